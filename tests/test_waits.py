@@ -25,7 +25,7 @@ ALLOWED = {
     ("cli/bridge.py", "_flags.get"): "a context variable, not a queue",
     ("cli/stop_signals.py", "numbers.recv"): "in a daemon thread, until a signal comes or the command ends",
     ("viewer/native.py", "process.wait"): "until the user closes the viewer's window",
-    ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
+    ("viewer/web.py", "self.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
     ("inference/preprocess.py", "task.result"): "the task is done",
     ("model/kernels/compiled.py", "helper.result"): "the tasks only compute",

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 
@@ -21,7 +22,7 @@ from bevcli.inference.background import write_behind
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import BevState
+from bevcli.inference.runner import RunnerState
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.recording.writer import Recording
@@ -131,7 +132,7 @@ def _time_run(
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
-    def record(step: tuple[Frame, Prediction, BevState | None]) -> None:
+    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> None:
         made.append(time.perf_counter())  # recording begins as soon as the model has made the step
         recording.log(*step[:2])
 

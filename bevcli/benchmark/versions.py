@@ -4,6 +4,7 @@ import copy
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,7 @@ from bevcli.benchmark.result import Comparison
 from bevcli.engines.box_differences import NEAR_M
 from bevcli.frame import Prediction
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
-from bevcli.inference.runner import BevState, Runner, StepOptions
+from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
 from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
 from bevcli.model.network import Network
@@ -39,7 +40,7 @@ class Version:
         self.runner.clock = StageClock(model.observed, device, *fine_stages(model))
         self.seconds: list[float] = []
         self.queries: QueryResults = (torch.empty(0), torch.empty(0))
-        self.state: BevState | None = None
+        self.state: RunnerState[Any] | None = None
 
     def step(self, prepared: PreparedFrame) -> Prediction:
         """Runs and times one frame, from its network inputs to its boxes."""

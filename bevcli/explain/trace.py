@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.commands import read_commands
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import BevState, Runner, StepOptions
+from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import project_pillars
@@ -125,7 +126,7 @@ def trace(
     preprocessor = Preprocessor(model.config)
     scene = next(places for places in scenes_of(sequence.stamps) if place in places)
     places = range(scene[0], place)
-    state: BevState | None = None
+    state: RunnerState[Any] | None = None
     recent: list[tuple[Frame, Prediction]] = []
     for frame, prediction, state in runner.run(sequence, places, preprocessor):  # noqa: B007
         recent = [*recent, (frame, prediction)][-RECENT + 1 :]
@@ -164,7 +165,7 @@ def _default_cell(frame: Frame, prediction: Prediction) -> tuple[float, float]:
 
 def _traced_step(
     runner: Runner,
-    state: BevState | None,
+    state: RunnerState[Any] | None,
     prepared: PreparedFrame,
     recent: list[tuple[Frame, Prediction]],
     cell: tuple[int, int],

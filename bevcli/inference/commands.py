@@ -1,6 +1,6 @@
 """Commands of the driver, such as "straight": each chooses one of the paths that a model plans."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from bevcli.errors import InputError
@@ -8,21 +8,14 @@ from bevcli.frame import FrameResult, Plan
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
 
+# Commands over a drive: index of a frame and the command from it on, by rising index, until the next one.
+Commands = tuple[tuple[int, str], ...]
 
-@dataclass(frozen=True)
-class Commands:
-    """Commands over a drive. A command stays until the next one.
 
-    Attributes:
-        since: index of a frame and the command from it on, by rising index.
-    """
-
-    since: tuple[tuple[int, str], ...] = ()
-
-    def given_to(self, results: tuple[FrameResult, ...], frame: int) -> tuple[FrameResult, ...]:
-        """The results, plans with the command at a frame, "" for none."""
-        command = next((command for first, command in reversed(self.since) if first <= frame), "")
-        return tuple(replace(each, command=command) if isinstance(each, Plan) else each for each in results)
+def with_command(results: tuple[FrameResult, ...], commands: Commands, frame: int) -> tuple[FrameResult, ...]:
+    """The results, plans with the command at a frame, "" for none."""
+    command = next((command for first, command in reversed(commands) if first <= frame), "")
+    return tuple(replace(each, command=command) if isinstance(each, Plan) else each for each in results)
 
 
 def read_commands(command: str | None, config: ModelConfig) -> Commands:
@@ -31,7 +24,7 @@ def read_commands(command: str | None, config: ModelConfig) -> Commands:
     None: no command. Raises InputError for a model that does not plan, an unknown command, or a wrong file.
     """
     if command is None:
-        return Commands()
+        return ()
     path = Path(command)
     if path.suffix != ".json":
         return one_command(command, config)
@@ -43,7 +36,7 @@ def read_commands(command: str | None, config: ModelConfig) -> Commands:
         if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
             expected = f"expected {', '.join(known)}, by frame index"
             raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected})')
-    return Commands(tuple(sorted((int(frame), name) for frame, name in found.items())))
+    return tuple(sorted((int(frame), name) for frame, name in found.items()))
 
 
 def one_command(command: str, config: ModelConfig) -> Commands:
@@ -51,7 +44,7 @@ def one_command(command: str, config: ModelConfig) -> Commands:
     known = _known(command, config)
     if command not in known:
         raise InputError(f"`command={command}`: is unknown (expected {', '.join(known)} or a FILE.json)")
-    return Commands(((0, command),))
+    return ((0, command),)
 
 
 def _known(command: str, config: ModelConfig) -> tuple[str, ...]:

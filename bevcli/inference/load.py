@@ -4,13 +4,14 @@ import copy
 import hashlib
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
@@ -121,11 +122,7 @@ class Model:
     @cached_property
     def weights_hash(self) -> str:
         """SHA-256 of names, types, shapes and values of all weights."""
-        found = hashlib.sha256()
-        for name, tensor in self.network.state_dict().items():
-            found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-            found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-        return found.hexdigest()
+        return hash_of(self.network.state_dict().items())
 
     @cached_property
     def prepared(self) -> TemporalModel:
@@ -139,6 +136,15 @@ class Model:
             return self.network
         assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
+
+
+def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:
+    """SHA-256 of names, types, shapes and numbers, in this order."""
+    found = hashlib.sha256()
+    for name, tensor in tensors:
+        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+        found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
 
 
 def load_model(

@@ -1,11 +1,11 @@
-"""The temporal run: frame by frame, with the memory that the model keeps."""
+"""The temporal run: frame by frame, with the memory that the model keeps, and the tracks of the boxes."""
 
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 
@@ -13,27 +13,31 @@ from bevcli.frame import Frame, FrameStamp, NewStart, Prediction, Sequence, Star
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
-from bevcli.inference.commands import Commands
+from bevcli.inference.commands import Commands, with_command
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
-from bevcli.inference.tracking import without_identities
+from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
-from bevcli.model.temporal_model import Memory, TemporalModel
+from bevcli.model.temporal_model import TemporalModel
+
+Memory = TypeVar("Memory")
 
 
 @dataclass(frozen=True)
-class BevState:
+class RunnerState(Generic[Memory]):
     """The state of a run between two frames.
 
     Attributes:
-        memory: of the model; the runner only passes it on.
+        memory: of the model, None for nothing; the runner only passes it on.
         stamp: of the frame; None where the next frame starts anew.
+        tracks: of the tracker; None before the first frame or without tracks.
     """
 
-    memory: Memory
-    stamp: FrameStamp | None
+    memory: Memory | None = None
+    stamp: FrameStamp | None = None
+    tracks: TrackerState | None = None
 
 
 @dataclass(frozen=True)
@@ -46,13 +50,17 @@ class StepOptions:
         ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
         commands: of the driver, for a model that plans.
+        track: whether boxes keep the identities that a model with history may give them.
+        tracker: gives identities to the boxes of other models; None for no tracker.
     """
 
     precision: Precision | Literal["int8"] = "fp32"
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
-    commands: Commands = field(default_factory=Commands)
+    commands: Commands = ()
+    track: bool = True
+    tracker: TrackerConfig | None = None
 
 
 class Runner:
@@ -65,10 +73,9 @@ class Runner:
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model.observed, device, model.stages)
 
-    @torch.inference_mode()
     def step(
-        self, state: BevState | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
-    ) -> tuple[BevState | None, Prediction]:
+        self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
+    ) -> tuple[RunnerState[Any], Prediction]:
         """The state and the prediction after one frame.
 
         A frame without any image returns the state unchanged, so that the next alignment by ego-motion spans both
@@ -81,8 +88,18 @@ class Runner:
             upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
                 or without images are not used.
         """
+        state, prediction = self._step_model(state or RunnerState(), prepared, upcoming)
+        if self.options.tracker is None or self.tracks:
+            return state, prediction
+        ((_, prediction, tracks),) = track(self.options.tracker, [(prepared.frame, prediction)], state.tracks)
+        return replace(state, tracks=tracks), prediction
+
+    @torch.inference_mode()
+    def _step_model(
+        self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Items[PreparedFrame]
+    ) -> tuple[RunnerState[Any], Prediction]:
         frame = prepared.frame
-        started_anew = self._new_start(None if state is None else state.stamp, frame.stamp)
+        started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
             state = self._restarted(state)
         if not frame.images:
@@ -90,17 +107,18 @@ class Runner:
         probe = self._probe()
         with self.clock:
             with self._autocast(), probe or contextlib.nullcontext():
-                before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
-                outputs, memory = self.model.step(prepared, before, later)
+                later = self._usable(prepared, upcoming)
+                outputs, memory = self.model.step(prepared, state.memory, later)
                 found, is_finite = read_back(outputs, prepared.images)
                 if not is_finite:
-                    where = origin(self.model.observed, lambda: self.model.step(prepared, before, later))
+                    where = origin(self.model.observed, lambda: self.model.step(prepared, state.memory, later))
                     return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
             boxes = self.model.decode_boxes(found)
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)
             self.clock.mark("box_decoding")
-            results = self.options.commands.given_to(self.model.decode_results(found), frame.stamp.index)
+            results = self.model.decode_results(found)
+            results = with_command(results, self.options.commands, frame.stamp.index)
             segmentation = self.model.decode_map(found)
             if segmentation is not None:
                 self.clock.mark("map_merging")
@@ -114,32 +132,23 @@ class Runner:
             stage_seconds=self.clock.read(),
             results=results,
         )
-        return BevState(memory, frame.stamp), prediction
+        return RunnerState(memory, frame.stamp, state.tracks), prediction
 
     def run(
-        self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
-    ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
+        self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
+    ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
         """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance.
 
         A model that looks ahead sees the later ones of these places.
         """
-        for prepared, upcoming in self.frames(sequence, places, self.preparation(preprocessor)):
-            state, prediction = self.step(state, prepared, upcoming)
-            yield prepared.frame, prediction, state
-
-    def frames(
-        self, sequence: Sequence, places: Items[int], prepare: Callable[[Frame], PreparedFrame]
-    ) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
-        """Each frame at these places, read and prepared in advance, with the later ones that the model looks ahead to.
-
-        prepare: of `preparation`.
-        """
         ahead = self.config.later_frames if self.options.temporal else 0
+        prepare = self.preparation(preprocessor)
         source = read_ahead(lambda place: prepare(sequence.load(place)), places)
         waiting = deque(islice(source, ahead + 1))
         while waiting:
-            frame = waiting.popleft()
-            yield frame, tuple(waiting)
+            prepared = waiting.popleft()
+            state, prediction = self.step(state, prepared, tuple(waiting))
+            yield prepared.frame, prediction, state
             waiting.extend(islice(source, 1))
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
@@ -150,14 +159,12 @@ class Runner:
     @property
     def tracks(self) -> bool:
         """The boxes have identities, those of the model's own tracks."""
-        return self.options.temporal and self.config.has_tracks
+        return self.options.track and self.options.temporal and self.config.has_tracks
 
-    def _restarted(self, state: BevState | None) -> BevState | None:
-        """The state before a frame without history: what the model keeps over scenes, None for nothing."""
-        if state is None or not self.options.temporal:
-            return None
-        memory = self.model.restarted(state.memory)
-        return None if memory is None else BevState(memory, None)
+    def _restarted(self, state: RunnerState[Any]) -> RunnerState[Any]:
+        """The state before a frame without history: what the model keeps over scenes, and the tracks."""
+        is_kept = self.options.temporal and state.memory is not None
+        return replace(state, memory=self.model.restarted(state.memory) if is_kept else None, stamp=None)
 
     def _new_start(self, before: FrameStamp | None, stamp: FrameStamp) -> NewStart | None:
         if not self.options.temporal:
@@ -218,7 +225,7 @@ def paired_steps(
     Yields each frame that has an image, and the outputs of both.
     """
     runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
-    states: list[BevState | None] = [None, None]
+    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
     outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
     with contextlib.ExitStack() as hooks:
         for runner in runners:

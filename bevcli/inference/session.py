@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from operator import index
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.run import RunnerState, Steps
-from bevcli.inference.runner import StepOptions
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, RunnerState, StepOptions
 
 ColorOrder = Literal["bgr", "rgb"]
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
@@ -86,9 +86,12 @@ class Session:
         self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
-        options = StepOptions(model.precision, temporal, commands=read_commands(command, model.config))
-        self._steps = Steps(model, options, cameras, track=track)
-        self._state, self._poses = RunnerState(), RecentPoses()
+        commands, tracker = read_commands(command, model.config), model.tracker if track else None
+        options = StepOptions(model.precision, temporal, commands=commands, track=track, tracker=tracker)
+        self._runner = Runner(model.prepared, model.device, options)
+        self._prepare = self._runner.preparation(Preprocessor(model.config, cameras))
+        self._state: RunnerState[Any] = RunnerState()
+        self._poses = RecentPoses()
         self._drive = 1
         self._last_ns: int | None = None
 
@@ -136,9 +139,9 @@ class Session:
             dropped={name: "not given" for name in self.rig.names if name not in images},
         )
         if command is not None:
-            runner = self._steps.runner
-            runner.options = replace(runner.options, commands=one_command(command, runner.config))
-        self._state, prediction = self._steps.step(self._state, self._steps.prepare(frame))
+            commands = one_command(command, self._runner.config)
+            self._runner.options = replace(self._runner.options, commands=commands)
+        self._state, prediction = self._runner.step(self._state, self._prepare(frame))
         self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
         return prediction
 

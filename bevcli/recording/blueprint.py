@@ -1,19 +1,18 @@
 """The layout of a recording in the viewer: cameras above and below scene and BEV; curves and texts to the right."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
 from bevcli.recording.ground_lines import KINDS
-from bevcli.recording.log_static import legend_size
+from bevcli.recording.log_static import legend_entries, legend_size
+from bevcli.recording.recorded import Recorded, frame_rate_hz
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
 
@@ -63,31 +62,6 @@ LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
 MAP_ZOOM = 17.0
 
 
-@dataclass(frozen=True)
-class LayoutFacts:
-    """The facts of a run that change the layout.
-
-    Attributes:
-        note: added to the titles of the main views, such as "untrained weights"; "" for none.
-        probes: whether probes are shown at first.
-        segmentation: whether the model predicts a map; then it lies on the ground, and the BEV features are hidden.
-        rate_hz: frames per second of the drive.
-        on_earth: whether there is a street map view.
-        legend_entries: number of entries of the legend.
-        grid: of the model, None if unknown.
-        follows: whether the viewer shows the newest frame at first, instead of playing from the first one.
-    """
-
-    note: str = ""
-    probes: bool = False
-    segmentation: bool = False
-    rate_hz: float = 2.0
-    on_earth: bool = False
-    legend_entries: int = 0
-    grid: BevGrid | None = None
-    follows: bool = False
-
-
 class Layout(rrb.Blueprint):
     """Views in the middle, side panels collapsed.
 
@@ -111,25 +85,25 @@ class Layout(rrb.Blueprint):
             self._streams.pop().disconnect()
 
 
-def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> Layout:
-    """The layout for a rig."""
-    titled = f" ({facts.note})" if facts.note else ""
-    middle = rrb.Horizontal(_scene(rig, titled, facts), _bev_tabs(titled, facts), column_shares=[5, 3])
+def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:
+    """The layout of a recording. follows: the viewer first shows the newest frame, else it plays from the first one."""
+    rig, probes = recorded.drive.rig, bool(recorded.options.probes)
+    titled = f" ({recorded.note})" if recorded.note else ""
+    middle = rrb.Horizontal(_scene(recorded, titled), _bev_tabs(recorded, titled), column_shares=[5, 3])
     rows = [
-        rrb.Horizontal(*(_camera(rig, name, probes=facts.probes) for name in row), name="cameras")
-        for row in camera_rows(rig)
+        rrb.Horizontal(*(_camera(rig, name, probes=probes) for name in row), name="cameras") for row in camera_rows(rig)
     ]
     heights = camera_row_shares(rig)
     shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
     views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares)
     return Layout(
-        rrb.Horizontal(views, _texts(facts), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
+        rrb.Horizontal(views, _texts(recorded), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
         # Playback of "time" runs at the drive's own speed; `fps` is that of the timeline "frame".
         rrb.TimePanel(
             state="collapsed",
             timeline=entities.TIME_TIMELINE,
-            fps=facts.rate_hz,
-            play_state="following" if facts.follows else None,
+            fps=frame_rate_hz(recorded.drive.stamps),
+            play_state="following" if follows else None,
         ),
     )
 
@@ -143,10 +117,11 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
     return [min(share, LARGEST_CAMERAS_SHARE / len(rows)) for share in shares]
 
 
-def _scene(rig: CameraRig, titled: str, facts: LayoutFacts) -> rrb.Spatial3DView:
-    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", *KINDS)
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_images]
-    hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if facts.segmentation else [])]
+def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
+    drawn_in_images, names = ("boxes", "ground_truth", "pillars", "probes", *KINDS), recorded.drive.rig.names
+    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in names for kind in drawn_in_images]
+    # A map lies on the ground in place of the BEV features.
+    hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
         contents=[f"/{entities.WORLD}/**", *excluded],
@@ -168,9 +143,8 @@ def _from_start() -> list[rr.VisibleTimeRange]:
     ]
 
 
-def _bev_tabs(titled: str, facts: LayoutFacts) -> rrb.Tabs:
-    grid = facts.grid
-    margin = VIEW_MARGIN_M if grid is None else min(VIEW_MARGIN_M, grid.nearest_side_m)
+def _bev_tabs(recorded: Recorded, titled: str) -> rrb.Tabs:
+    margin = min(VIEW_MARGIN_M, recorded.model.config.bev_grid.nearest_side_m)
 
     def view(name: str, *without: str) -> rrb.Spatial2DView:
         contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
@@ -182,7 +156,8 @@ def _bev_tabs(titled: str, facts: LayoutFacts) -> rrb.Tabs:
         view("BEV features", history, segmentation),
         view("History weight", features, segmentation),
     ]
-    return rrb.Tabs(*views, *([_street_map()] if facts.on_earth else []), active_tab=0)
+    on_earth = recorded.drive.facts.geo_origin is not None
+    return rrb.Tabs(*views, *([_street_map()] if on_earth else []), active_tab=0)
 
 
 def _street_map() -> rrb.MapView:
@@ -195,7 +170,7 @@ def _street_map() -> rrb.MapView:
     )
 
 
-def _texts(facts: LayoutFacts) -> rrb.Vertical:
+def _texts(recorded: Recorded) -> rrb.Vertical:
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop)
     curves = {
         "Speed": entities.SPEED_CURVE,
@@ -206,7 +181,7 @@ def _texts(facts: LayoutFacts) -> rrb.Vertical:
     columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
-    width, height = legend_size(facts.legend_entries)
+    width, height = legend_size(len(legend_entries(recorded)))
     legend = flat_view(entities.LEGEND, "Legend", (0, width), (0, height))
     pages = rrb.Tabs(events, about, active_tab=0)
     return rrb.Vertical(rrb.Tabs(*plots, active_tab=0), legend, pages, row_shares=[3, 3, 4])

@@ -1,7 +1,7 @@
 """Meshes of classes: each box of such a class has its mesh in the scene, scaled to the box."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -55,9 +55,9 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
     return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
 
 
-def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, names: Iterable[str]) -> None:
+def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
     """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
-    for name in names:
+    for name in (name for name, one in classes.items() if one.mesh):
         own = boxes[boxes.classes == name]
         # The last one has no size: an entity without poses would show its mesh at the origin.
         poses = rr.InstancePoses3D(

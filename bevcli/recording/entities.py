@@ -2,7 +2,8 @@
 
 `world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
 in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and
-longitudes, where the drive states its place on Earth.
+longitudes, where the drive states its place on Earth. Lines on the ground of one of
+`bevcli.recording.ground_lines.KINDS` are directly below `world` and `bev`, such as "bev/map_lines".
 """
 
 import rerun as rr
@@ -74,16 +75,6 @@ def track(class_name: str, identity: str) -> str:
 def class_mesh(class_name: str) -> str:
     """The entity of the mesh in all boxes of a class, such as "world/boxes/mesh/car"."""
     return f"{BOXES}/mesh/{rr.escape_entity_path_part(class_name)}"
-
-
-def ground_lines(kind: str) -> str:
-    """The entity of lines on the ground in the scene, such as "world/map_lines"."""
-    return f"{WORLD}/{kind}"
-
-
-def bev_ground_lines(kind: str) -> str:
-    """The entity of lines on the ground in the BEV view, such as "bev/map_lines"."""
-    return f"{BEV}/{kind}"
 
 
 def overlay(name: str, kind: str) -> str:

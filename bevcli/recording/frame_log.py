@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import rerun as rr
@@ -14,87 +14,66 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
-from bevcli.recording.colors import EGO_COLOR, class_colors
+from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
-from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_tracks import TrackHistory, TrackLog
-from bevcli.recording.options import RecordingOptions
-from bevcli.recording.recorded import WARNINGS, RecordedDrive, RecordedModel, weights_note
+from bevcli.recording.log_cameras import CameraImages, PosedCamera
+from bevcli.recording.log_tracks import TrackHistory, log_tracks
+from bevcli.recording.recorded import WARNINGS, Recorded
 
 PosedCameras = tuple[PosedCamera, ...]
 
 
-@dataclass(frozen=True)
-class LastFrame:
-    """The frame that was written last. `world_from_ego`: its pose in the sequence's world."""
-
-    scene: str
-    world_from_ego: Pose
-
-
-@dataclass(frozen=True)
+@dataclass
 class FrameLogState:
     """What the frames so far leave behind for later ones.
 
     Attributes:
-        origin: (3,) the recording's origin in the sequence's world, metres.
-        last: the last frame.
+        origin: (3,) the recording's origin in the sequence's world, metres: the place of the first frame's ego vehicle.
+        scene: of the last frame.
+        world_from_ego: pose of the last frame in the sequence's world; None before the first one.
         colors: of the BEV features, None where these are not drawn.
         tracks: the trails.
     """
 
-    origin: Array
-    last: LastFrame | None
-    colors: BevColors | None
-    tracks: TrackHistory
+    origin: Array | None = None
+    scene: str = ""
+    world_from_ego: Pose | None = None
+    colors: BevColors | None = None
+    tracks: TrackHistory = field(default_factory=TrackHistory)
 
 
 class FrameLog:
     """Logs frames into a stream of rerun, in order. resume: the state from which the log goes on."""
 
-    def __init__(
-        self,
-        stream: rr.RecordingStream,
-        drive: RecordedDrive,
-        model: RecordedModel,
-        options: RecordingOptions,
-        resume: FrameLogState | None,
-    ) -> None:
-        self._stream, self.options = stream, options
-        self._config, self.untrained, self.note = model.config, model.untrained, weights_note(model, drive)
-        self.classes = class_colors(model.config.object_classes.values())
-        self._with_mesh = tuple(name for name, one in model.config.object_classes.items() if one.mesh)
-        self._geo_origin, self._has_ego_motion = drive.facts.geo_origin, drive.has_ego_motion
-        self._origin: Array | None = None  # (3,) position of the first frame's ego vehicle in the world
-        self._last: LastFrame | None = None
+    def __init__(self, stream: rr.RecordingStream, recorded: Recorded, resume: FrameLogState | None) -> None:
+        self._stream, self._recorded = stream, recorded
+        self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
+        self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        self._tracks = TrackLog(stream, self.classes, None if resume is None else resume.tracks)
-        self._video = VideoImages(stream) if options.images == "av1" else None
-        draws_bev = options.bev != "none" and options.shows_internals
-        self._bev_images = BevImages(options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
-        if resume is not None:
-            self._origin, self._last = resume.origin, resume.last
-            if self._bev_images is not None:
-                self._bev_images.colors = resume.colors
+        self._images = CameraImages(stream, as_video=self._options.images == "av1")
+        draws_bev = self._options.bev != "none" and self._options.shows_internals
+        self._bev_images = BevImages(self._options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
+        if self._bev_images is not None:
+            self._bev_images.colors = self._kept.colors
 
     def state(self) -> FrameLogState | None:
         """The state from which a later log goes on; None as long as it cannot be resumed.
 
         BEV colours are fitted on the first two frames, and are part of the state.
         """
-        colors = None if self._bev_images is None else self._bev_images.colors
-        if self._origin is None or (self._bev_images is not None and colors is None):
-            return None
-        return FrameLogState(self._origin, self._last, colors, deepcopy(self._tracks.history))
+        if self._bev_images is not None:
+            self._kept.colors = self._bev_images.colors
+            if self._kept.colors is None:
+                return None
+        return None if self._kept.origin is None else deepcopy(self._kept)
 
     def finish(self) -> None:
         """Logs what waits for later frames."""
         if self._bev_images is not None:
             self._log_bev_images(self._bev_images.finish())
-        if self._video is not None:
-            self._video.close()
+        self._images.close()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Logs one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
@@ -102,17 +81,17 @@ class FrameLog:
         cameras = self._log_cameras(frame)
         self._log_boxes(frame, prediction, cameras)
         self._log_results(prediction, cameras)
-        if self._last is None:
-            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.classes)
+        if self._kept.world_from_ego is None:
+            log_static.log_curve_names(self._stream, prediction.stage_seconds, self._recorded.classes)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
         self._log_frame_events(frame, prediction)
-        if self.options.shows_internals:
+        if self._options.shows_internals:
             self._log_internals(frame, prediction, cameras)
-        self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
+        self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
 
     def event(self, text: str, level: str = "INFO") -> None:
         """See `Recording.event`."""
-        if self._origin is None:
+        if self._kept.origin is None:
             self._early_events.append((text, level))
         else:
             self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
@@ -123,9 +102,9 @@ class FrameLog:
 
     def _log_ego(self, frame: Frame) -> None:
         """Writes the ego pose. The recording's world frame has its origin at the first frame's ego position."""
-        if self._origin is None:
-            self._origin = frame.world_from_ego.matrix[:3, 3].copy()
-            self._stream.log(entities.WORLD, rr.AnyValues(origin=self._origin), static=True)
+        if self._kept.origin is None:
+            self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
+            self._stream.log(entities.WORLD, rr.AnyValues(origin=self._kept.origin), static=True)
         self._at(frame.stamp)
         pose = self._moved_to_origin(frame.world_from_ego.matrix)
         self._stream.log(
@@ -133,21 +112,21 @@ class FrameLog:
             log_cameras.transform(pose),
             rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
-        if self._has_ego_motion:
+        if self._recorded.drive.has_ego_motion:
             log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
-        before = self._last if self._last is not None and self._last.scene == frame.stamp.scene else None
+        before = self._kept.world_from_ego if self._kept.scene == frame.stamp.scene else None
         if self._geo_origin is not None:
-            last = None if before is None else before.world_from_ego.translation
+            last = None if before is None else before.translation
             log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
-            poses = (before.world_from_ego, frame.world_from_ego)
+            poses = (before, frame.world_from_ego)
             piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
             self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
-        assert self._origin is not None
-        return rigid(-self._origin) @ world_from_a
+        assert self._kept.origin is not None
+        return rigid(-self._kept.origin) @ world_from_a
 
     def _world_from_bev(self, prediction: Prediction) -> Array:
         return self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
@@ -159,15 +138,12 @@ class FrameLog:
         )
         for posed in cameras:
             self._stream.log(entities.camera(posed.name), log_cameras.transform(posed.world_from_camera))
-            image = frame.images.get(posed.name)
-            if self._video is None:
-                log_cameras.log_image(self._stream, posed, image)
-            else:
-                self._video.log(posed, image)
+            self._images.log(posed.name, frame.images.get(posed.name))
         return cameras
 
     def _log_boxes(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
-        shown = prediction.boxes.scored(self.options.score)
+        stream, names = self._stream, self._recorded.classes
+        shown = prediction.boxes.scored(self._options.score)
         world_from_bev = self._world_from_bev(prediction)
         in_world = shown.transformed(world_from_bev)
         marks = log_boxes.false_and_duplicate(shown, None)
@@ -175,16 +151,15 @@ class FrameLog:
             in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
             truth = log_boxes.detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
             found = np.ones(len(truth), dtype=bool)
-            if not self.untrained:  # random boxes match nothing: a scene all in red would be useless
+            if not self._recorded.model.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | log_boxes.other_classes(truth, self.classes)
+                found = marks.found | log_boxes.other_classes(truth, names)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
-        stream, names = self._stream, self.classes
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
-        log_class_meshes(stream, in_world, self._with_mesh)
+        log_class_meshes(stream, in_world, self._recorded.model.config.object_classes)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
-        self._tracks.log(in_world, frame.stamp, inverse(world_from_bev))
+        log_tracks(stream, self._kept.tracks, in_world, frame.stamp, inverse(world_from_bev), names)
         if self._geo_origin is not None:
             in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
@@ -196,29 +171,30 @@ class FrameLog:
 
     def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
         """Writes lines of the map, futures and planned paths of a model that has further results."""
-        if not self._config.results:
+        kinds = self._recorded.model.config.results
+        if not kinds:
             return
-        world_from_bev, score = self._world_from_bev(prediction), self.options.score
+        world_from_bev, score = self._world_from_bev(prediction), self._options.score
         moved = Pose.from_matrix(self._moved_to_origin(prediction.world_from_ego.matrix))
         ground = replace(prediction.ground, world_from_ego=moved)
         shown = prediction.boxes.scored(score).transformed(world_from_bev)
-        of_results = result_lines(prediction.results, ground, self._config.results, score)
-        for lines in (*of_results, future_lines(shown, self.classes)):
+        of_results = result_lines(prediction.results, ground, kinds, score)
+        for lines in (*of_results, future_lines(shown, self._recorded.classes)):
             log_ground_lines(self._stream, lines, world_from_bev, cameras)
 
     def _log_ground_truth(
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
-        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.classes))
+        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
         log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:
             log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
-        if self._last is None and self.note in WARNINGS:
-            self.event(WARNINGS[self.note], "WARN")
+        if self._kept.world_from_ego is None and self._recorded.note in WARNINGS:
+            self.event(WARNINGS[self._recorded.note], "WARN")
         where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
@@ -250,7 +226,7 @@ class FrameLog:
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self.options.level == "full")
+            self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
             log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
         colors = log_static.pillar_colors(prediction.grid, len(self._pillars))
         points = apply(self._world_from_bev(prediction), self._pillars.reshape(-1, 3))

@@ -129,10 +129,10 @@ def log_ground_lines(
     """Writes lines in the recording's world; without any, those of the frame before are cleared."""
     colors, radii = list(lines.colors) or None, rr.Radius.ui_points(lines.width)
     in_space = line_strips([strip + ABOVE_GROUND for strip in lines.strips], 3)
-    stream.log(entities.ground_lines(lines.kind), rr.LineStrips3D(in_space, colors=colors, radii=radii))
+    stream.log(f"{entities.WORLD}/{lines.kind}", rr.LineStrips3D(in_space, colors=colors, radii=radii))
     bev_from_world = inverse(world_from_bev)
     flat = line_strips([apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in lines.strips], 2)
-    stream.log(entities.bev_ground_lines(lines.kind), rr.LineStrips2D(flat, colors=colors, radii=radii, draw_order=24))
+    stream.log(f"{entities.BEV}/{lines.kind}", rr.LineStrips2D(flat, colors=colors, radii=radii, draw_order=24))
     for posed in cameras:
         _log_in_image(stream, lines, posed)
 

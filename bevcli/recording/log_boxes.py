@@ -9,7 +9,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.matching import descending_scores, gather, match_greedily
+from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.geographic import GeoOrigin
@@ -77,16 +77,15 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     count as equal.
     """
     is_true, is_found = np.zeros(len(predictions), dtype=bool), np.zeros(len(ground_truth), dtype=bool)
-    scores = np.ones(len(predictions)) if predictions.scores is None else predictions.scores
-    origin = np.zeros((1, 2))  # ranges from the ego vehicle are not used here
-    for name in np.unique(predictions.classes):
-        predicted = np.flatnonzero(predictions.classes == name)
-        predicted = predicted[descending_scores(scores[predicted])]
-        truths = np.flatnonzero(ground_truth.classes == name)
-        one, other = gather([ground_truth[truths]], origin), gather([predictions[predicted]], origin)
-        matched = match_greedily(one, other, (MATCH_DISTANCE_M,))[0]
-        is_true[predicted[matched >= 0]] = True
-        is_found[truths[matched[matched >= 0]]] = True
+    order = descending_scores(np.ones(len(predictions)) if predictions.scores is None else predictions.scores)
+    names = np.concatenate([ground_truth.classes, predictions.classes[order]])
+    # Boxes of different classes match as little as those of different frames.
+    frames = np.split(np.unique(names, return_inverse=True)[1], [len(ground_truth)])
+    sides = zip((ground_truth, predictions[order]), frames, strict=True)
+    truths, best_first = (ScoredBoxes(boxes, index, np.zeros(len(boxes))) for boxes, index in sides)
+    matched = match_greedily(truths, best_first, (MATCH_DISTANCE_M,))[0]
+    is_true[order[matched >= 0]] = True
+    is_found[matched[matched >= 0]] = True
     return is_true, is_found
 
 

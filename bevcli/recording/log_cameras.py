@@ -48,43 +48,42 @@ def transform(parent_from_entity: Array) -> rr.Transform3D:
     return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
 
 
-def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
-    """Writes the encoded image. Without an image, the one of the frame before is cleared."""
-    if image is None:
-        stream.log(entities.image(posed.name), rr.Clear(recursive=False))
-        return
+class CameraImages:
+    """Writes the images of all cameras. as_video: AV1, in place of the bytes of the image files."""
+
+    def __init__(self, stream: rr.RecordingStream, *, as_video: bool) -> None:
+        self._stream, self._as_video = stream, as_video
+        self._encoders: dict[str, Av1Encoder] = {}
+
+    def log(self, camera: str, image: CameraImage | None) -> None:
+        """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
+        if image is not None:
+            written = self._video_image(camera, image) if self._as_video else _encoded(image)
+            self._stream.log(entities.image(camera), written)
+            return
+        self._stream.log(entities.image(camera), rr.Clear(recursive=False))
+        if camera in self._encoders:
+            self._encoders.pop(camera).close()
+
+    def _video_image(self, camera: str, image: CameraImage) -> rr.VideoStream:
+        if camera not in self._encoders:
+            height, width = image.pixels_bgr.shape[:2]
+            self._encoders[camera] = Av1Encoder(width, height)
+        data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
+        return rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
+
+    def close(self) -> None:
+        """Ends all video streams."""
+        for encoder in self._encoders.values():
+            encoder.close()
+
+
+def _encoded(image: CameraImage) -> rr.EncodedImage:
     contents, media_type = image.encoded, image.media_type
     if contents is None or media_type is None:
         _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         contents, media_type = data.tobytes(), "image/jpeg"
-    stream.log(entities.image(posed.name), rr.EncodedImage(contents=contents, media_type=media_type))
-
-
-class VideoImages:
-    """Writes the images of all cameras as AV1 video streams, one for each camera."""
-
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self._stream = stream
-        self._encoders: dict[str, Av1Encoder] = {}
-
-    def log(self, posed: PosedCamera, image: CameraImage | None) -> None:
-        """Writes an image. A missing one is cleared, and the stream starts anew with the next."""
-        entity, name = entities.image(posed.name), posed.name
-        if image is None:
-            self._stream.log(entity, rr.Clear(recursive=False))
-            if name in self._encoders:
-                self._encoders.pop(name).close()
-            return
-        if name not in self._encoders:
-            height, width = image.pixels_bgr.shape[:2]
-            self._encoders[name] = Av1Encoder(width, height)
-        data, is_keyframe = self._encoders[name].encode(image.pixels_bgr)
-        self._stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe))
-
-    def close(self) -> None:
-        """Ends all streams."""
-        for encoder in self._encoders.values():
-            encoder.close()
+    return rr.EncodedImage(contents=contents, media_type=media_type)
 
 
 def log_boxes_in_image(

@@ -1,6 +1,7 @@
 """Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -9,6 +10,7 @@ from bevcli._version import __version__
 from bevcli.frame import MapLines, Plan
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
@@ -26,7 +28,7 @@ from bevcli.recording.colors import (
     map_colors,
 )
 from bevcli.recording.mesh_file import Mesh
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording.recorded import Recorded
 from bevcli.recording.vehicle import VehicleMesh, default_vehicle
 
 RING_STEP_M = 10
@@ -73,14 +75,36 @@ def log_scene(
     _log_rings(stream, rig, grid)
 
 
-def about_text(title: str, rig: CameraRig, options: RecordingOptions, *, untrained: bool) -> str:
+def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
+    """Writes the page "About", and the facts of the run that readers of the file need."""
+    maps, lines = recorded.map_classes, line_entries(recorded.model.config)
+    of_map: dict[str, Any] = {"map_classes": list(maps)} if maps else {}
+    if lines:
+        names, colors = zip(*lines, strict=True)
+        of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
+    facts = rr.AnyValues(
+        title=recorded.title,
+        untrained=recorded.model.untrained,
+        note=recorded.note,
+        score=recorded.options.score,
+        class_names=list(recorded.classes),
+        class_colors=list(map(hex_of_color, recorded.classes.values())),
+        camera_names=list(recorded.drive.rig.names),
+        **of_map,
+    )
+    page = rr.TextDocument(_about_text(recorded), media_type="text/markdown")
+    stream.log(entities.RUN, page, facts, static=True)
+
+
+def _about_text(recorded: Recorded) -> str:
     """The page "About" in Markdown: the run, and how to read the views."""
+    names, untrained = recorded.drive.rig.names, recorded.model.untrained
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
     facts = (
-        f"bevcli {__version__}; {len(rig.cameras)} cameras: {', '.join(rig.names)}. "
-        f"Boxes with a score of {options.score:g} or more are shown.\n"
+        f"bevcli {__version__}; {len(names)} cameras: {', '.join(names)}. "
+        f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
     )
-    return f"# {title}\n\n{warning}{facts}\n{HOW_TO_READ}"
+    return f"# {recorded.title}\n\n{warning}{facts}\n{HOW_TO_READ}"
 
 
 def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
@@ -184,16 +208,12 @@ COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
 TEXT_COLOR: Color = (225, 228, 235)
 
 
-def legend_entries(
-    classes: Mapping[str, Color],
-    map_classes: Sequence[str] = (),
-    lines: Sequence[tuple[str, Color]] = (),
-) -> list[tuple[str, Color]]:
+def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
-    of_classes = [(name.replace("_", " "), color) for name, color in classes.items()]
+    of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
     states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
-    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
-    return [*of_classes, *states, *maps, *lines]
+    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(recorded.map_classes).items()]
+    return [*of_classes, *states, *maps, *line_entries(recorded.model.config)]
 
 
 def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:

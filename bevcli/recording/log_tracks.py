@@ -1,7 +1,6 @@
 """Writes tracks into a recording: each has an entity of its own with its past, its footprint and the next second."""
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,49 +62,45 @@ def track_names(boxes: Boxes3D) -> list[str]:
     return [str(instance) for instance in boxes.instances]
 
 
-class TrackLog:
-    """Writes the tracks of each frame, and clears the entities of tracks without a box.
+def log_tracks(
+    stream: rr.RecordingStream,
+    history: TrackHistory,
+    boxes: Boxes3D,
+    stamp: FrameStamp,
+    bev_from_world: Array,
+    classes: Mapping[str, Color],
+) -> None:
+    """Writes the tracks of a frame, and clears the entities of tracks without a box. Without tracks: nothing.
 
-    past: the tracks of an interrupted recording.
+    history: gets the boxes. boxes: in the recording's world. bev_from_world: (4, 4).
     """
-
-    def __init__(self, stream: rr.RecordingStream, classes: Mapping[str, Color], past: TrackHistory | None) -> None:
-        self._stream, self._classes = stream, classes
-        self.history = TrackHistory() if past is None else deepcopy(past)
-
-    def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
-        """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""
-        if boxes.instances is None:
-            return
-        self.history.add(boxes, stamp)
-        ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._classes)
-        shown: set[str] = set()
-        flat, flat_colors = [], []
-        for i, name in enumerate(track_names(boxes)):
-            if not name:
-                continue
-            entity = entities.track(str(boxes.classes[i]), name)
-            past = np.array(self.history.positions[name])  # (K, 3)
-            trail = [past] if len(past) > 1 else []
-            own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
-            self._log_style(entity, name, own_colors)
-            strips = line_strips([ahead[i], outlines[i], *trail], 3)
-            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=strips))
-            shown.add(entity)
-            flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
-            flat_colors += own_colors[:: 2 if trail else 3]
-        trails = rr.LineStrips2D(line_strips(flat, 2), colors=flat_colors or None, radii=THIN, draw_order=25)
-        self._stream.log(entities.BEV_TRACKS, trails)
-        for entity in set(self.history.shown) - shown:
-            self._stream.log(entity, rr.Clear(recursive=False))
-        self.history.shown = sorted(shown)
-
-    def _log_style(self, entity: str, name: str, colors: list[tuple[int, int, int, int]]) -> None:
-        """Writes what does not change, once for each track: a message costs more bytes than its numbers."""
-        if entity not in self.history.known:
-            self.history.known.append(entity)
-            style = rr.LineStrips3D.from_fields(colors=colors, radii=WIDTH)
-            self._stream.log(entity, style, rr.AnyValues(track=name), static=True)
+    if boxes.instances is None:
+        return
+    history.add(boxes, stamp)
+    ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
+    shown: set[str] = set()
+    flat, flat_colors = [], []
+    for i, name in enumerate(track_names(boxes)):
+        if not name:
+            continue
+        entity = entities.track(str(boxes.classes[i]), name)
+        past = np.array(history.positions[name])  # (K, 3)
+        trail = [past] if len(past) > 1 else []
+        own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+        if entity not in history.known:  # a message costs more bytes than its numbers: what stays is written once
+            history.known.append(entity)
+            style = rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH)
+            stream.log(entity, style, rr.AnyValues(track=name), static=True)
+        strips = line_strips([ahead[i], outlines[i], *trail], 3)
+        stream.log(entity, rr.LineStrips3D.from_fields(strips=strips))
+        shown.add(entity)
+        flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
+        flat_colors += own_colors[:: 2 if trail else 3]
+    trails = rr.LineStrips2D(line_strips(flat, 2), colors=flat_colors or None, radii=THIN, draw_order=25)
+    stream.log(entities.BEV_TRACKS, trails)
+    for entity in set(history.shown) - shown:
+        stream.log(entity, rr.Clear(recursive=False))
+    history.shown = sorted(shown)
 
 
 def _feet(boxes: Boxes3D) -> Array:

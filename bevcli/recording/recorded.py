@@ -1,13 +1,18 @@
-"""What is recorded: the facts about a model and a drive that a recording states."""
+"""What is recorded: a drive, the results of a model, and how much of them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.recording.colors import Color, class_colors
+from bevcli.recording.options import RecordingOptions
 
 if TYPE_CHECKING:
     from bevcli.model.config import ModelConfig
@@ -49,11 +54,35 @@ class RecordedDrive(Protocol):
         """The frames that are known in advance; their rate is written."""
 
 
-def weights_note(model: RecordedModel, sequence: RecordedDrive) -> str:
-    """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
-    if model.untrained:
-        return UNTRAINED
-    return FROM_RENDERED if model.bundled and not sequence.facts.rendered else ""
+@dataclass(frozen=True)
+class Recorded:
+    """A drive, the model that runs on it, and how much of both a recording holds."""
+
+    drive: RecordedDrive
+    model: RecordedModel
+    options: RecordingOptions
+
+    @property
+    def title(self) -> str:
+        """The names of the drive and of the model."""
+        return f"{self.drive.name} · {self.model.config.name}"
+
+    @property
+    def note(self) -> str:
+        """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
+        if self.model.untrained:
+            return UNTRAINED
+        return FROM_RENDERED if self.model.bundled and not self.drive.facts.rendered else ""
+
+    @cached_property
+    def classes(self) -> Mapping[str, Color]:
+        """The model's classes and their colours."""
+        return class_colors(self.model.config.object_classes.values())
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that is written; none without a map."""
+        return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
 
 
 def frame_rate_hz(stamps: tuple[FrameStamp, ...]) -> float:

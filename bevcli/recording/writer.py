@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import rerun as rr
 
 from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, Prediction
-from bevcli.geometry.object_classes import hex_of_color
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import Layout, LayoutFacts, recording_blueprint
+from bevcli.recording.blueprint import Layout, recording_blueprint
 from bevcli.recording.class_meshes import read_class_meshes
-from bevcli.recording.colors import Color
 from bevcli.recording.frame_log import FrameLog, FrameLogState
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.recorded import RecordedDrive, RecordedModel, frame_rate_hz
+from bevcli.recording.recorded import Recorded, RecordedDrive, RecordedModel
 from bevcli.recording.rrd_file import RrdFile
 from bevcli.recording.vehicle import load_vehicle
 
@@ -79,11 +76,8 @@ class Recording:
         live: LiveSink | None = None,
         resume: RecordingState | None = None,
     ) -> None:
-        self.path, self.rig = Path(path), sequence.rig
-        self.title = f"{sequence.name} · {model.config.name}"
-        self.options = RecordingOptions() if options is None else options
-        self._config, self._on_earth = model.config, sequence.facts.geo_origin is not None
-        self._rate_hz, self._live = frame_rate_hz(sequence.stamps), live
+        self.path, self._live = Path(path), live
+        self._recorded = Recorded(sequence, model, RecordingOptions() if options is None else options)
         self._recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
         self._size = None if resume is None else resume.size
         # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait
@@ -92,56 +86,24 @@ class Recording:
         self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id)
         self._frames = 0
         frames = None if resume is None else resume.frames
-        self._frame_log = FrameLog(self._stream, sequence, model, self.options, frames)
+        self._frame_log = FrameLog(self._stream, self._recorded, frames)
 
     def __enter__(self) -> Recording:
-        mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
+        recorded, config = self._recorded, self._recorded.model.config
+        mesh = recorded.options.vehicle_mesh
         vehicle = None if mesh is None else load_vehicle(mesh)
-        meshes = read_class_meshes(self._config.object_classes)
-        map_classes = self._config.map_classes if self.options.shows_internals else ()
-        lines = log_static.line_entries(self._config)
-        legend = log_static.legend_entries(self._frame_log.classes, map_classes, lines)
-        facts = LayoutFacts(
-            note=self._frame_log.note,
-            probes=bool(self.options.probes),
-            segmentation=bool(map_classes),
-            rate_hz=self._rate_hz,
-            on_earth=self._on_earth,
-            legend_entries=len(legend),
-            grid=grid,
-        )
-        self._layout = recording_blueprint(self.rig, facts)
+        meshes = read_class_meshes(config.object_classes)
+        self._layout = recording_blueprint(recorded)
         self._file = RrdFile(self.path, self._size)
-        follows = replace(facts, follows=self._live is not None)
-        self._connect(recording_blueprint(self.rig, follows))
+        self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
-        log_static.log_scene(self._stream, self.rig, self._frame_log.classes, vehicle, grid)
+        log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, config.bev_grid)
         for name, of_class in meshes.items():
             log_static.log_mesh(self._stream, entities.class_mesh(name), of_class)
-        self._log_about(map_classes, lines)
-        log_static.log_legend(self._stream, legend)
+        log_static.log_about(self._stream, recorded)
+        log_static.log_legend(self._stream, log_static.legend_entries(recorded))
         return self
-
-    def _log_about(self, map_classes: tuple[str, ...], lines: Sequence[tuple[str, Color]]) -> None:
-        """Writes the page "About", and the facts of the run that readers of the file need."""
-        of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
-        if lines:
-            names, colors = zip(*lines, strict=True)
-            of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
-        untrained, classes = self._frame_log.untrained, self._frame_log.classes
-        facts = rr.AnyValues(
-            title=self.title,
-            untrained=untrained,
-            note=self._frame_log.note,
-            score=self.options.score,
-            class_names=list(classes),
-            class_colors=list(map(hex_of_color, classes.values())),
-            camera_names=list(self.rig.names),
-            **of_map,
-        )
-        text = log_static.about_text(self.title, self.rig, self.options, untrained=untrained)
-        self._stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
 
     def _connect(self, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""

@@ -5,10 +5,10 @@ import hashlib
 import json
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
-from bevcli.sequences.files.incremental_json import partial_path
+from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.lines_file import LinesWriter
 from bevcli.sequences.files.map_folder import map_path, write_map
@@ -38,6 +38,7 @@ BEV = "BEV features"
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
 BLOCK = 1 << 20  # bytes
+Growing = TypeVar("Growing", bound=GrowingFile)
 ResultWriter = LinesWriter | PlanWriter
 RESULT_WRITERS: Mapping[type, type[ResultWriter]] = {MapLines: LinesWriter, Plan: PlanWriter}  # by the type of results
 
@@ -85,29 +86,17 @@ class FilesState:
 
     Attributes:
         recording: of recording.rrd.
-        predictions: bytes of predictions.json.
-        tracks: bytes of tracks.csv, None without one.
-        submission: bytes of results_nusc.json, None without one.
-        results: name -> bytes of the files of further results.
+        sizes: name -> bytes of each other file that grows.
         kept: what each file holds, by its name; the files of single frames by the name of their folder.
         map_frames: indices of the frames that have a map.
         bev_frames: indices of the frames that have BEV features.
     """
 
     recording: RecordingState
-    predictions: int
-    tracks: int | None
-    submission: int | None
-    results: Mapping[str, int]
+    sizes: Mapping[str, int]
     kept: Mapping[str, Kept]
     map_frames: tuple[int, ...]
     bev_frames: tuple[int, ...]
-
-    @property
-    def sizes(self) -> dict[str, int | None]:
-        """Bytes of each file that grows, None for one that does not exist."""
-        sizes = self.recording.size, self.predictions, self.tracks, self.submission
-        return dict(zip((RECORDING, PREDICTIONS, TRACKS, SUBMISSION), sizes, strict=True)) | dict(self.results)
 
 
 class RunFiles:
@@ -129,6 +118,7 @@ class RunFiles:
         self._folder, self._out, self._resume = folder, folder.path, resume
         self._sequence, self._model, self._options, self._live = sequence, model, options, live
         self._stack = contextlib.ExitStack()
+        self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
         self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
@@ -156,16 +146,17 @@ class RunFiles:
             "range_m": grid.nearest_side_m,
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
-        sizes = {} if resume is None else resume.sizes
-        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=sizes.get(PREDICTIONS))
         with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)
-            self._boxes = self._stack.enter_context(boxes)
+            self._boxes = self._open(PREDICTIONS, BoxesWriter, frame_of_reference=self._reference, extras=extras)
             if self._options.track:
-                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, sizes.get(TRACKS)))
-            self._open_results(extras)
-            if sizes.get(SUBMISSION) is not None:
-                self._open_submission(sizes[SUBMISSION])
+                self._tracks = self._open(TRACKS, CsvWriter)
+            for kind, names in config.results.items():
+                write: Callable[..., ResultWriter] = RESULT_WRITERS[kind]
+                facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
+                self._results[kind] = self._open(RESULT_WRITERS[kind].file_name, write, **facts)
+            if resume is not None and SUBMISSION in resume.sizes:
+                self._submission = self._open(SUBMISSION, SubmissionWriter)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
@@ -198,7 +189,8 @@ class RunFiles:
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
             self._tracks.write(tracked, self._reference)
         if frame.sample_token is not None:
-            (self._submission or self._open_submission()).write(boxes)
+            self._submission = self._submission or self._open(SUBMISSION, SubmissionWriter)
+            self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
             writer.write(ground, next((result for result in prediction.results if isinstance(result, kind)), None))
@@ -225,18 +217,15 @@ class RunFiles:
         recording = self._recording.state()
         if recording is None:
             return None
-        tracks, submission = (None if file is None else file.size for file in (self._tracks, self._submission))
-        frames = tuple(self._map_frames), tuple(self._bev_frames)
-        results = {writer.file_name: writer.size for writer in self._results.values()}
-        state = FilesState(recording, self._boxes.size, tracks, submission, results, {}, *frames)
+        sizes = {name: file.size for name, file in self._files.items()}
+        state = FilesState(recording, sizes, {}, tuple(self._map_frames), tuple(self._bev_frames))
         return replace(state, kept=dict(self._kept(state)))
 
     def _kept(self, state: FilesState) -> Iterator[tuple[str, Kept]]:
         """What the files hold up to the sizes of a state, by name."""
-        for name, size in state.sizes.items():
-            if size is not None:
-                partial = partial_path(self._out / name)
-                yield name, self._growing[name].up_to(partial if partial.exists() else self._out / name, size)
+        for name, size in {RECORDING: state.recording.size, **state.sizes}.items():
+            unfinished = partial_path(self._out / name)
+            yield name, self._growing[name].up_to(unfinished if unfinished.exists() else self._out / name, size)
         yield SEGMENTATION, self._growing[SEGMENTATION].kept
         yield BEV, self._growing[BEV].kept
 
@@ -260,25 +249,16 @@ class RunFiles:
         for ending in ("npy", "json"):
             self._growing[BEV].add(self._options.save_bev / f"{index:06d}.{ending}")
 
-    def _open_results(self, extras: Mapping[str, Any]) -> None:
-        """Open the file of each type of further results that the model has."""
-        for kind, names in self._model.config.results.items():
-            write = RESULT_WRITERS[kind]
-            name = write.file_name
-            path, resume_at = self._out / name, None if self._resume is None else self._resume.results[name]
-            self._folder.add(path)
-            self._results[kind] = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
-            self._stack.callback(self._results[kind].close)
-
-    def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
-        self._folder.add(self._out / SUBMISSION)
-        self._submission = self._stack.enter_context(SubmissionWriter(self._out / SUBMISSION, resume_at))
-        return self._submission
+    def _open(self, name: str, write: Callable[..., Growing], **how: Any) -> Growing:
+        """Open a file that grows; of a resumed run, where it ended. write: takes its path, `resume_at` and `how`."""
+        self._folder.add(self._out / name)
+        resume_at = None if self._resume is None else self._resume.sizes.get(name)
+        file = write(self._out / name, resume_at=resume_at, **how)
+        self._files[name] = self._stack.enter_context(file)
+        return file
 
     def _check_that_files_exist(self) -> None:
-        deleted = [self._recording.is_deleted(), self._boxes.is_deleted()]
-        deleted += [writer.is_deleted() for writer in self._results.values()]
-        if any(deleted) or (self._tracks is not None and self._tracks.is_deleted()):
+        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
             raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
 
     def written(self) -> tuple[Path, ...]:

@@ -12,8 +12,8 @@ from bevcli.inference.background import write_behind
 from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.run import RunnerState, run_steps
-from bevcli.inference.runner import StepOptions
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.check_drive import CheckedDrive
@@ -69,11 +69,13 @@ def run_into_folder(
         ask_attention=options.recording.shows_internals,
         probes=tuple(options.recording.probes),
         commands=read_commands(options.command, model.config),
+        track=options.track,
+        tracker=model.tracker if options.track else None,
     )
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands.since)}
+        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands)}
         memory = model_class(model.config).memory_type
         state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
         if resume and state is None and folder.has_files():
@@ -118,16 +120,15 @@ def _run_from(
 ) -> None:
     """Run the frames after a state, write them, and save the state."""
     saver = StateSaver(folder.state_path)
-    start, runner, is_whole = state.frames, state.runner, True
+    start, latest, is_whole = state.frames, state.runner, True
 
     def save() -> None:
         parts = files.state()
         if parts is not None:
-            kept = RunnerState() if summary.is_complete else runner  # nothing comes after the last frame
-            memory, stamp = (None, None) if kept.bev is None else (kept.bev.memory, kept.bev.stamp)
-            saver.save(RunState(state.facts, parts, summary.counts, memory, stamp, kept.tracks))
+            kept = RunnerState() if summary.is_complete else latest  # nothing comes after the last frame
+            saver.save(RunState(state.facts, parts, summary.counts, kept))
 
-    def write(step: tuple[Frame, Prediction, RunnerState]) -> float:
+    def write(step: tuple[Frame, Prediction, RunnerState[Any]]) -> float:
         """The seconds that writing the frame took."""
         nonlocal is_whole
         is_whole, writing_began = False, time.perf_counter()
@@ -137,12 +138,13 @@ def _run_from(
     with files:
         try:
             began = time.perf_counter()
-            steps = run_steps(model, sequence, asked, options.cameras, track=options.track, start=start, state=runner)
+            runner, places = Runner(model.prepared, model.device, asked), range(start, len(sequence.stamps))
+            steps = runner.run(sequence, places, Preprocessor(model.config, options.cameras), latest)
             for (frame, prediction, after), recording_s in write_behind(write, steps):
                 now = time.perf_counter()
                 summary.add(frame, prediction, recording_s=recording_s, whole_s=now - began)
-                runner, is_whole, began = after, True, now
-                if saver.is_due(runner):
+                latest, is_whole, began = after, True, now
+                if saver.is_due(latest):
                     save()
                 after_frame(frame, prediction)
                 if should_stop():

@@ -8,7 +8,7 @@ the type that it expects, so that nothing in a file decides what is made of it.
 import hashlib
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, get_origin
 
@@ -20,11 +20,9 @@ from torch import Tensor
 
 from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import FrameStamp, Sequence
-from bevcli.inference.load import Model
-from bevcli.inference.run import RunnerState
-from bevcli.inference.runner import BevState
-from bevcli.inference.tracking import TrackerState
+from bevcli.frame import Sequence
+from bevcli.inference.load import Model, hash_of
+from bevcli.inference.runner import Memory, RunnerState
 from bevcli.inference.transfer import tensors_in
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.pth import read_safetensors
@@ -33,7 +31,7 @@ from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts
 from bevcli.writing import write_whole
 
-FORMAT = "bevcli-state/4"
+FORMAT = "bevcli-state/5"
 LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may state an array of gigabytes
 SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
@@ -49,7 +47,6 @@ class _HasFacts(Protocol):
 
 Loaded = TypeVar("Loaded")
 State = TypeVar("State", bound=_HasFacts)
-Memory = TypeVar("Memory")
 
 
 @dataclass(frozen=True)
@@ -60,28 +57,18 @@ class RunState(Generic[Memory]):
         facts: what the run was made of, see `run_facts`.
         files: None as long as nothing can be kept; the run then starts anew.
         counts: of the summary so far.
-        memory: of the model, see `BevState`; None before the first frame and after the last one.
-        stamp: of the last frame, see `BevState`.
-        tracks: of the tracker.
+        runner: what the next frame needs; nothing before the first frame and after the last one.
     """
 
     facts: Mapping[str, str]
     files: FilesState | None
     counts: Counts
-    memory: Memory | None = None
-    stamp: FrameStamp | None = None
-    tracks: TrackerState | None = None
+    runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
     @property
     def frames(self) -> int:
         """Number of finished frames."""
         return self.counts.whole.count
-
-    @property
-    def runner(self) -> RunnerState:
-        """The state that the next frame needs."""
-        bev: Any = None if self.memory is None else BevState(self.memory, self.stamp)
-        return RunnerState(bev, self.tracks)
 
 
 def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, str]:
@@ -134,7 +121,7 @@ class StateSaver:
         self._longest_s: float | None = None
         self.saved_frames: int | None = None
 
-    def is_due(self, runner: RunnerState) -> bool:
+    def is_due(self, runner: RunnerState[Any]) -> bool:
         """Time has been long enough for another save."""
         assumed_s = ASSUMED_S + sum(tensor.nbytes for _, tensor in tensors_in(runner)) / ASSUMED_BYTES_PER_S
         next_s = assumed_s if self._longest_s is None else self._longest_s
@@ -186,7 +173,7 @@ def short_hash(hexdigest: str) -> str:
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors = _tensors_of(state)
-    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}), regular=True)
+    write_whole(path, save(tensors, {"format": FORMAT, "sha256": hash_of(sorted(tensors.items()))}), regular=True)
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:
@@ -201,7 +188,7 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
             f'{path}: is not a state file of this version: "format" must be "{FORMAT}", '
             f'found "{metadata.get("format", ""):.40}"'
         )
-    if _TREE not in tensors or metadata.get("sha256") != _hash(tensors):
+    if _TREE not in tensors or metadata.get("sha256") != hash_of(sorted(tensors.items())):
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
 
     def decoded(expected: type, found: Any) -> Any:
@@ -218,7 +205,7 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
 
 def digest(tree: object) -> str:
     """The hash of a tree that `save_state` could write."""
-    return _hash(_tensors_of(tree))
+    return hash_of(sorted(_tensors_of(tree).items()))
 
 
 def _tensors_of(tree: object) -> dict[str, Tensor]:
@@ -239,16 +226,6 @@ def _tensors_of(tree: object) -> dict[str, Tensor]:
 
     text = msgspec.msgpack.encode(tree, enc_hook=encoded)
     return tensors | {_TREE: torch.frombuffer(bytearray(text), dtype=torch.uint8)}
-
-
-def _hash(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of names, types, shapes and numbers."""
-    found = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
 
 
 def _strings(content: Any, dtype: str) -> np.ndarray:

@@ -228,7 +228,7 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
     for kind in KINDS:
-        draw_faded_strips(canvas, frame, entities.bev_ground_lines(kind), to_canvas)
+        draw_faded_strips(canvas, frame, f"{entities.BEV}/{kind}", to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
     draw_strips(canvas, frame, entities.BEV_BOXES, to_canvas, 2)

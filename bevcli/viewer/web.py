@@ -14,11 +14,9 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from bevcli.errors import OutputError
@@ -55,10 +53,11 @@ def web_viewer_assets() -> dict[str, bytes]:
     return {**files, "/": FONT_LINKS.sub(b"", files["/"])}
 
 
-class WebViewer:
+class WebViewer(ThreadingHTTPServer):
     """A web server for the viewer and a recording.
 
-    The file is opened once, here: whatever takes its place later is not served.
+    The file is opened once, here: whatever takes its place later is not served. Each connection has a thread,
+    MOST_CONNECTIONS at a time. A connection that breaks is no error.
 
     Args:
         assets: the web viewer's files by path (`web_viewer_assets`).
@@ -67,8 +66,14 @@ class WebViewer:
         port: the preferred port; if it is in use, the next free one is taken.
         ended: set when the file has its last byte; until then, viewers get what is appended. None for a whole file.
 
+    Attributes:
+        live_transfers: threads that send a recording while it grows.
+        last_block_s: time at which a viewer took the last block (time.monotonic()).
+
     Raises OutputError where the recording cannot be read, or is no file.
     """
+
+    daemon_threads = True
 
     def __init__(
         self,
@@ -79,9 +84,14 @@ class WebViewer:
         *,
         ended: threading.Event | None = None,
     ) -> None:
-        handler = partial(_Handler, assets, open_regular(recording, error=OutputError), ended)
+        if ":" in host:
+            self.address_family = socket.AF_INET6
+        self.assets, self.file, self.ended = assets, open_regular(recording, error=OutputError), ended
+        self.live_transfers: list[threading.Thread] = []
+        self.last_block_s = 0.0
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.host, self.port = host, free_port(port, host)
-        self._server = _Server((host, self.port), handler)
+        super().__init__((self.host, self.port), _Handler)
 
     @property
     def address(self) -> str:
@@ -90,37 +100,18 @@ class WebViewer:
 
     def serve(self) -> None:
         """Serves until `close` is called from another thread."""
-        self._server.serve_forever(poll_interval=1.0)
+        self.serve_forever(poll_interval=1.0)
 
     def close(self) -> None:
         """Stops `serve`, and frees the port. Viewers that follow a recording and still read get its rest first."""
         # shutdown waits until `serve` has ended, without a limit.
-        stopping = threading.Thread(target=self._server.shutdown, daemon=True)
+        stopping = threading.Thread(target=self.shutdown, daemon=True)
         stopping.start()
         stopping.join(STOP_TIMEOUT_S)
-        self._server.server_close()
-        for transfer in self._server.live_transfers:
-            while transfer.is_alive() and time.monotonic() - self._server.last_block_s < STOP_TIMEOUT_S:
+        self.server_close()
+        for transfer in self.live_transfers:
+            while transfer.is_alive() and time.monotonic() - self.last_block_s < STOP_TIMEOUT_S:
                 transfer.join(GROWTH_PERIOD_S)
-
-
-class _Server(ThreadingHTTPServer):
-    """A thread for each connection, MOST_CONNECTIONS at a time. A connection that breaks is no error.
-
-    Attributes:
-        live_transfers: threads that send a recording while it grows.
-        last_block_s: time at which a viewer took the last block (time.monotonic()).
-    """
-
-    daemon_threads = True
-
-    def __init__(self, address: tuple[str, int], handler: Callable[..., BaseHTTPRequestHandler]) -> None:
-        if ":" in address[0]:
-            self.address_family = socket.AF_INET6
-        self.live_transfers: list[threading.Thread] = []
-        self.last_block_s = 0.0
-        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__(address, handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Starts the thread of a connection; closes the connection if there are too many."""
@@ -143,15 +134,9 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: WebViewer
     protocol_version = "HTTP/1.1"
     timeout = CONNECTION_TIMEOUT_S  # of each read and write
-
-    def __init__(
-        self, assets: dict[str, bytes], file: BinaryIO, ended: threading.Event | None, *request: object
-    ) -> None:
-        self.assets, self.file, self.ended = assets, file, ended
-        super().__init__(*request)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
         """Serves the viewer's files and the recording; "/" redirects to the viewer with the recording."""
@@ -162,9 +147,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_recording()
         elif parts.path == "/" and "url" not in parse_qs(parts.query):
             self._redirect(parts.query)
-        elif parts.path in self.assets:
-            self._send_head(200, ASSETS[parts.path], len(self.assets[parts.path]))
-            self.wfile.write(self.assets[parts.path])
+        elif parts.path in self.server.assets:
+            self._send_head(200, ASSETS[parts.path], len(self.server.assets[parts.path]))
+            self.wfile.write(self.server.assets[parts.path])
         else:
             self._send_head(404, "text/plain", 0)
 
@@ -181,8 +166,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _send_recording(self) -> None:
-        size = os.fstat(self.file.fileno()).st_size
-        if self.ended is None:
+        file, ended = self.server.file, self.server.ended
+        size = os.fstat(file.fileno()).st_size
+        if ended is None:
             self._send_head(200, "application/octet-stream", size)
             self._copy(0, size)
             return
@@ -191,8 +177,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_head(200, "application/octet-stream", None)
         sent, is_last = 0, False
         while not is_last:
-            is_last = self.ended.wait(GROWTH_PERIOD_S)
-            size = os.fstat(self.file.fileno()).st_size
+            is_last = ended.wait(GROWTH_PERIOD_S)
+            size = os.fstat(file.fileno()).st_size
             if size > sent:
                 self.wfile.write(b"%x\r\n" % (size - sent))
                 self._copy(sent, size)
@@ -203,7 +189,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _copy(self, start: int, end: int) -> None:
         """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
         while start < end:
-            block = os.pread(self.file.fileno(), min(BLOCK, end - start), start)
+            block = os.pread(self.server.file.fileno(), min(BLOCK, end - start), start)
             if not block:
                 raise ConnectionError("the recording is shorter than it was")
             self.wfile.write(block)

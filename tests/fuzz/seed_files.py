@@ -24,6 +24,7 @@ from written_formats import WRITTEN
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.runs.state import RunState, save_state
 from bevcli.runs.summary import Counts
@@ -164,7 +165,8 @@ def _runs(folder: Path) -> None:
     (folder / "out/.bevcli").mkdir(parents=True)
     (folder / "out/.bevcli/written").write_text("recording.rrd\npredictions.json\n")
     memory, stamp = BevHistory(torch.zeros(1, 4, 2), Pose.identity()), FrameStamp(0, "", 5)
-    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, None, Counts(), memory, stamp))
+    runner = RunnerState(memory, stamp)
+    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, None, Counts(), runner))
     (folder / "older").mkdir()
     (folder / "older/summary.json").write_text(json.dumps({"bevcli_version": "0.1", "files": ["older/recording.rrd"]}))
     model = torch.nn.Linear(2, 1)

@@ -9,7 +9,7 @@ from memory_drive import MemorySequence
 
 from bevcli.errors import WeightsError
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.prepare import prepare_for_inference
 
 CPU = torch.device("cpu")
@@ -78,7 +78,7 @@ def test_an_input_that_is_not_finite_is_named(mini_model, prepared_model):
     images = prepared.images.clone()
     images[0, 0, 0, 0, 0] = float("nan")
     state, prediction = runner.step(None, replace(prepared, images=images))
-    assert state is None
+    assert state == RunnerState()
     assert prediction.not_finite == "input images"
 
 

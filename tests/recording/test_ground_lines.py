@@ -60,7 +60,7 @@ def strips(frame: RecordedFrame, entity: str, dimensions: int = 3) -> list[np.nd
 
 
 def test_lines_from_above_are_in_the_bev_frame(frames: list[RecordedFrame]) -> None:
-    (line,) = strips(frames[0], entities.bev_ground_lines("map_lines"), 2)  # the other has a lower score
+    (line,) = strips(frames[0], f"{entities.BEV}/map_lines", 2)  # the other has a lower score
     np.testing.assert_allclose(line * (1, -1), LINES.points[0], atol=1e-3)
 
 
@@ -71,7 +71,7 @@ def test_the_legend_names_lines_paths_and_futures(frames: list[RecordedFrame]) -
 
 
 def test_lines_in_the_scene_lie_on_the_ground(frames: list[RecordedFrame], drive: MemorySequence) -> None:
-    (line,) = strips(frames[0], entities.ground_lines("map_lines"))
+    (line,) = strips(frames[0], f"{entities.WORLD}/map_lines")
     origin = frames[0].array(entities.WORLD, "origin", 3)[0]
     in_bev = apply(bev_from_world(drive.load(0)), line + origin)
     np.testing.assert_allclose(in_bev[:, :2], LINES.points[0], atol=1e-3)
@@ -89,7 +89,7 @@ def test_a_line_in_the_image_is_where_opencv_projects_it(frames: list[RecordedFr
 
 
 def test_the_commanded_path_is_a_ribbon(frames: list[RecordedFrame]) -> None:
-    found = strips(frames[0], entities.bev_ground_lines("plan"), 2)
+    found = strips(frames[0], f"{entities.BEV}/plan", 2)
     left, (one, other, *rungs), straight = found[0], found[1:-1], found[-1]
     np.testing.assert_allclose(left * (1, -1), [[0, 0], *PLAN.paths[0]], atol=1e-3)
     np.testing.assert_allclose(straight * (1, -1), [[0, 0], *PLAN.paths[1]], atol=1e-3)
@@ -108,8 +108,8 @@ def test_futures_fade_with_time_and_with_the_score_of_the_mode() -> None:
 
 def test_a_frame_without_results_shows_none(frames: list[RecordedFrame]) -> None:
     for kind in ("map_lines", "plan", FUTURES):
-        assert strips(frames[0], entities.ground_lines(kind))
-        assert not strips(frames[1], entities.ground_lines(kind))
+        assert strips(frames[0], f"{entities.WORLD}/{kind}")
+        assert not strips(frames[1], f"{entities.WORLD}/{kind}")
         assert not strips(frames[1], entities.overlay("CAM_FRONT", kind), 2)
 
 

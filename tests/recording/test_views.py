@@ -26,7 +26,8 @@ from bevcli.recording.colors import (
     map_colors,
 )
 from bevcli.recording.log_static import legend_entries, ring_distances_m
-from bevcli.recording.recorded import FROM_RENDERED, UNTRAINED, frame_rate_hz, weights_note
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.recorded import FROM_RENDERED, UNTRAINED, Recorded, frame_rate_hz
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -67,11 +68,13 @@ def test_map_classes_of_any_name_have_different_colours():
 
 
 def test_the_legend_names_every_class_and_map_class():
-    colors = class_colors(TINY.object_classes.values())
-    names = [text for text, _ in legend_entries(colors, list(MAP_CLASSES))]
+    def legend(config):
+        return [text for text, _ in legend_entries(Recorded(Drive(), NamedModel(config=config), RecordingOptions()))]
+
+    names = legend(replace(TINY, heads=("detection", "segmentation")))
     assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
     assert {f"map: {name.replace('_', ' ')}" for name in MAP_CLASSES} <= set(names)
-    assert not any(text.startswith("map") for text, _ in legend_entries(colors))
+    assert not any(text.startswith("map") for text in legend(TINY))
 
 
 def test_the_legend_is_in_the_recording(tmp_path):
@@ -109,10 +112,13 @@ class Weights(NamedModel):
 
 
 def test_titles_say_when_the_weights_do_not_know_such_images():
-    assert weights_note(Weights(), Drive(rendered=False)) == FROM_RENDERED
-    assert weights_note(Weights(), Drive(rendered=True)) == ""
-    assert weights_note(NamedModel(), Drive(rendered=False)) == ""
-    assert weights_note(NamedModel(untrained=True), Drive(rendered=True)) == UNTRAINED
+    def note(model, rendered):
+        return Recorded(Drive(rendered=rendered), model, RecordingOptions()).note
+
+    assert note(Weights(), rendered=False) == FROM_RENDERED
+    assert note(Weights(), rendered=True) == ""
+    assert note(NamedModel(), rendered=False) == ""
+    assert note(NamedModel(untrained=True), rendered=True) == UNTRAINED
 
 
 def test_the_note_is_an_event_and_in_the_file(tmp_path):

@@ -15,7 +15,7 @@ from memory_drive import MemorySequence
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground, MapLines, Plan
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.inference.commands import Commands, read_commands
+from bevcli.inference.commands import read_commands, with_command
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.session import Session
@@ -108,7 +108,8 @@ def test_wrong_commands_are_refused(model: Model, mini_config: ModelConfig, tmp_
             read_commands(command, model.config)
     with pytest.raises(InputError, match="mini plans no path"):
         read_commands("left", mini_config)
-    assert Commands(((4, "left"),)).given_to((Plan(("left",), np.zeros((1, 1, 2)), np.ones(1)),), 3)[0].command == ""
+    plan = Plan(("left",), np.zeros((1, 1, 2)), np.ones(1))
+    assert with_command((plan,), ((4, "left"),), 3)[0].command == ""
 
 
 def test_points_lie_on_the_ground_below_the_bev_frame() -> None:

@@ -15,6 +15,7 @@ from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
+from bevcli.inference.runner import RunnerState
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
 from bevcli.recording.options import RecordingOptions
@@ -192,8 +193,16 @@ def test_a_broken_state_is_an_error_of_one_line(model, interrupted):
     assert "\n" not in str(error.value)
 
 
+def with_runner(change):
+    return lambda state: replace(state, runner=change(state.runner))
+
+
 def with_memory(**changes):
-    return lambda state: replace(state, memory=replace(state.memory, **changes))
+    return with_runner(lambda runner: replace(runner, memory=replace(runner.memory, **changes)))
+
+
+def with_size(name, size):
+    return lambda state: replace(state, files=replace(state.files, sizes={**state.files.sizes, name: size}))
 
 
 def with_times(**changes):
@@ -211,9 +220,9 @@ def with_times(**changes):
         with_memory(bev=torch.zeros(1, 3, 2)),
         with_memory(bev=torch.zeros(0)),
         with_memory(pose=Pose(np.zeros(1), np.zeros((2, 2)))),
-        lambda state: replace(state, files=replace(state.files, predictions=1 << 63)),
-        lambda state: replace(state, files=replace(state.files, tracks=-1)),
-        lambda state: replace(state, tracks=replace(state.tracks, tracks=replace(state.tracks.tracks, frames=NINE))),
+        with_size("predictions.json", 1 << 63),
+        with_size("tracks.csv", -1),
+        with_runner(lambda it: replace(it, tracks=replace(it.tracks, tracks=replace(it.tracks.tracks, frames=NINE)))),
         with_times(count=-1),
         with_times(total_s=float("nan")),
         with_times(bins={10**6: 3}),
@@ -289,7 +298,7 @@ def test_saving_states_takes_two_percent_of_the_time_at_most(model, tmp_path, mo
     spent = 0
     for _ in range(10_000):
         clock[0] += 0.1
-        if saver.is_due(run_state.RunnerState()):
+        if saver.is_due(RunnerState()):
             saver.save(run_state.RunState({}, None, Counts()))
             spent += 1
         assert spent * 0.5 <= 0.02 * clock[0] + 0.5  # the first save's time is not known before

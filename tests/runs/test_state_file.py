@@ -15,6 +15,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.model.bevformer_v2.window import FeatureWindow
 from bevcli.model.uniad.uniad import TrackMemory
@@ -66,7 +67,7 @@ def test_a_state_comes_back_exactly(tmp_path):
 
 @pytest.mark.parametrize("memory", [BevHistory, FeatureWindow, TrackMemory])
 def test_a_run_state_takes_the_memory_of_its_model(tmp_path, memory):
-    none: RunState[None] = RunState({"model": "mini"}, None, Counts(), stamp=FrameStamp(2, "", 5))
+    none: RunState[None] = RunState({"model": "mini"}, None, Counts(), RunnerState(stamp=FrameStamp(2, "", 5)))
     save_state(tmp_path / "state", none)
     assert load_state(tmp_path / "state", RunState[memory]) == none
 

@@ -135,7 +135,7 @@ def test_a_viewer_that_dies_or_hangs_does_not_disturb_the_run(tmp_path, monkeypa
     try:
         view = LiveView()
         with Recording(path, drive, NamedModel(), live=view) as recording:
-            while not view.server._server.live_transfers:
+            while not view.server.live_transfers:
                 time.sleep(0.1)  # until the viewer is connected
             for place in range(8):
                 if place == 3:

@@ -200,7 +200,7 @@ def test_a_port_in_use_is_replaced_by_another(viewer, tmp_path):
     (tmp_path / "recording.rrd").touch()
     second = WebViewer(PAGE, tmp_path / "recording.rrd", port=viewer.port)
     assert second.port != viewer.port
-    second._server.server_close()
+    second.server_close()
 
 
 def test_the_assets_are_the_files_of_the_viewer(viewer):
