@@ -56,7 +56,7 @@ class WarmPython:
     """Takes the place of `run_python`. The process starts with the first program and ends with `close`."""
 
     def __init__(self) -> None:
-        self._server: subprocess.Popen[str] | None = None
+        self._server: subprocess.Popen[bytes] | None = None
 
     def __call__(
         self,
@@ -75,7 +75,8 @@ class WarmPython:
             err.touch()
             streams = [os.devnull, str(out), str(err)]
             program = LIMIT_MEMORY.format(memory=memory) + code
-            print(json.dumps([program, words, dict(environment), os.getcwd(), streams]), file=self._server.stdin)
+            request = json.dumps([program, words, dict(environment), os.getcwd(), streams])
+            self._server.stdin.write(request.encode() + b"\n")
             child = int(self._server.stdout.readline())
             late = not select([self._server.stdout], [], [], seconds)[0]
             if late:
@@ -90,8 +91,9 @@ class WarmPython:
             self._server.communicate(timeout=10)  # it ends where its input ends
 
 
-def _start() -> subprocess.Popen[str]:
+def _start() -> subprocess.Popen[bytes]:
     environment = {**os.environ, **CHECK_ENVIRONMENT, "RUST_BACKTRACE": "0", "OPENBLAS_NUM_THREADS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     command, pipe = [sys.executable, "-P", "-c", SERVER], subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1, env=environment)
+    # Without a buffer, which would hide from `select` what it holds.
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, bufsize=0, env=environment)
