@@ -2,15 +2,19 @@
 
 import gc
 import os
+import sys
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from warm_python import WarmPython
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.inference.cpu_settings import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
@@ -26,16 +30,19 @@ from bevcli.model.vad.motion_head import MotionConfig
 from bevcli.model.vad.vad import VAD
 from bevcli.viewer import recording_file
 
-# Files that one worker runs, because they share what takes long: imports for the export, processes to fork from, and
-# syntax trees.
+# Files that one worker runs, because they share what takes long: processes to fork from, an exported model, a rendered
+# drive, and syntax trees.
 GROUPS = {
-    "export": ("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
-    "processes": ("test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
-    "code": ("test_extend", "test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
+    "processes": (
+        *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
+        *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
+    ),
+    "rendered": ("test_drive", "test_export", "test_random_rig", "test_rendered_lens"),
+    "code": ("test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.
-FIRST = ("export", "processes", "test_fuzz", "test_equals_original", "test_resume", "test_drive", "test_demo_model")
+FIRST = ("processes", "rendered", "test_resume", "test_fuzz", "test_equals_original", "test_run_batch")
 
 
 def group_of(file: str) -> str:
@@ -69,6 +76,31 @@ def no_weights_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BEVCLI_WEIGHTS_DIR", str(folder / "weights"))
         patch.setenv("XDG_CONFIG_HOME", str(folder / "settings"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def memory_settings_of_the_program() -> None:
+    """The program sets them at its start: otherwise page faults take much of the time of large models."""
+    keep_freed_memory()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm_python() -> Iterator[WarmPython]:
+    """The process that checks a recording makes its imports once a worker. Tests of the process itself undo this."""
+    warm = WarmPython()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording_file, "run_python", warm)
+        yield warm
+    warm.close()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def assets_built_once() -> Iterator[None]:
+    """The meshes of rendered drives, which are always the same. They are imported where tests of rendering are."""
+    with pytest.MonkeyPatch.context() as patch:
+        if catalog := sys.modules.get("bevcli.synth.assets.catalog"):
+            patch.setattr(catalog.Assets, "build", cache(catalog.Assets.build))
         yield
 
 
@@ -132,10 +164,12 @@ def mini_vad(mini_config) -> VAD:
 @pytest.fixture(scope="session")
 def window_model(mini_config):
     """A function: frames of the window -> a small BEVFormerV2; models of as many frames have the same weights."""
+    encoder, decoder = (replace(part, layers=1) for part in (mini_config.encoder, mini_config.decoder))
+    changes = {"ego_motion": NO_EGO_MOTION, "neck": FPNConfig(levels=5), "fusion": BevFusionConfig(2, 48)}
+    changes |= {"encoder": encoder, "decoder": decoder}
 
     def make(*frames: int) -> BEVFormerV2:
         settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
-        changes = {"ego_motion": NO_EGO_MOTION, "neck": FPNConfig(levels=5), "fusion": BevFusionConfig(2, 48)}
         torch.manual_seed(0)
         model = BEVFormerV2(BEVFormerV2Config(**{**settings, **changes}, frames=frames)).eval()
         with torch.no_grad():

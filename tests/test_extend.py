@@ -11,12 +11,16 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from textwrap import dedent
 
 import pytest
 from command_line import MINI_TOML
+from forks import FORKS, run_in_fork
 from source_code import ROOT as PACKAGE, trees
+
+from bevcli.registry import entries
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/extend.md").read_text()
@@ -58,6 +62,22 @@ def python(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+def bevcli(folder: Path, *arguments: str) -> str:
+    """The output of `bevcli` with the package installed."""
+    texts = folder / "texts"
+    before = partial(install, folder)
+    process = FORKS.Process(target=run_in_fork, args=(folder, arguments, str(texts)), kwargs={"before": before})
+    process.start()
+    process.join(240)
+    assert process.exitcode == 0, f"{shlex.join(arguments)}\n{texts.read_text()}"
+    return texts.read_text()
+
+
+def install(folder: Path) -> None:
+    sys.path.insert(0, str(folder))
+    entries.cache_clear()
+
+
 def test_format_and_model_of_the_page_are_short():
     assert lines("bevcli_ground/drive_file.py") <= 42
     assert lines("bevcli_ground/ground.py") <= 80
@@ -70,16 +90,16 @@ def test_the_pages_commands_run(folder):
     for line in commands:
         program, *arguments = shlex.split(line)
         assert program == "bevcli"
-        printed = python(folder, "-m", "bevcli", *arguments)
+        printed = bevcli(folder, *arguments)
     assert re.fullmatch(r"((car|pedestrian) \d+\n)+", printed)
     summary = json.loads((folder / "runs/ground/summary.json").read_text())
     assert summary["frames"] == 2  # of three, by --skip 1
 
 
 def test_help_lists_the_command_of_the_page(folder):
-    assert "Print the number of boxes of each class in a run." in python(folder, "-m", "bevcli", "--help")
-    assert "--min-score" in python(folder, "-m", "bevcli", "count", "--help")
-    assert "--skip" in python(folder, "-m", "bevcli", "run", "--help")
+    assert "Print the number of boxes of each class in a run." in bevcli(folder, "--help")
+    assert "--min-score" in bevcli(folder, "count", "--help")
+    assert "--skip" in bevcli(folder, "run", "--help")
 
 
 def test_a_formats_option_is_one_line(folder):
@@ -92,7 +112,7 @@ def test_a_formats_option_is_one_line(folder):
 def test_the_engine_of_the_page_runs_an_exported_file(folder):
     pytest.importorskip("onnxruntime")
     (folder / "mini.toml").write_text(MINI_TOML)
-    python(folder, "-m", "bevcli", "export-onnx", "--model", "mini.toml", "--untrained", "-o", "mini.onnx")
+    bevcli(folder, "export-onnx", "--model", "mini.toml", "--untrained", "-o", "mini.onnx")
     code = (
         "import bevcli; drive = bevcli.open_sequence('samples/street', frames=slice(0, 1))\n"
         "for engine in ('unoptimised', 'onnxruntime'):\n"
@@ -102,7 +122,7 @@ def test_the_engine_of_the_page_runs_an_exported_file(folder):
     plain, optimised = python(folder, "-c", code).splitlines()
     assert plain == optimised
     options = ("--engine", "unoptimised", "--frames", "0:1", "--out", "runs/engine")
-    python(folder, "-m", "bevcli", "run", "samples/street", "--model", "mini.onnx", *options)
+    bevcli(folder, "run", "samples/street", "--model", "mini.onnx", *options)
     assert json.loads((folder / "runs/engine/summary.json").read_text())["frames"] == 1
 
 

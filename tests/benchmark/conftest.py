@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
 import pytest
+
+from bevcli.benchmark import made_up
 
 SMALL = {
     "size = [800, 450]": "size = [160, 90]",
@@ -23,6 +27,14 @@ SMALL_UNIAD = {
     "blocks = [3, 4, 23, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
     "queries = 901": "queries = 30",
 }
+
+
+@pytest.fixture(scope="session", autouse=True)
+def images_made_once() -> Iterator[None]:
+    """The images of made-up drives, which are always the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(made_up, "_jpeg", cache(made_up._jpeg))
+        yield
 
 
 @pytest.fixture

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from statistics import median
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
-from bevcli.benchmark import limits, measure, result
+from bevcli.benchmark import limits, made_up, measure, result
 from bevcli.benchmark.limits import MachineLimits
 from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
@@ -21,6 +22,17 @@ from bevcli.engines.engine import installed_engines
 from bevcli.errors import BevcliError
 from bevcli.inference.engine_choice import fastest_engine
 from bevcli.inference.preprocess import Preprocessor
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_images():
+    """Images of a fourth of the width and the same field of view."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):
+            patch.setattr(made_up, name, getattr(made_up, name) // 4)
+        patch.setattr(made_up, "_jpeg", cache(made_up._jpeg.__wrapped__))
+        yield
+
 
 RESULT = BenchmarkResult(
     model="tiny",

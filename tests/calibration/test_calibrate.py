@@ -13,10 +13,10 @@ from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, w
 from typer.testing import CliRunner
 
 import bevcli
+from bevcli.calibration import calibrate as calibrating
 from bevcli.calibration.estimates import Verdict, either_text
 from bevcli.calibration.matches import match_points
 from bevcli.calibration.result import CorrectedDrive
-from bevcli.calibration.views import read_views
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
@@ -43,9 +43,17 @@ def street():
 
 
 @pytest.fixture(scope="module")
-def result(street):
+def matched():
+    """The matches of points that `result` was made from."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(street, matched):
     drive, _, wrong = street
-    return bevcli.calibrate(WrongRig(drive, wrong))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrating, "match_points", lambda views: matched.append(match_points(views)) or matched[-1])
+        return bevcli.calibrate(WrongRig(drive, wrong))
 
 
 def test_a_planted_rotation_is_found(street, result):
@@ -91,8 +99,8 @@ def test_lens_distortion_is_respected(street, lens, zoom):
     assert found[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
 
 
-def test_no_point_is_matched_twice(street):
-    found = match_points(read_views(WrongRig(*street[:2]), 6))
+def test_no_point_is_matched_twice(result, matched):
+    [found] = matched
     points = np.column_stack([found.group, found.pixels_a.astype(int)])
     assert len(np.unique(points, axis=0)) == len(points) > 1000
 

@@ -20,7 +20,8 @@ from small_model import model_for_engines, small_inputs
 @pytest.fixture(scope="session")
 def small_file(tmp_path_factory) -> Path:
     model, file = model_for_engines(), tmp_path_factory.mktemp("small") / "small.onnx"
-    export_onnx(model, file, contents=as_table(model.config, TrackerConfig(birth_score=0.5)), untrained=True)
+    contents = as_table(model.config, TrackerConfig(birth_score=0.5))
+    export_onnx(model, file, contents=contents, decode=True, untrained=True)
     return file
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forks import FORKS
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -161,7 +161,7 @@ def endless_file(small_file) -> Path:
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_two_signals_end_an_endless_loop_of_a_file(endless_file, tmp_path, number):
-    process = multiprocessing.get_context("spawn").Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
+    process = FORKS.Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
     process.start()
     end = time.monotonic() + 60
     while not (tmp_path / "ready").exists():

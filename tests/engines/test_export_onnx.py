@@ -22,7 +22,9 @@ from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import decode
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history
+from bevcli.model.export_step import replace_parts
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries, load
@@ -30,25 +32,31 @@ from bevcli.sequences.open import open_sequence
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original
-from small_model import small_config, small_inputs, small_model, step_of_file
+from small_model import model_for_engines, small_config, small_inputs, small_model, step_of_file
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[2]
 
 
-def one_encoder_layer() -> BEVFormer:
-    """A small model with deformable convolutions, and duplicates that merge and fade. Few layers are soon exported."""
-    config = small_config()
-    decoder = replace(config.decoder, merge_duplicates=0.6, fade_duplicates=0.7)
-    return small_model(encoder=replace(config.encoder, layers=1), decoder=decoder)
+def deformable_model() -> BEVFormer:
+    """The small model of these tests with deformable convolutions and two layers in its decoder."""
+    config = model_for_engines().config
+    return small_model(
+        encoder=config.encoder, decoder=replace(config.decoder, layers=2), image_tokens=config.image_tokens
+    )
 
 
-@pytest.fixture(scope="module", params=["operator", pytest.param("gridsample", marks=pytest.mark.slow)])
-def small_file(request, tmp_path_factory) -> Path:
-    file = tmp_path_factory.mktemp("small") / "small.onnx"
-    export_onnx(one_encoder_layer(), file, deformable_convolution=request.param, decode=True)
-    return file
+@pytest.fixture(
+    scope="module", params=["", *(pytest.param(x, marks=pytest.mark.slow) for x in ("operator", "gridsample"))]
+)
+def model_and_file(request, small_file, tmp_path_factory) -> tuple[BEVFormer, Path]:
+    """A model and its file; with deformable convolutions of either form in the slow tests."""
+    if not request.param:
+        return model_for_engines(), small_file
+    model, file = deformable_model(), tmp_path_factory.mktemp("small") / "small.onnx"
+    export_onnx(model, file, deformable_convolution=request.param, decode=True)
+    return model, file
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +66,26 @@ def demo_file(tmp_path_factory) -> Path:
     return file
 
 
-def test_a_file_equals_the_model_with_and_without_history(small_file):
-    model = one_encoder_layer()
-    exported = load_exported(small_file, "onnxruntime")
+def test_a_deformable_convolution_is_an_operator_of_a_file(tmp_path):
+    network, x = (
+        torch.nn.Sequential(*(ModulatedDeformableConvolution(3, 3, stride) for stride in (1, 2))),
+        torch.randn(1, 3, 9, 7),
+    )
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    expected = network.eval()(x).detach().numpy()
+    replace_parts(network, "operator")
+    torch.onnx.export(network, (x,), tmp_path / "x.onnx", dynamo=True, opset_version=19, optimize=False, verbose=False)
+    operators = [node.op_type for node in onnx.load(tmp_path / "x.onnx").graph.node]
+    assert (operators.count("DeformConv"), "GridSample" in operators) == (2, False)
+    session = onnxruntime.InferenceSession(tmp_path / "x.onnx")
+    [found] = session.run(None, {session.get_inputs()[0].name: x.numpy()})
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_a_file_equals_the_model_with_and_without_history(model_and_file):
+    model, file = model_and_file
+    exported = load_exported(file, "onnxruntime")
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
@@ -70,9 +95,9 @@ def test_a_file_equals_the_model_with_and_without_history(small_file):
         torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
 
 
-def test_a_camera_without_an_image_sees_nothing(small_file):
-    model = one_encoder_layer()
-    exported = load_exported(small_file, "onnxruntime")
+def test_a_camera_without_an_image_sees_nothing(model_and_file):
+    model, file = model_and_file
+    exported = load_exported(file, "onnxruntime")
     inputs = small_inputs()
     inputs.has_image[:] = False
     with torch.inference_mode():
@@ -101,9 +126,9 @@ def test_a_file_for_wide_cameras_is_larger_and_embeds_the_rig(tmp_path):
     assert read_metadata(metadata, tmp_path).config.image == small_config().image  # of one size for every rig
 
 
-def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
-    model = one_encoder_layer()
-    exported = load_exported(small_file, "onnxruntime")
+def test_decoded_boxes_equal_the_decoder_of_the_library(model_and_file):
+    model, file = model_and_file
+    exported = load_exported(file, "onnxruntime")
     found: dict[str, np.ndarray] = {}
     exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
@@ -144,8 +169,8 @@ def test_the_history_is_rotated_to_the_same_cells(tmp_path):
         assert differs["openvino"].sum() <= 20
 
 
-def test_a_file_has_standard_operators_and_documents_its_inputs(small_file):
-    proto = onnx.load(small_file)
+def test_a_file_has_standard_operators_and_documents_its_inputs(model_and_file):
+    proto = onnx.load(model_and_file[1])
     assert {node.domain for node in proto.graph.node} <= {"", "ai.onnx"}
     assert [(entry.domain, entry.version) for entry in proto.opset_import] == [("", 19)]
     operators = {node.op_type for node in proto.graph.node}
@@ -163,6 +188,7 @@ def test_demo_equals_our_model_over_a_real_drive(demo_file, shared):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # base takes 262 s on two cores with nothing beside it
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])
 def test_published_models_equal_ours_over_a_real_drive(name, shared, tmp_path):
     drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
@@ -203,9 +229,9 @@ def test_the_deployment_pages_program_finds_the_boxes_of_bevcli(demo_file, tmp_p
         np.testing.assert_allclose(json.loads(best)[:3], boxes.centers[0], atol=0.02)
 
 
-def test_mistakes_are_named(small_file, tmp_path):
+def test_mistakes_are_named(tmp_path):
     with pytest.raises(BevcliError, match="expected 19 or newer"):
-        export_onnx(one_encoder_layer(), tmp_path / "old.onnx", opset=18)
+        export_onnx(model_for_engines(), tmp_path / "old.onnx", opset=18)
     (tmp_path / "broken.onnx").write_bytes(b"no model")
     for engine in entries("bevcli.engines"):
         with pytest.raises(WeightsError, match="cannot load it"):

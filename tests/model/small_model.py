@@ -53,10 +53,10 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
 
 
 def model_for_engines() -> BEVFormer:
-    """A small model without deformable convolutions, which OpenVINO lacks; for two cameras."""
+    """A small model without deformable convolutions, which OpenVINO lacks; duplicates of its boxes merge and fade."""
     return small_model(
         encoder=replace(small_config().encoder, layers=1),
-        decoder=replace(small_config().decoder, layers=1),
+        decoder=replace(small_config().decoder, layers=1, merge_duplicates=0.6, fade_duplicates=0.7),
         backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
         image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
     )

@@ -1,7 +1,9 @@
 """A run over thousands of frames takes no more memory, files, threads or sockets than one over a hundred."""
 
 import gc
+import multiprocessing
 import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -13,6 +15,7 @@ from memory_drive import MemorySequence, make_camera
 from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import Model
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.recording import writer
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.viewer.recording_file import open_recording
@@ -100,6 +103,12 @@ def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path, monkey
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_ten_thousand_frames_take_the_memory_of_a_hundred(mini_model, tmp_path):
-    found = measured_run(mini_model, tmp_path / "out", 10_000, range(100, 10_000, 50))
+def test_ten_thousand_frames_take_the_memory_of_a_hundred(mini_config, tmp_path):
+    """In a process of its own: one of many tests has freed memory that a long run may take or not."""
+    encoder, decoder = (replace(part, layers=1) for part in (mini_config.encoder, mini_config.decoder))
+    image = replace(mini_config.image, size=(48, 27))
+    decoder = replace(decoder, queries=10, max_boxes=5)
+    model = BEVFormer(replace(mini_config, image=image, encoder=encoder, decoder=decoder)).eval()
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        found = pool.submit(measured_run, model, tmp_path / "out", 10_000, range(100, 10_000, 50)).result()
     assert_flat(found, 20 * MIB, 120 * MIB)  # now and then four indexes of 28 MB are in memory

@@ -48,7 +48,8 @@ class Drive(MemorySequence):
 @pytest.fixture(scope="module")
 def model(mini_config):
     torch.manual_seed(1)
-    config = replace(mini_config, heads=("detection", "segmentation"))
+    encoder, decoder = (replace(part, layers=1) for part in (mini_config.encoder, mini_config.decoder))
+    config = replace(mini_config, heads=("detection", "segmentation"), encoder=encoder, decoder=decoder)
     return Model(BEVFormer(config).eval(), tracker=TrackerConfig(birth_score=0.0, keep_score=0.0))
 
 

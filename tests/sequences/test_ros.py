@@ -3,7 +3,9 @@
 import base64
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -31,6 +33,17 @@ from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose, rotation_about_z
 from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.open import open_sequence
+
+
+@pytest.fixture(scope="module", autouse=True)
+def message_types_compiled_once() -> Iterator[None]:
+    """rosbags compiles the code that reads a type of messages anew for each bag."""
+    from rosbags.serde import cdr
+
+    compiled = cache(lambda text, compile_lines=cdr.compile_lines: compile_lines([text]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cdr, "compile_lines", lambda lines: compiled("\n".join(lines)))
+        yield
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from same_world import with_rig
 
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse, wrap_angle
@@ -199,12 +200,12 @@ def test_supersampling_barely_changes_the_pixel_counts(drive: RenderedDrive, fra
     np.testing.assert_allclose(fine.boxes.num_points[large], frame.boxes.num_points[large], rtol=0.12)
 
 
-def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
+def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, frame: RenderedFrame):
     from bevcli.geometry.cameras import CameraRig, Distortion
 
     lens = Distortion("brown_conrady", (-0.25, 0.08, 0.001, -0.0005))
     rig = CameraRig(tuple(replace(c, distortion=lens) for c in drive.rig.cameras), drive.rig.ego_from_bev)
-    bent = RenderedDrive(113, frames=20, rig=rig, assets=assets, weather="noon")
+    bent = with_rig(drive, rig)
     view, states = bent.frame(9).views["CAM_BACK"], bent.states(9)
     camera, checked = rig["CAM_BACK"], 0
     for index in np.unique(view.objects[view.objects >= 0]):

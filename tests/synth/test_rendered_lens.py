@@ -5,12 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from same_world import with_rig
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import rigid
-from bevcli.synth.drive import RenderedDrive
-from bevcli.synth.rig import nuscenes_like_rig
 
 LENSES = {
     "brown_conrady": Distortion("brown_conrady", (-0.2, 0.05, 0.001, -0.0005)),
@@ -18,18 +17,17 @@ LENSES = {
 }
 
 
-def rendered(assets, lens, **changes):
+def rendered(drive, lens, **changes):
     """An image of CAM_FRONT with the given distortion and other changes of the camera, and this camera."""
-    rig = nuscenes_like_rig(320, 180)
-    camera = replace(rig["CAM_FRONT"], distortion=lens, **changes)
-    drive = RenderedDrive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), assets=assets, weather="noon")
-    return drive.frame(9).images["CAM_FRONT"].astype(np.float64), camera
+    camera = replace(drive.rig["CAM_FRONT"], distortion=lens, **changes)
+    one = with_rig(drive, CameraRig((camera,), drive.rig.ego_from_bev))
+    return one.frame(9).images["CAM_FRONT"].astype(np.float64), camera
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistorted_rendering_resembles_one_without_a_lens(assets, name):
-    plain, _ = rendered(assets, None)
-    bent, camera = rendered(assets, LENSES[name])
+def test_undistorted_rendering_resembles_one_without_a_lens(drive, name):
+    plain, _ = rendered(drive, None)
+    bent, camera = rendered(drive, LENSES[name])
     mended = camera.undistort(bent.astype(np.uint8)).astype(np.float64)
     seen = mended.sum(-1) > 0  # black where the lens saw nothing
     assert seen.mean() > 0.85
@@ -46,16 +44,16 @@ def square(focal):
 
 
 @pytest.fixture(scope="module")
-def fisheye_of_180_degrees(assets):
-    return rendered(assets, FISHEYE, **square(100.0))
+def fisheye_of_180_degrees(drive):
+    return rendered(drive, FISHEYE, **square(100.0))
 
 
 @pytest.mark.parametrize(("right_deg", "down_deg"), [(45, 0), (-68, 0), (68, 10), (0, -55), (-30, 45)])
-def test_a_fisheye_of_180_degrees_agrees_with_a_turned_pinhole(assets, fisheye_of_180_degrees, right_deg, down_deg):
+def test_a_fisheye_of_180_degrees_agrees_with_a_turned_pinhole(drive, fisheye_of_180_degrees, right_deg, down_deg):
     fisheye, camera = fisheye_of_180_degrees
     turn = cv2.Rodrigues(np.radians([0.0, right_deg, 0]))[0] @ cv2.Rodrigues(np.radians([-down_deg, 0.0, 0]))[0]
     turned = camera.ego_from_camera @ rigid((0, 0, 0), turn)
-    narrow, pinhole = rendered(assets, None, **{**square(450.0), "ego_from_camera": turned})
+    narrow, pinhole = rendered(drive, None, **{**square(450.0), "ego_from_camera": turned})
     u, v = np.meshgrid(np.arange(320.0), np.arange(320.0))
     directions = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(pinhole.intrinsics).T @ turn.T
     assert directions[:, 2].min() > 0  # OpenCV projects what is less than 90 degrees off the axis
@@ -68,14 +66,14 @@ def test_a_fisheye_of_180_degrees_agrees_with_a_turned_pinhole(assets, fisheye_o
     assert np.corrcoef(cv2.GaussianBlur(seen, (0, 0), 3).ravel(), coarse.ravel())[0, 1] > 0.95
 
 
-def test_a_fisheye_is_black_beyond_120_degrees_only(assets):
-    image, _ = rendered(assets, EQUIDISTANT, **square(60.0))
+def test_a_fisheye_is_black_beyond_120_degrees_only(drive):
+    image, _ = rendered(drive, EQUIDISTANT, **square(60.0))
     u, v = np.meshgrid(np.arange(320) - 160, np.arange(320) - 160)
     angle_deg = np.degrees(np.hypot(u, v) / 60.0)
     assert (image[angle_deg > 121] == 0).all()
     assert (image[angle_deg < 119].sum(-1) > 0).all()
 
 
-def test_a_lens_model_that_ends_inside_the_image_is_an_error(assets):
+def test_a_lens_model_that_ends_inside_the_image_is_an_error(drive):
     with pytest.raises(InputError, match="its lens model ends 27 degrees off the optical axis"):
-        rendered(assets, Distortion("kannala_brandt", (-1.5, 0.0, 0.0, 0.0)), **square(100.0))
+        rendered(drive, Distortion("kannala_brandt", (-1.5, 0.0, 0.0, 0.0)), **square(100.0))

@@ -26,7 +26,8 @@ def recording(tmp_path_factory):
     return path
 
 
-def test_a_complete_recording_is_read_from_its_own_file(recording):
+def test_a_complete_recording_is_read_from_its_own_file(recording, monkeypatch):
+    monkeypatch.setattr(recording_file, "run_python", run_python)  # a process as the user's
     with open_recording(recording) as file:
         assert (file.path, file.repaired) == (recording, False)
 
