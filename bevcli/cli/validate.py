@@ -47,13 +47,14 @@ def validate(
     if loaded.choice is not None:
         loaded = in_engine_with_bar(loaded, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
-    runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
+    tracker = loaded.tracker if options.tracking else None
+    asked = StepOptions(loaded.precision, run_options.temporal, tracker=tracker)
+    runner = Runner(loaded.prepared, loaded.device, asked)
     with Progress(count_frames(drives), "frames", notes) as progress:
         scores = validate_model(
             runner,
             drives,
             options.max_range,
-            loaded.tracker if options.tracking else None,
             after_frame=progress.advance,
             each_drive=options.each,
         )

@@ -91,7 +91,7 @@ class Runner:
         state, prediction = self._step_model(state or RunnerState(), prepared, upcoming)
         if self.options.tracker is None or self.tracks:
             return state, prediction
-        ((_, prediction, tracks),) = track(self.options.tracker, [(prepared.frame, prediction)], state.tracks)
+        tracks, prediction = track(self.options.tracker, state.tracks, prediction)
         return replace(state, tracks=tracks), prediction
 
     @torch.inference_mode()

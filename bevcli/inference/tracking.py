@@ -5,14 +5,14 @@ the tracks move to the frame's time, and the boxes, highest score first, each ta
 within the class's gate. Added here: two score thresholds, scores of tracks, and the suppression of duplicates.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.frame import FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
@@ -125,18 +125,17 @@ class TrackerState:
 
 
 def track(
-    config: TrackerConfig, predictions: Iterable[tuple[Frame, Prediction]], state: TrackerState | None = None
-) -> Iterator[tuple[Frame, Prediction, TrackerState | None]]:
-    """Gives the boxes of a run's predictions their identities, and yields the state after each frame.
+    config: TrackerConfig, state: TrackerState | None, prediction: Prediction
+) -> tuple[TrackerState | None, Prediction]:
+    """The state after a frame, and its prediction whose boxes have their identities: see `step`.
 
     A frame without any image has no boxes and leaves the state as it is.
     """
-    for frame, prediction in predictions:
-        if not prediction.skipped:
-            state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
-            columns = {name: getattr(tracked, name) for name in ("instances", "track_scores", "duplicates")}
-            prediction = replace(prediction, boxes=replace(prediction.boxes, **columns))
-        yield frame, prediction, state
+    if prediction.skipped:
+        return state, prediction
+    state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
+    columns = {name: getattr(tracked, name) for name in ("instances", "track_scores", "duplicates")}
+    return state, replace(prediction, boxes=replace(prediction.boxes, **columns))
 
 
 def step(

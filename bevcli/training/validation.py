@@ -1,7 +1,7 @@
 """Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -19,7 +19,6 @@ from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
-from bevcli.inference.tracking import TrackerConfig, track
 from bevcli.synth.drives import Drives
 
 
@@ -79,21 +78,22 @@ def validate(
     runner: Runner,
     drives: Drives,
     max_range_m: float | None = None,
-    tracker: TrackerConfig | None = None,
     after_frame: Callable[[], None] = lambda: None,
     *,
     each_drive: bool = False,
 ) -> Validation:
     """Runs every frame of the drives and scores the frames that have ground truth.
 
+    Tracks are scored where the runner has a tracker.
+
     Args:
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
-        tracker: parameters of the tracker whose tracks are scored; None scores no tracks.
         each_drive: score each drive alone too.
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     classes = runner.config.object_classes
     config = DetectionConfig.of(classes).cut_at(range_m)
+    tracking = None if runner.options.tracker is None else TrackingConfig.of(classes).cut_at(range_m)
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
@@ -101,13 +101,10 @@ def validate(
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
-        steps: Iterable[tuple[Frame, Prediction, object]]
-        steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config))
-        if tracker is not None:
-            steps = track(tracker, ((frame, prediction) for frame, prediction, _ in steps))
-        for frame, prediction, _ in steps:
+        places, preprocessor = range(len(sequence.stamps)), Preprocessor(runner.config)
+        for frame, prediction, _ in runner.run(sequence, places, preprocessor):
             if frame.ground_truth is not None:
-                if tracker is not None:
+                if tracking is not None:
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
                     place = frame.world_from_ego.translation[:2]
@@ -125,7 +122,7 @@ def validate(
     return Validation(
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
-        None if tracker is None else _score_tracks(tracks, TrackingConfig.of(classes).cut_at(range_m)),
+        None if tracking is None else _score_tracks(tracks, tracking),
         drives=tuple(of_drives),
     )
 

@@ -14,7 +14,7 @@ from stepping import CPU, run
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run as run_model
-from bevcli.inference.runner import Runner
+from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import prepare_for_inference
@@ -24,6 +24,7 @@ from bevcli.model.uniad.uniad import UniAD, UniADConfig
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.training import validation
 
 MAP_HEAD = MapHeadConfig(
     thing_queries=12, max_things=6, encoder_layers=1, location_layers=2, thing_mask_layers=1, stuff_mask_layers=1,
@@ -230,3 +231,29 @@ def test_an_interrupted_run_is_resumed_with_its_tracks(loaded, tmp_path):
 def stops_after(frames: int):
     """Asked after each frame: whether the run ends."""
     return iter([*[False] * (frames - 1), True]).__next__
+
+
+class OneDrive(list):
+    def open(self, index):
+        return self[index]
+
+
+class Labelled(MemorySequence):
+    """Its true boxes are the predicted ones."""
+
+    def __init__(self, predictions):
+        super().__init__(len(predictions))
+        self.predictions = predictions
+
+    def load(self, place):
+        return replace(super().load(place), ground_truth=self.predictions[place].boxes_world)
+
+
+def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
+    def keep(found, *rest):
+        scored.extend(boxes.instances.tolist() for boxes in found)
+
+    scored: list[list[str]] = []
+    monkeypatch.setattr(validation, "evaluate_tracking", keep)
+    validation.validate(Runner(model, CPU, StepOptions(tracker=TrackerConfig())), OneDrive([Labelled(whole[:3])]))
+    assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]

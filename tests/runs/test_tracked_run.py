@@ -51,21 +51,26 @@ def test_identities_reach_boxes_of_every_frame_of_reference(model):
         assert list(boxes.instances) == list(prediction.boxes.instances)
 
 
+def tracked(results, state=None):
+    """State and prediction after each frame of a run."""
+    for _, prediction in results:
+        state, prediction = track(EAGER, state, prediction)
+        yield state, prediction
+
+
 def test_a_frame_without_images_leaves_the_tracks_alone(model):
-    results = list(run(model, WithoutImages({1: "all"}, count=3), track=False))
-    states = [state for *_, state in track(EAGER, results)]
+    states = [state for state, _ in tracked(run(model, WithoutImages({1: "all"}, count=3), track=False))]
     assert states[1] is states[0]
     assert states[2].stamp.index == 2
 
 
 def test_a_tracked_run_cut_in_two_equals_the_whole(model):
     results = list(run(model, MemorySequence(4), track=False))
-    whole = [prediction.boxes for _, prediction, _ in track(EAGER, results)]
-    first = list(track(EAGER, results[:2]))
-    second = list(track(EAGER, results[2:], first[-1][2]))
-    for one, (_, other, _) in zip(whole, first + second, strict=True):
-        assert list(one.instances) == list(other.boxes.instances)
-        assert np.array_equal(one.track_scores, other.boxes.track_scores, equal_nan=True)
+    first = list(tracked(results[:2]))
+    second = list(tracked(results[2:], first[-1][0]))
+    for (_, one), (_, other) in zip(tracked(results), first + second, strict=True):
+        assert list(one.boxes.instances) == list(other.boxes.instances)
+        assert np.array_equal(one.boxes.track_scores, other.boxes.track_scores, equal_nan=True)
 
 
 def test_predictions_and_tracks_files_hold_the_identities(model, tmp_path):
