@@ -186,29 +186,21 @@ def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str,
     file = read_pth(path)
     contents = file.contents
     state = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
-    hidden = _placeholders(state)
+    named = state if isinstance(state, dict) else {"": state}
+    hidden = [f"{key}: {each.made_by}".removeprefix(": ") for key, each in named.items() if type(each) is Placeholder]
     if hidden:
         raise WeightsError(
-            f"{path}: is not safe to read: its tensors are hidden behind code ({hidden:.100}), which was not run "
+            f"{path}: is not safe to read: its tensors are hidden behind code ({hidden[0]:.100}), which was not run "
             "(expected tensors by name, at the top level or under state_dict)"
         )
-    named = state.items() if isinstance(state, dict) else ()
-    if not named or not all(isinstance(key, str) and isinstance(value, StoredTensor) for key, value in named):
+    is_named = isinstance(state, dict) and all(isinstance(key, str) for key in named)
+    if not (state and is_named and all(isinstance(each, StoredTensor) for each in named.values())):
         raise WeightsError(
             f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
         )
     meta = contents.get("meta")
     facts = {key: _fact(meta.get(key)) for key in ("epoch", "iter", "time")} if isinstance(meta, dict) else {}
-    return file.tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
-
-
-def _placeholders(state: object) -> str:
-    """The class or function of the first placeholder in place of a tensor, "" for none."""
-    values = state.items() if isinstance(state, dict) else [("", state)]
-    for key, value in values:
-        if isinstance(value, Placeholder):
-            return f"{key}: {value.made_by}" if key else str(value.made_by)
-    return ""
+    return file.with_tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
 
 
 def _fact(value: object) -> str:
