@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part, input_argument
+from bevcli.cli.bridge import Part, argument
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -28,11 +28,10 @@ SOME_FAILED = 3  # exit code
 def batch(
     drives: Annotated[
         list[str] | None,
-        input_argument(
+        argument(
             "Sequence folders, nuScenes roots (one drive per scene), folders of drives such as a DDAD root, "
             ".mcap files, patterns such as 'fleet/*', or URLs such as s3://bucket/fleet/*.",
             "path or pattern",
-            show_default=False,
         ),
     ] = None,
     *,

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from bevcli.cli.bridge import Json, Part, input_argument, print_note
+from bevcli.cli.bridge import Json, Part, argument, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
@@ -14,9 +14,9 @@ PANEL = "Score"
 
 
 def evaluate(
-    predictions: Annotated[Path, input_argument("predictions.json, the folder of a run, or a results_nusc.json.")],
+    predictions: Annotated[Path, argument("predictions.json, the folder of a run, or a results_nusc.json.")],
     ground_truth: Annotated[
-        Path, input_argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
+        Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
     source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
     format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],

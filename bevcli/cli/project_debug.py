@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, as_flags, input_argument
+from bevcli.cli.bridge import Json, Part, argument, as_flags
 from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
@@ -21,7 +21,7 @@ ERRORS_FOUND = 3
 
 
 def project_debug(
-    calibration: Annotated[Path, input_argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
+    calibration: Annotated[Path, argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
     format_options: Annotated[dict[str, Any], Part(only=("topics", "topics_file"), classes=option_classes)],
     options: CheckOptions,

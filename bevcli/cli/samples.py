@@ -4,9 +4,8 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from bevcli.errors import OutputError
+from bevcli.options import Option
 from bevcli.printing import say
 from bevcli.writing import write_whole
 
@@ -15,9 +14,7 @@ NAME, NOTEBOOK = "street", "first_steps.ipynb"
 
 
 def samples(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The folder that gets the sample.")] = Path(
-        "samples"
-    ),
+    out: Annotated[Path, Option("The folder that gets the sample.", metavar="DIR")] = Path("samples"),
 ) -> None:
     """Copy the sample drive, a rendered street, to DIR/street, and the notebook first_steps.ipynb.
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, input_argument, print_note
+from bevcli.cli.bridge import Json, Part, argument, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.robustness.options import StressOptions, StressOutputOptions
@@ -20,7 +20,7 @@ PANEL = "Score"
 def stress(
     sequence: Annotated[
         list[Path] | None,
-        input_argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],

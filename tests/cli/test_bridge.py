@@ -7,9 +7,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from bevcli.cli.bridge import OldArgument, Part, as_flags, command
+from bevcli.cli.bridge import Part, as_flags, command
 from bevcli.errors import InputError
-from bevcli.options import option, options
+from bevcli.options import Option, option, options
 
 
 def parse_range(text):
@@ -49,7 +49,7 @@ def invoke(function, *arguments):
 def options_of(*arguments):
     got = []
 
-    def read(source: ReadOptions, force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False) -> None:
+    def read(source: ReadOptions, force: Annotated[bool, Option("Overwrite.")] = False) -> None:
         got.append((source, force))
 
     done = invoke(read, *arguments)
@@ -184,7 +184,7 @@ def test_help_shows_no_old_spelling():
 
 
 def test_an_option_that_was_an_argument_still_is_one():
-    def read(model: Annotated[str | None, typer.Option(help="A model."), OldArgument] = None) -> None:
+    def read(model: Annotated[str | None, Option("A model.", old=("",))] = None) -> None:
         typer.echo(model)
 
     assert invoke(read, "--model", "tiny").output == "tiny\n"
