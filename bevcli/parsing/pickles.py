@@ -91,7 +91,6 @@ class PickleReader(pickle._Unpickler):
         return Global(module, name)
 
     def persistent_load(self, pid: Any) -> Any:
-        """The object for a persistent id."""
         raise PickleError("a persistent id outside of a PyTorch file")
 
     def _reduce(self) -> None:

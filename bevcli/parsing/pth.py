@@ -113,9 +113,7 @@ _MADE: dict[str, Callable[..., Any]] = {
     "collections.OrderedDict": lambda *_: {},
     "collections.defaultdict": lambda *_: {},
     "torch._utils._rebuild_tensor": StoredTensor,
-    "torch._utils._rebuild_tensor_v2": lambda storage, offset, shape, strides, *_: StoredTensor(
-        storage, offset, shape, strides
-    ),
+    "torch._utils._rebuild_tensor_v2": lambda *given: StoredTensor(*given[:4]),
     "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
     "torch._utils._rebuild_parameter_with_state": lambda tensor, *_: tensor,
     "torch.Size": lambda sizes=(), *_: sizes,
