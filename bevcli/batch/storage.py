@@ -230,15 +230,13 @@ def _filesystem(url: str) -> tuple[Any, str]:
     match = _URL.match(url)
     assert match is not None
     protocol = match["protocol"].lower()
-    package = _PACKAGES.get(protocol, "")
-    try:
-        import fsspec
-    except ImportError:
-        raise BevcliError(f"{url}: URLs need a package: run pip install fsspec {package}".rstrip()) from None
+    import fsspec  # PyTorch brings it
+
     try:
         with _one_line(url, InputError):
             system, path = fsspec.core.url_to_fs(url)
     except ImportError as error:
+        package = _PACKAGES.get(protocol)
         advice = f"run pip install {package}" if package else reason_of(error)[:200]
         raise BevcliError(f"{url}: {protocol}:// needs a package that is not installed: {advice}") from None
     return system, str(path)
