@@ -55,7 +55,7 @@ def batch(
     from bevcli.batch.drives import find_drives, read_list
     from bevcli.batch.job import Job, all_own_options, with_absolute_paths
     from bevcli.batch.storage import is_url
-    from bevcli.cli.fetching import fetch_if_asked
+    from bevcli.cli.progress import fetch_if_asked
     from bevcli.sequences.nuscenes.format import NuScenesOptions
 
     texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]

@@ -84,7 +84,7 @@ def reproduce(
 
 def _get(named: "NamedWeights", model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
-    from bevcli.cli.fetching import fetch_with_bar
+    from bevcli.cli.progress import fetch_with_bar
     from bevcli.weights.fetch import by_hand
 
     if named.here is not None:

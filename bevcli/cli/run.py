@@ -45,8 +45,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.fetching import fetch_if_asked
-        from bevcli.cli.progress import Progress, in_engine_with_bar
+        from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.inference.load import load_model
         from bevcli.rig.check_drive import CheckedDrive

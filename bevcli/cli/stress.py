@@ -37,8 +37,7 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.fetching import fetch_if_asked
-    from bevcli.cli.progress import Progress, in_engine_with_bar
+    from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
     from bevcli.inference.load import load_model

@@ -59,7 +59,7 @@ def fetch(
     A cut download goes on where it ended. The file is checked: its hash if that is known, else its size and the keys
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
-    from bevcli.cli.fetching import fetch_with_bar
+    from bevcli.cli.progress import fetch_with_bar
     from bevcli.weights.cache import named_weights
 
     found = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
