@@ -178,8 +178,8 @@ def fetch_if_asked(options: ModelOptions) -> None:
     """Download the weights of a model, where `fetch` asks for it and they are not there."""
     if not options.fetch or options.weights is not None or options.untrained:
         return
-    from bevcli.weights.cache import find_weights
+    from bevcli.weights.cache import all_weights
 
-    named = find_weights(str(options.model), options.weights_dir)
+    named = all_weights(options.weights_dir).get(str(options.model))
     if named is not None and named.here is None:
         fetch_with_bar(named)

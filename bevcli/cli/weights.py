@@ -39,7 +39,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     from bevcli.published import own_table
     from bevcli.weights.cache import all_weights
 
-    found = list(all_weights(options.weights_dir))
+    found = list(all_weights(options.weights_dir).values())
     if as_json:
         say(json.dumps([_named_as_data(each) for each in found], indent=1))
         return

@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bevcli.checkpoints import bundled_weights, expected_state, read_checkpoint, require_fit
@@ -63,11 +63,12 @@ def fetch_weights(
         found = _check(weights, partial)
     except BevcliError as error:
         _remove(partial)
-        raise WeightsError(f"{weights.source.url}: refused, and deleted: {_without(str(error), partial)}") from None
+        reason = str(error).replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
+        raise WeightsError(f"{weights.source.url}: refused, and deleted: {reason}") from None
     weights.remember(found.known)
     os.replace(partial, weights.file)
     _remove(partial)
-    return FetchedWeights(weights.file, found.known, found.checked)
+    return replace(found, path=weights.file)
 
 
 def weights_file(path_or_name: Path) -> Path:
@@ -127,7 +128,3 @@ def _remove(partial: Path) -> None:
     for path in (partial, partial.with_name(f"{partial.name}.json")):
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def _without(message: str, partial: Path) -> str:
-    return message.replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
