@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part, argument
+from bevcli.cli.bridge import FormatValues, Part, argument
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
@@ -42,8 +41,8 @@ def batch(
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
     source: Annotated[SequenceOptions, Part(without=("scene",))],
     format_options: Annotated[
-        dict[str, Any],
-        Part(without=("intrinsics", "extrinsics", "ego_motion_file"), classes=option_classes),
+        FormatValues,
+        Part(without=("intrinsics", "extrinsics", "ego_motion_file")),
     ],
 ) -> None:
     """Run BEVFormer on many DRIVES, each exactly as `bevcli run` does, on this machine or a Ray cluster.

@@ -7,7 +7,7 @@ import glob
 import os
 import re
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import MISSING, dataclass, replace
 from inspect import Parameter, Signature, signature
@@ -20,6 +20,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults, option_of
 from bevcli.printing import one_line, say
+from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
@@ -35,6 +36,7 @@ def model_option(help: str, panel: str = "Model", **settings: Any) -> Option:
     return Option(help, panel, metavar="NAME|FILE", complete=complete_model, reads="path or name", **settings)
 
 
+FormatValues = dict[str, Any]  # a parameter with the options of all input formats, by name
 Json = Annotated[bool, Option("Print one JSON object instead of text.", flag="--json")]
 InputDrive = Annotated[
     Path, argument("Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.")
@@ -45,15 +47,15 @@ InputDrive = Annotated[
 class Part:
     """The options that a command takes of a dataclass, in an annotation: `Annotated[ModelOptions, Part(only=…)]`.
 
+    Or those that it takes of `FormatValues`.
+
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
-        classes: dataclasses whose fields the parameter, a mapping, gets by name. None: the annotated dataclass itself.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
-    classes: Callable[[], Iterable[type[Any]]] | None = None
 
     def __contains__(self, name: str) -> bool:
         return name not in self.without and (not self.only or name in self.only)
@@ -290,10 +292,11 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     marks = getattr(hint, "__metadata__", ())
     hint = get_args(hint)[0] if marks else hint
     part = next((each for each in marks if isinstance(each, Part)), Part())
-    if part.classes is None and not dataclasses.is_dataclass(hint):
+    own = hint == FormatValues
+    if not own and not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
-    for kind in [hint] if part.classes is None else part.classes():
+    for kind in option_classes() if own else [hint]:
         kinds, known = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
             stated, name = option_of(field), field.name
@@ -301,7 +304,7 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
                 default = known.get(name, Parameter.empty)
                 found.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
     assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
-    return (dict if part.classes else hint), found
+    return (dict if own else hint), found
 
 
 def _plain(hint: Any) -> Any:

@@ -2,12 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from bevcli.cli.bridge import Json, Part, argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.printing import say
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 PANEL = "Score"
@@ -19,7 +18,7 @@ def evaluate(
         Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
     source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     options: EvaluationOptions,
     as_json: Json = False,
 ) -> None:

@@ -38,12 +38,11 @@ class Progress:
         total: the amount of work, in units.
         unit: the plural of the unit, such as "frames".
         notes: printed at the start, each once.
-        stream: where to write; stderr if None.
     """
 
-    def __init__(self, total: int, unit: str, notes: Iterable[str] = (), stream: TextIO | None = None) -> None:
+    def __init__(self, total: int, unit: str, notes: Iterable[str] = ()) -> None:
         self.total, self.unit, self._notes = total, unit, dict.fromkeys(notes)
-        self.stream = sys.stderr if stream is None else stream
+        self.stream = sys.stderr
         self.done = 0
         self.detail = ""
         self.skipped = 0

@@ -4,17 +4,16 @@ import gc
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from bevcli.calibration.options import CalibrateFirstOptions
-from bevcli.cli.bridge import InputDrive, Part, as_flags
+from bevcli.cli.bridge import FormatValues, InputDrive, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def run(
     source: SequenceOptions,
     first: CalibrateFirstOptions,
     output: OutputOptions,
-    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    format_options: FormatValues,
 ) -> None:
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 

@@ -2,15 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.robustness.options import StressOptions, StressOutputOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
 
@@ -26,7 +25,7 @@ def stress(
     model: Annotated[ModelOptions, Part(without=("untrained",))],
     options: StressOptions,
     source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
     output: StressOutputOptions,
     as_json: Json = False,
