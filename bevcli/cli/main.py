@@ -81,7 +81,6 @@ def click_command(name: str, found: Any) -> Any:
 app = typer.Typer(
     cls=_Group,
     rich_markup_mode=None,
-    help="Run BEVFormer on sequences from any camera rig, and look at the results.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
