@@ -4,10 +4,9 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-from bevcli.errors import OutputError
 from bevcli.options import Option
 from bevcli.printing import say
-from bevcli.writing import write_whole
+from bevcli.writing import output_errors, write_whole
 
 PANEL = "Start"
 NAME, NOTEBOOK = "street", "first_steps.ipynb"
@@ -29,11 +28,9 @@ def samples(
         if target.exists():
             say(f"{target}: exists already")
             continue
-        try:
+        with output_errors(target):
             if (source / name).is_dir():
                 shutil.copytree(source / name, target)
             else:
                 write_whole(target, (source / name).read_bytes())
-        except OSError as error:
-            raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
         say(f"{target}: copied; {advice}")

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from bevcli.checkpoints import bundled_weights, expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
-from bevcli.errors import BevcliError, OutputError, WeightsError
+from bevcli.errors import BevcliError, WeightsError
 from bevcli.published import own_table
 from bevcli.weights.cache import HASHES, Known, NamedWeights, named_weights
 from bevcli.weights.download import Report, download
+from bevcli.writing import output_errors
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 
@@ -54,10 +55,8 @@ def fetch_weights(
     if weights.source.path is not None or (not force and weights.here is not None):
         return _check(weights, weights.file)
     partial = weights.file.with_name(PARTIAL + weights.file.name)
-    try:
+    with output_errors(weights.file.parent):
         weights.file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{weights.file.parent}: cannot be written ({error.strerror})") from None
     download(weights.source.url, partial, weights.source.bytes, report)
     try:
         found = _check(weights, partial)
