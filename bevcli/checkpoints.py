@@ -25,34 +25,6 @@ INTEGER_KEY = "num_batches_tracked"
 
 
 @dataclass(frozen=True)
-class KeyReport:
-    """The differences between a state dict and the one that a model needs.
-
-    Attributes:
-        missing: keys that the state dict lacks.
-        unexpected: keys that the model does not have.
-        misshapen: lines "key: expected (…), found (…)" for tensors of a wrong shape.
-    """
-
-    missing: tuple[str, ...]
-    unexpected: tuple[str, ...]
-    misshapen: tuple[str, ...]
-
-    @property
-    def fits(self) -> bool:
-        """True where nothing differs."""
-        return not any(vars(self).values())
-
-    def describe(self) -> str:
-        """All differing keys, on one line."""
-        return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in vars(self).items() if keys)
-
-    def summary(self) -> str:
-        """The first differing key of each kind, on one line."""
-        return "; ".join(f"{len(keys)} {name}, such as {keys[0]}" for name, keys in vars(self).items() if keys)
-
-
-@dataclass(frozen=True)
 class Checkpoint:
     """The contents of a weights file.
 
@@ -75,7 +47,7 @@ class Checkpoint:
     @cached_property
     def models(self) -> tuple[str, ...]:
         """Names of the known models that the state dict fits."""
-        return tuple(name for name in known_models() if compare(self.state, _expected_of(name)).fits)
+        return tuple(name for name in known_models() if not compare(self.state, _expected_of(name)))
 
     @property
     def parameters(self) -> int:
@@ -104,12 +76,13 @@ def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tenso
 
     model: its name or TOML file. expected: its state dict.
     """
-    report = compare(checkpoint.state, expected)
-    if report.fits:
+    found = compare(checkpoint.state, expected)
+    if not found:
         return
-    differences = report.describe()
+    differences = "; ".join(f"{len(keys)} {kind}: {', '.join(keys)}" for kind, keys in found.items())
     if checkpoint.models:
-        differences = f"it holds weights of {' or '.join(checkpoint.models)}; {report.summary()}"
+        first = "; ".join(f"{len(keys)} {kind}, such as {keys[0]}" for kind, keys in found.items())
+        differences = f"it holds weights of {' or '.join(checkpoint.models)}; {first}"
     raise WeightsError(
         f"{checkpoint.path}: does not fit model {model}: {differences}; `bevcli train` starts from whatever fits "
         f"(`--model {model} --weights {checkpoint.path}`)"
@@ -158,17 +131,22 @@ def bundled_weights(model: str) -> Path | None:
     return file if model in known_models() and file.is_file() else None
 
 
-def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyReport:
-    """The differences between a state dict and the state dict of a model."""
-    return KeyReport(
-        missing=tuple(key for key in expected if key not in state),
-        unexpected=tuple(key for key in state if key not in expected),
-        misshapen=tuple(
+def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict[str, list[str]]:
+    """The differences between a state dict and the state dict of a model, by kind; empty if it fits.
+
+    "missing": keys that the state dict lacks. "unexpected": keys that the model does not have. "misshapen": lines
+    "key: expected (…), found (…)" for tensors of a wrong shape.
+    """
+    found = {
+        "missing": [key for key in expected if key not in state],
+        "unexpected": [key for key in state if key not in expected],
+        "misshapen": [
             f"{key}: expected {tuple(tensor.shape)}, found {tuple(state[key].shape)}"
             for key, tensor in expected.items()
             if key in state and tensor.shape != state[key].shape
-        ),
-    )
+        ],
+    }
+    return {kind: keys for kind, keys in found.items() if keys}
 
 
 @cache
@@ -186,29 +164,21 @@ def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str,
     file = read_pth(path)
     contents = file.contents
     state = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
-    hidden = _placeholders(state)
+    named = state if isinstance(state, dict) else {"": state}
+    hidden = [f"{key}: {each.made_by}".removeprefix(": ") for key, each in named.items() if type(each) is Placeholder]
     if hidden:
         raise WeightsError(
-            f"{path}: is not safe to read: its tensors are hidden behind code ({hidden:.100}), which was not run "
+            f"{path}: is not safe to read: its tensors are hidden behind code ({hidden[0]:.100}), which was not run "
             "(expected tensors by name, at the top level or under state_dict)"
         )
-    named = state.items() if isinstance(state, dict) else ()
-    if not named or not all(isinstance(key, str) and isinstance(value, StoredTensor) for key, value in named):
+    is_named = isinstance(state, dict) and all(isinstance(key, str) for key in named)
+    if not (state and is_named and all(isinstance(each, StoredTensor) for each in named.values())):
         raise WeightsError(
             f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
         )
     meta = contents.get("meta")
     facts = {key: _fact(meta.get(key)) for key in ("epoch", "iter", "time")} if isinstance(meta, dict) else {}
-    return file.tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
-
-
-def _placeholders(state: object) -> str:
-    """The class or function of the first placeholder in place of a tensor, "" for none."""
-    values = state.items() if isinstance(state, dict) else [("", state)]
-    for key, value in values:
-        if isinstance(value, Placeholder):
-            return f"{key}: {value.made_by}" if key else str(value.made_by)
-    return ""
+    return file.with_tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
 
 
 def _fact(value: object) -> str:

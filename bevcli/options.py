@@ -44,7 +44,9 @@ class Option:
             it, one of `complete` if that is given; "path or pattern" where a glob pattern may. The command line refuses
             a missing one before anything slow is imported.
         hidden: whether only Python has the option.
-        old: earlier spellings, which work for one more release, with a note; `--help` does not show them.
+        is_argument: whether it is an argument of the command and no flag.
+        old: earlier spellings, which work for one more release, with a note; `--help` does not show them. "" for an
+            option that was an argument.
         retired: what to use in place of an option that works for one more release, with this note; "" for others.
     """
 
@@ -60,6 +62,7 @@ class Option:
     maximum: float | None = None
     reads: Reads | None = None
     hidden: bool = False
+    is_argument: bool = False
     old: tuple[str, ...] = ()
     retired: str = ""
 

@@ -12,7 +12,6 @@ import msgspec
 from bevcli.errors import ConfigError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.user_folders import user_settings
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
@@ -75,8 +74,8 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 def own_table() -> Path:
-    """The file in which a user adds sources."""
-    return user_settings() / "weights.toml"
+    """The file in which a user adds sources, $XDG_CONFIG_HOME/bevcli/weights.toml (default ~/.config)."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "bevcli/weights.toml"
 
 
 def read_sources() -> dict[str, Source]:

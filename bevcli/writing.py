@@ -12,6 +12,15 @@ from bevcli.errors import OutputError
 
 
 @contextmanager
+def output_errors(path: Path, what: str = "written") -> Iterator[None]:
+    """Every OSError of the block becomes an OutputError: PATH cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be {what} ({error.strerror or error})") from None
+
+
+@contextmanager
 def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regular: bool = False) -> Iterator[Path]:
     """A path to write to, in the folder of `path`.
 
@@ -29,18 +38,17 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
     mark = uuid.uuid4().hex[:8] if shared else f"{zlib.crc32(os.fsencode(path.name)):08x}"
     unfinished = path.with_name(f".unfinished-{mark}{path.suffix}")
     try:
-        if not regular and (path.is_relative_to("/dev") or (path.exists() and not path.is_file())):
-            yield path
-            return
-        if parents:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.unlink(missing_ok=True)  # it may be a link
-        mode = _mode_of_new_files(unfinished)
-        yield unfinished
-        unfinished.chmod(mode)  # some libraries, such as safetensors, write files that only their owner can read
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        with output_errors(path):
+            if not regular and (path.is_relative_to("/dev") or (path.exists() and not path.is_file())):
+                yield path
+                return
+            if parents:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished.unlink(missing_ok=True)  # it may be a link
+            mode = _mode_of_new_files(unfinished)
+            yield unfinished
+            unfinished.chmod(mode)  # some libraries, such as safetensors, write files that only their owner can read
+            os.replace(unfinished, path)
     finally:
         with suppress(OSError):
             unfinished.unlink()
@@ -68,10 +76,8 @@ def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
     Raises OutputError where the folder cannot be made.
     """
     is_new = not folder.exists()
-    try:
+    with output_errors(folder, "created"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror})") from None
     try:
         yield
     except BaseException:

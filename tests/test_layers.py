@@ -142,6 +142,6 @@ def test_only_a_download_uses_libcurl_and_http():
                 users.setdefault(name, set()).add(path.relative_to(ROOT).as_posix())
     assert users["pycurl"] == {"weights/download.py"}
     assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
-    assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/fetching.py"}
+    assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/progress.py"}
     assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
     assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()

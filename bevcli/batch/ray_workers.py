@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from bevcli.batch.drives import Drive
@@ -49,7 +50,7 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Worker
         remote = ray.remote(num_cpus=threads, num_gpus=gpus, max_restarts=-1, max_task_retries=-1)(_RayWorker)
         idle = [remote.remote(job, job_hash, threads) for _ in range(count)]
         # Only a worker that has started gets a drive: a cluster may have no room for all of them yet.
-        running = {worker.problem.remote(): worker for worker in idle}
+        running = {worker.run.remote(None): worker for worker in idle}
         left, waiting = list(reversed(drives)), len(drives)
         try:
             while waiting:
@@ -72,20 +73,14 @@ class _RayWorker:
     def __init__(self, job: Job, job_hash: str, threads: int) -> None:
         keep_freed_memory()
         use_threads(threads)
-        self._problem: Record | None = None
-        try:
-            self._worker = Worker(job, job_hash)
-        except BevcliError as error:  # an exception here would make Ray start the worker again and again
-            self._problem = {"problem": str(error)}
+        self._make_worker = partial(Worker, job, job_hash)
+        self._worker: Worker | None = None
 
-    def problem(self) -> Record | None:
-        """The reason why the worker cannot run drives, or None."""
-        return self._problem
-
-    def run(self, drive: Drive) -> Record:
-        """See `Worker.run`."""
-        try:
-            return self._worker.run(drive)
+    def run(self, drive: Drive | None) -> Record | None:
+        """See `Worker.run`; None only loads the model."""
+        try:  # not above: an exception there would make Ray start the worker again and again
+            self._worker = self._worker or self._make_worker()
+            return None if drive is None else self._worker.run(drive)
         except BevcliError as error:
             return {"problem": str(error)}
 

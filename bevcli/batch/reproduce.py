@@ -1,7 +1,7 @@
 """Our scores of a published model next to the published ones."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from bevcli.evaluation.known_mistakes import known_mistakes
@@ -20,54 +20,38 @@ SCORES = {
 
 
 @dataclass(frozen=True)
-class ScorePair:
-    """A score of ours and the published one. None: not measured, or not published."""
-
-    name: str
-    ours: float | None
-    published: float | None
-
-    @property
-    def difference(self) -> float | None:
-        """Ours minus the published one."""
-        return None if self.ours is None or self.published is None else self.ours - self.published
-
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table: name, ours, published, difference."""
-        unit = SCORES[self.name][1] if self.name in SCORES else "%"
-        scale, digits = (100, 1) if unit == "%" else (1, 3)
-
-        def text(value: float | None, sign: str = "") -> str:
-            return "–" if value is None else f"{scale * value:{sign}.{digits}f}"
-
-        return f"{self.name} {unit}".strip(), text(self.ours), text(self.published), text(self.difference, "+")
-
-
-@dataclass(frozen=True)
 class Comparison:
     """Scores next to the published ones.
 
     Attributes:
         frames: number of frames that were scored.
-        pairs: one a score.
+        scores: by name: "name", "ours", "published" and "difference", each None if not measured or not published.
         notes: why the numbers may differ, and known mistakes whose pattern they have.
     """
 
     frames: int
-    pairs: tuple[ScorePair, ...]
+    scores: Mapping[str, Mapping[str, Any]]
     notes: tuple[str, ...]
 
     def table(self) -> str:
         """The scores as text for a terminal."""
-        rows = [("score", "ours", "published", "difference"), *(pair.cells() for pair in self.pairs)]
-        return "\n".join(
-            f"{name:9} {ours:>7} {published:>10} {difference:>11}" for name, ours, published, difference in rows
-        )
+        rows = [f"{'score':9} {'ours':>7} {'published':>10} {'difference':>11}"]
+        for name, score in self.scores.items():
+            unit = SCORES[name][1] if name in SCORES else "%"
+            ours, published, difference = (
+                _number(score[key], unit, sign) for key, sign in (("ours", ""), ("published", ""), ("difference", "+"))
+            )
+            rows.append(f"{f'{name} {unit}'.strip():9} {ours:>7} {published:>10} {difference:>11}")
+        return "\n".join(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        pairs = {pair.name: {**asdict(pair), "difference": pair.difference} for pair in self.pairs}
-        return {"frames": self.frames, "scores": pairs, "notes": list(self.notes)}
+        return {"frames": self.frames, "scores": self.scores, "notes": list(self.notes)}
+
+
+def _number(value: float | None, unit: str, sign: str) -> str:
+    scale, digits = (100, 1) if unit == "%" else (1, 3)
+    return "–" if value is None else f"{scale * value:{sign}.{digits}f}"
 
 
 def compare_with_published(
@@ -81,9 +65,9 @@ def compare_with_published(
         temporal: whether the model was run with history.
     """
     ours = {**metrics["tp_errors"], **{key: metrics[key] for key in ("nd_score", "mean_ap")}}
-    pairs = [ScorePair(name, ours[key], published.get(name)) for name, (key, _) in SCORES.items()]
     others = [name for name in published if name not in SCORES]
-    pairs += [ScorePair(name, None, published[name]) for name in others]
+    scores = {name: _pair(name, ours[key], published.get(name)) for name, (key, _) in SCORES.items()}
+    scores |= {name: _pair(name, None, published[name]) for name in others}
     notes = []
     if metrics["frames"] != VALIDATION_FRAMES:
         notes.append(
@@ -93,4 +77,9 @@ def compare_with_published(
     if others:
         notes.append(f"{', '.join(others)}: not measured here; `bevcli eval --tracking` scores tracks")
     notes += known_mistakes(metrics, temporal=temporal)
-    return Comparison(metrics["frames"], tuple(pairs), tuple(notes))
+    return Comparison(metrics["frames"], scores, tuple(notes))
+
+
+def _pair(name: str, ours: float | None, published: float | None) -> dict[str, Any]:
+    difference = None if ours is None or published is None else ours - published
+    return {"name": name, "ours": ours, "published": published, "difference": difference}

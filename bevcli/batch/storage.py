@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import reason_of
-from bevcli.writing import remove_parts, write_whole
+from bevcli.writing import output_errors, remove_parts, write_whole
 
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
 # The packages that fsspec needs for a protocol.
@@ -108,23 +108,18 @@ class LocalFolder:
 
     def remove(self, name: str) -> None:
         """Remove a file or a subfolder, if it is there. Raises OutputError."""
-        try:
-            with contextlib.suppress(FileNotFoundError):
-                remove_parts(self.path, [name])
-        except OSError as error:
-            raise OutputError(f"{self.path / name}: cannot be removed ({error.strerror})") from None
+        with output_errors(self.path / name, "removed"), contextlib.suppress(FileNotFoundError):
+            remove_parts(self.path, [name])
 
     def land(self, folder: Path, name: str, last: str) -> None:
         """Move a local folder to a name on the same file system, in place of a damaged one. Raises OutputError.
 
         last: the file of the folder that says that it is whole; it never exists without the others.
         """
-        try:
+        with output_errors(self.path / name):
             (self.path / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(self.path / name, ignore_errors=True)
             os.rename(folder, self.path / name)
-        except OSError as error:
-            raise OutputError(f"{self.path / name}: cannot be written ({error.strerror})") from None
 
 
 class RemoteFolder:
@@ -230,15 +225,13 @@ def _filesystem(url: str) -> tuple[Any, str]:
     match = _URL.match(url)
     assert match is not None
     protocol = match["protocol"].lower()
-    package = _PACKAGES.get(protocol, "")
-    try:
-        import fsspec
-    except ImportError:
-        raise BevcliError(f"{url}: URLs need a package: run pip install fsspec {package}".rstrip()) from None
+    import fsspec  # PyTorch brings it
+
     try:
         with _one_line(url, InputError):
             system, path = fsspec.core.url_to_fs(url)
     except ImportError as error:
+        package = _PACKAGES.get(protocol)
         advice = f"run pip install {package}" if package else reason_of(error)[:200]
         raise BevcliError(f"{url}: {protocol}:// needs a package that is not installed: {advice}") from None
     return system, str(path)

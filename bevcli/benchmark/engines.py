@@ -77,14 +77,10 @@ class EngineTable:
             middle, span = median(row.seconds), f"{1000 * min(row.seconds):.1f} to {1000 * max(row.seconds):.1f}"
             cells = (f"{1000 * middle:.1f}", span, f"{middle / first:.2f}", f"{row.near:.1%}")
             lines.append(_line(row.name, *cells, f"{row.largest_m:.2g}", f"{row.score:.2g}"))
-        taken = {precision: self.fastest(precision) for precision in ("fp32", "int8")}
-        words = [f"{row.engine} in {precision}" for precision, row in taken.items() if row is not None]
+        rows = sorted((row for row in self.rows if row.seconds), key=lambda row: median(row.seconds))
+        fastest = {row.precision: row.engine for row in reversed(rows)}
+        words = [f"{fastest[precision]} in {precision}" for precision in ("fp32", "int8") if precision in fastest]
         return "\n".join([*lines, "", f"`engine=auto` takes {', '.join(words)} for {self.model} from now on"])
-
-    def fastest(self, precision: str) -> EngineRow | None:
-        """The fastest engine in a precision."""
-        rows = [row for row in self.rows if row.precision == precision and row.seconds]
-        return min(rows, key=lambda row: median(row.seconds)) if rows else None
 
 
 def compare_engines(config: ModelConfig, frames: int, report: Report = lambda done, total, what: None) -> EngineTable:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bevcli.engines.box_differences import CENTER, NEAR_M
-from bevcli.engines.exported import ExportedModel, ExportedOutputs, load_exported
+from bevcli.engines.exported import ExportedOutputs, load_exported
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
@@ -46,32 +46,28 @@ class FrameDifference:
 
 
 def check_exported(
-    file: Path, model: Model, sequence: Sequence, engine: str = "onnxruntime"
+    file: Path, reference: Model | Path, sequence: Sequence, engine: str = "onnxruntime"
 ) -> Iterator[FrameDifference]:
     """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
 
     Args:
         file: an exported file of the model.
-        model: the model; it runs on the CPU in float32.
+        reference: the model, which runs on the CPU in float32; or another exported file of it.
         sequence: the drive. Frames without any image are left out.
         engine: the program that runs the file.
 
     Raises WeightsError where the file cannot be loaded, InputError where a frame cannot be read.
     """
-    network = prepare_for_inference(model.network, torch.device("cpu"))
-    yield from _differences((network, load_exported(file, engine)), sequence)
-
-
-def compare_exported(file: Path, other: Path, sequence: Sequence, engine: str) -> Iterator[FrameDifference]:
-    """As `check_exported`, for two exported files of one model."""
-    yield from _differences((load_exported(other, engine), load_exported(file, engine)), sequence)
-
-
-def _differences(networks: tuple[TemporalModel, ExportedModel], sequence: Sequence) -> Iterator[FrameDifference]:
-    preprocess = Preprocessor(networks[1].config)  # of the exported file, whose images have one size
+    network: TemporalModel
+    if isinstance(reference, Path):
+        network = load_exported(reference, engine)
+    else:
+        network = prepare_for_inference(reference.network, torch.device("cpu"))
+    exported = load_exported(file, engine)
+    preprocess = Preprocessor(exported.config)  # of the exported file, whose images have one size
     frames = (preprocess(sequence.load(place)) for place in range(len(sequence.stamps)))
-    for prepared, ours, theirs in paired_steps(*networks, frames):
-        yield compare_outputs(prepared.frame.stamp.index, ours, theirs, networks[1].form)
+    for prepared, ours, theirs in paired_steps(network, exported, frames):
+        yield compare_outputs(prepared.frame.stamp.index, ours, theirs, exported.form)
 
 
 def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs, form: ExportForm) -> FrameDifference:

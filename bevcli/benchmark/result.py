@@ -106,11 +106,7 @@ class BenchmarkResult:
         """The result for JSON."""
         frame_s = median(self.frame_s)
         data: dict[str, object] = {
-            "model": self.model,
-            "device": self.device,
-            "precision": self.precision,
-            "engine": self.engine,
-            "machine": self.machine,
+            **{name: getattr(self, name) for name in ("model", "device", "precision", "engine", "machine")},
             "stages_ms": {stage: round(1000 * median(times), 3) for stage, times in self.stages_s.items()},
             "frame_ms": round(1000 * frame_s, 3),
             "frame_ms_spread": [round(1000 * min(self.frame_s), 3), round(1000 * max(self.frame_s), 3)],

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part, input_argument
+from bevcli.cli.bridge import FormatValues, Part, argument
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
@@ -28,11 +27,10 @@ SOME_FAILED = 3  # exit code
 def batch(
     drives: Annotated[
         list[str] | None,
-        input_argument(
+        argument(
             "Sequence folders, nuScenes roots (one drive per scene), folders of drives such as a DDAD root, "
             ".mcap files, patterns such as 'fleet/*', or URLs such as s3://bucket/fleet/*.",
             "path or pattern",
-            show_default=False,
         ),
     ] = None,
     *,
@@ -43,8 +41,8 @@ def batch(
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
     source: Annotated[SequenceOptions, Part(without=("scene",))],
     format_options: Annotated[
-        dict[str, Any],
-        Part(without=("intrinsics", "extrinsics", "ego_motion_file"), classes=option_classes),
+        FormatValues,
+        Part(without=("intrinsics", "extrinsics", "ego_motion_file")),
     ],
 ) -> None:
     """Run BEVFormer on many DRIVES, each exactly as `bevcli run` does, on this machine or a Ray cluster.
@@ -56,7 +54,7 @@ def batch(
     from bevcli.batch.drives import find_drives, read_list
     from bevcli.batch.job import Job, all_own_options, with_absolute_paths
     from bevcli.batch.storage import is_url
-    from bevcli.cli.fetching import fetch_if_asked
+    from bevcli.cli.progress import fetch_if_asked
     from bevcli.sequences.nuscenes.format import NuScenesOptions
 
     texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]

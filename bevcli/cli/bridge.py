@@ -1,16 +1,15 @@
 """Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
 
 import ast
-import copy
 import dataclasses
 import difflib
 import glob
 import os
 import re
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
-from dataclasses import MISSING, Field, dataclass
+from dataclasses import MISSING, dataclass, replace
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -21,113 +20,88 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults, option_of
 from bevcli.printing import one_line, say
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
-def input_argument(help: str, reads: Reads = "path", **settings: Any) -> Any:
-    """The argument, for typer, of what is read, see `Option.reads`. settings: of `typer.Argument`."""
-    info = typer.Argument(help=help, **settings)
-    info.reads = reads
-    return info
+def argument(help: str, reads: Reads | None = "path", **settings: Any) -> Option:
+    """An argument of a command, in the annotation of a parameter. reads, settings: of `Option`."""
+    return Option(help, is_argument=True, reads=reads, **settings)
 
 
-_DRIVE = "Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."
-InputDrive = Annotated[Path, input_argument(_DRIVE)]
+def model_option(help: str, panel: str = "Model", **settings: Any) -> Option:
+    """The option --model of a command that does not take it as a field. settings: of `Option`."""
+    return Option(help, panel, metavar="NAME|FILE", complete=complete_model, reads="path or name", **settings)
 
 
-def model_option(help: str, panel: str | None = "Model", **settings: Any) -> Any:
-    """The option --model, for typer, of a command that does not take it as a field. settings: of `typer.Option`."""
-    info = typer.Option(
-        autocompletion=complete_model, metavar="NAME|FILE", help=help, rich_help_panel=panel, **settings
-    )
-    info.reads = "path or name"
-    return info
+FormatValues = dict[str, Any]  # a parameter with the options of all input formats, by name
+Json = Annotated[bool, Option("Print one JSON object instead of text.", flag="--json")]
+InputDrive = Annotated[
+    Path, argument("Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.")
+]
 
 
 @dataclass(frozen=True)
 class Part:
     """The options that a command takes of a dataclass, in an annotation: `Annotated[ModelOptions, Part(only=…)]`.
 
+    Or those that it takes of `FormatValues`.
+
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
-        classes: dataclasses whose fields the parameter, a mapping, gets by name. None: the annotated dataclass itself.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
-    classes: Callable[[], Iterable[type[Any]]] | None = None
 
     def __contains__(self, name: str) -> bool:
         return name not in self.without and (not self.only or name in self.only)
 
 
-class OldArgument:
-    """In the annotation of an option: it was an argument, and is still taken as one for this release, with a note."""
-
-
-@dataclass(frozen=True)
-class _Old:
-    """An earlier form of an option. option: its parameter. new: its flag. spelling: "" where it was an argument."""
-
-    option: Parameter
-    new: str
-    spelling: str = ""
-
-    @property
-    def parameter(self) -> Parameter:
-        """The hidden parameter of a function, as typer reads it."""
-        kind, info, *_ = get_args(self.option.annotation)
-        if self.spelling:
-            info = copy.copy(info)
-            info.default, info.param_decls, info.hidden = ..., (self.spelling,), True  # default has a spelling
-        else:
-            info = typer.Argument(hidden=True, metavar=f"[{self.option.name.upper()}]")
-        kind, default = (bool, False) if kind is bool else (kind | None, None)
-        name = f"{self.option.name}_{self.spelling.strip('-').replace('-', '_')}"
-        return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
-
-    def move(self, given: dict[str, Any]) -> None:
-        """Give its value to the option, with a note. Raises click's usage error."""
-        value, name = given.pop(self.parameter.name), self.option.name
-        if value in (None, [], ()) or value is False:
-            return
-        now = self.new if self.spelling else f"{self.new} {value}"
-        if given[name] != self.option.default:
-            raise typer.BadParameter(f"is given twice, also as {self.spelling or value}", param_hint=self.new)
-        print_note(f"{self.spelling or f'the argument {value}'} is now {now}; the old form ends with this release")
-        given[name] = value
-
-
 @dataclass(frozen=True)
 class _Flag:
-    """An option of a command. kind: type of the field. default: `Parameter.empty` for a required one."""
+    """An option or an argument of a command.
 
-    field: Field[Any]
+    Attributes:
+        name: of the field or the function's parameter.
+        option: as it is stated.
+        kind: type of the value.
+        default: `Parameter.empty` if it is required.
+        panel: heading in `--help`.
+        replaced_by: the option of which this is an earlier form; None for a present one.
+    """
+
+    name: str
     option: Option
     kind: Any
     default: Any
-    panel: str
+    panel: str | None
+    replaced_by: "_Flag | None" = None
 
     @property
     def spellings(self) -> list[str]:
         """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too."""
-        short = " -o" if self.field.name == "out" else ""
-        return (self.option.flag or f"--{self.field.name.replace('_', '-')}{short}").split()
+        short = " -o" if self.name == "out" else ""
+        return (self.option.flag or f"--{self.name.replace('_', '-')}{short}").split()
 
     @property
     def yes(self) -> str:
         """Spelling without that of the opposite."""
         return self.spellings[0].partition("/")[0]
 
+    @property
+    def earlier(self) -> Iterator["_Flag"]:
+        """The earlier forms of the option, each with a parameter of its own."""
+        for text in self.option.old:
+            form = replace(self.option, flag=text, is_argument=not text, old=())
+            yield replace(self, name=f"{self.name}_{text.strip('-').replace('-', '_')}", option=form, replaced_by=self)
+
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
-        stated, default = self.option, self.default
-        kind: Any = _plain(self.kind)
+        stated, kind, default = self.option, _plain(self.kind), self.default
         if stated.flag_value is not None:
             kind, default = bool, False
         elif stated.repeatable or stated.parse is not None:
@@ -135,19 +109,27 @@ class _Flag:
             kind = types.GenericAlias(list, (kind,)) if stated.repeatable else kind
             if default is not Parameter.empty:
                 kind, default = kind | None, None
-        info = typer.Option(
-            *self.spellings,
-            help=_with_flags(stated.help, flags),
-            rich_help_panel=self.panel,
-            metavar=stated.metavar or None,
-            min=stated.minimum,
-            max=stated.maximum,
-            autocompletion=stated.complete,
-            hidden=bool(stated.retired),
-        )
-        info.reads = stated.reads
-        annotation = Annotated[kind, info]
-        return Parameter(self.field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        if self.replaced_by is not None:
+            kind, default = (bool, False) if kind is bool else (kind | None, None)
+        settings: dict[str, Any] = {
+            "help": _with_flags(stated.help, flags),
+            "metavar": stated.metavar or self._metavar(kind),
+            "hidden": bool(stated.retired or self.replaced_by),
+        }
+        if stated.is_argument:
+            info = typer.Argument(**settings)
+        else:
+            settings |= {"min": stated.minimum, "max": stated.maximum, "autocompletion": stated.complete}
+            info = typer.Option(*self.spellings, rich_help_panel=self.panel, **settings)
+        return Parameter(self.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+
+    def _metavar(self, kind: Any) -> str | None:
+        """The name of the value in `--help`: that of an argument, else PATH, TEXT or the choices."""
+        while get_origin(kind) in (list, tuple, Union, types.UnionType):
+            kind = get_args(kind)[0]
+        if self.option.is_argument:
+            return self.name.upper()
+        return None if kind is bool else "|".join(get_args(kind)) or _METAVARS.get(kind)
 
     def value(self, given: Any) -> Any:
         """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
@@ -164,6 +146,18 @@ class _Flag:
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint=self.yes) from None
 
+    def move(self, given: dict[str, Any], defaults: Mapping[str, Any]) -> None:
+        """Give the value of an earlier form to the option, with a note. Raises click's usage error."""
+        value, now, spelling = given.pop(self.name), self.replaced_by, self.option.flag
+        assert now is not None
+        if value in (None, [], ()) or value is False:
+            return
+        if given[now.name] != defaults[now.name]:
+            raise typer.BadParameter(f"is given twice, also as {spelling or value}", param_hint=now.yes)
+        new = now.yes if spelling else f"{now.yes} {value}"
+        print_note(f"{spelling or f'the argument {value}'} is now {new}; the old form ends with this release")
+        given[now.name] = value
+
 
 _flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
 
@@ -174,7 +168,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
     """
     parts: list[Parameter | _Flag] = []
-    flags: dict[str, _Flag] = {}
+    flags: dict[str, _Flag] = {}  # of the dataclasses, which the texts of the library name
     makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in signature(function).parameters.items():
@@ -182,23 +176,25 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         for twice in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
         if make is None:
-            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
+            parts.append(_direct(parameter, hints[name]))
         else:
             makers[name] = make, found
         flags |= found
         parts += found.values()
+    stated = [part for part in parts if isinstance(part, _Flag)]
+    inputs, old = [flag for flag in stated if flag.option.reads], [form for flag in stated for form in flag.earlier]
 
     def called(**given: Any) -> None:
         before = _flags.set(flags)
         try:
             for earlier in old:
-                earlier.move(given)
-            read = [(given[name], *how) for name, how in inputs.items()]
+                earlier.move(given, known)
+            read = [(given[flag.name], flag) for flag in inputs]
             for parameter, (make, found) in makers.items():
                 values = {name: flag.value(given.pop(name)) for name, flag in found.items()}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
-            for each in read:  # before anything is imported that takes seconds
-                _require(*each)
+            for value, flag in read:  # before anything is imported that takes seconds
+                _require(value, flag)
             function(**given)
         except BevcliError as error:
             error.args = (as_flags(str(error)), *error.args[1:])
@@ -207,33 +203,36 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             _flags.reset(before)
 
     called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
-    parameters = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
-    spelled = {each.name: flags[each.name].yes if each.name in flags else f"--{each.name}" for each in parameters}
-    infos = {each.name: _info_in(each.annotation) for each in parameters}
-    inputs = {name: (spelled[name], info) for name, info in infos.items() if getattr(info, "reads", None)}
-    retired = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
-    retired += [(each, "") for each in parameters if OldArgument in get_args(each.annotation)]
-    old = [_Old(each, spelled[each.name], text) for each, text in retired]
-    made = [*parameters, *(each.parameter for each in old)]
-    called.__signature__ = Signature([_with_metavar(each) for each in made])  # type: ignore[attr-defined]
+    made = [part.parameter(flags) if isinstance(part, _Flag) else part for part in (*parts, *old)]
+    known = {each.name: each.default for each in made}
+    called.__signature__ = Signature(made)  # type: ignore[attr-defined]
     return called
 
 
-def _require(value: Any, flag: str, info: Any) -> None:
+def _direct(parameter: Parameter, hint: Any) -> Parameter | _Flag:
+    """A parameter that is no dataclass of options; one without an `Option` in its annotation stays as typer has it."""
+    marks = getattr(hint, "__metadata__", ())
+    if marks and isinstance(marks[0], Option):
+        return _Flag(parameter.name, marks[0], get_args(hint)[0], parameter.default, marks[0].panel or None)
+    return parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint)
+
+
+def _require(value: Any, flag: _Flag) -> None:
     """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name.
 
-    value: one or several, or None. info: of typer, with `reads`.
+    value: one or several, or None.
     """
+    reads, complete = flag.option.reads, flag.option.complete
     for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
         if not text or "://" in text or _exists(Path(text)):
             continue
-        if info.reads == "path or name" and not Path(text).suffix and os.sep not in text:
-            known = [text] if info.autocompletion is None else list(info.autocompletion(""))
+        if reads == "path or name" and not Path(text).suffix and os.sep not in text:
+            known = [text] if complete is None else list(complete(""))
             if text not in known:
                 near = difflib.get_close_matches(text, known, n=1)
                 hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
-                raise InputError(f"{flag} {text}: is unknown: {hint}")
-        elif info.reads != "path or pattern" or not glob.has_magic(text):
+                raise InputError(f"{flag.yes} {text}: is unknown: {hint}")
+        elif reads != "path or pattern" or not glob.has_magic(text):
             raise InputError(f"{text}: there is no such file or folder")
         elif next(glob.iglob(text), None) is None:
             raise InputError(f"{text}: nothing matches this pattern (expected drives)")
@@ -290,46 +289,22 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
 
 def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     """The maker of a parameter's value, and its options by name; None for a parameter without options."""
-    hint, marks = _unmarked(hint)
+    marks = getattr(hint, "__metadata__", ())
+    hint = get_args(hint)[0] if marks else hint
     part = next((each for each in marks if isinstance(each, Part)), Part())
-    if part.classes is None and not dataclasses.is_dataclass(hint):
+    own = hint == FormatValues
+    if not own and not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
-    for kind in [hint] if part.classes is None else part.classes():
+    for kind in option_classes() if own else [hint]:
         kinds, known = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
-            stated = option_of(field)
-            if stated is not None and not stated.hidden and field.name in part:
-                default = known.get(field.name, Parameter.empty)
-                flag = _Flag(field, stated, kinds[field.name], default, stated.panel or kind.panel)
-                found.setdefault(field.name, flag)
+            stated, name = option_of(field), field.name
+            if stated is not None and not stated.hidden and name in part:
+                default = known.get(name, Parameter.empty)
+                found.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
     assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
-    return (dict if part.classes else hint), found
-
-
-def _unmarked(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """The type in an annotation, and the marks of an Annotated."""
-    return (get_args(hint)[0], hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
-
-
-def _info_in(hint: Any) -> Any:
-    """The `typer.Argument` or `typer.Option` in an annotation, or None."""
-    return next((each for each in _unmarked(hint)[1] if isinstance(each, typer.models.ParameterInfo)), None)
-
-
-def _with_metavar(parameter: Parameter) -> Parameter:
-    """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
-    info, (whole, _) = copy.copy(_info_in(parameter.annotation)), _unmarked(parameter.annotation)
-    kind = whole
-    while get_origin(kind) in (list, tuple, Union, types.UnionType):
-        kind = get_args(kind)[0]
-    if info is None or info.metavar is not None or kind is bool:
-        return parameter
-    if isinstance(info, typer.models.ArgumentInfo):
-        info.metavar = parameter.name.upper()
-    else:
-        info.metavar = "|".join(get_args(kind)) or _METAVARS.get(kind)
-    return parameter.replace(annotation=Annotated[whole, info])
+    return (dict if own else hint), found
 
 
 def _plain(hint: Any) -> Any:

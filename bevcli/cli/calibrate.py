@@ -1,12 +1,11 @@
 """`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from bevcli.calibration.options import CalibrateOptions, CalibrateOutputOptions
-from bevcli.cli.bridge import InputDrive, Json, Part, as_flags
+from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 PANEL = "Look"
@@ -16,7 +15,7 @@ def calibrate(
     sequence: InputDrive,
     options: CalibrateOptions,
     source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
-    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    format_options: FormatValues,
     output: CalibrateOutputOptions,
     as_json: Json = False,
 ) -> None:

@@ -3,13 +3,10 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import InputDrive, Part
+from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
 from bevcli.printing import say
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
 
 PANEL = "Start"
@@ -17,10 +14,10 @@ PANEL = "Start"
 
 def convert(
     input: InputDrive,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder or file to write.")],
+    out: Annotated[Path, argument("The folder or file to write.", reads=None)],
     options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
     labels: LabelOptions,
-    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    format_options: FormatValues,
     written: WriteOptions,
 ) -> None:
     """Write any input as a native sequence folder, or as a drive of another format.

@@ -2,24 +2,23 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from bevcli.cli.bridge import Json, Part, input_argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.printing import say
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 PANEL = "Score"
 
 
 def evaluate(
-    predictions: Annotated[Path, input_argument("predictions.json, the folder of a run, or a results_nusc.json.")],
+    predictions: Annotated[Path, argument("predictions.json, the folder of a run, or a results_nusc.json.")],
     ground_truth: Annotated[
-        Path, input_argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
+        Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
     source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     options: EvaluationOptions,
     as_json: Json = False,
 ) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from bevcli.cli.bridge import Part, input_argument
+from bevcli.cli.bridge import Part, argument
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -14,9 +14,7 @@ PANEL = "Look"
 
 
 def explain(
-    sequence: Annotated[
-        Path, input_argument("A sequence folder, a folder of videos (one per camera), or a nuScenes root.")
-    ],
+    sequence: Annotated[Path, argument("A sequence folder, a folder of videos (one per camera), or a nuScenes root.")],
     model: Annotated[ModelOptions, Part(only=("model", "weights", "untrained", "device"))],
     options: ExplainOptions,
     run_options: Annotated[RunOptions, Part(only=("command",))],

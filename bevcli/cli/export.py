@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bevcli.cli.bridge import input_argument
+from bevcli.cli.bridge import argument
 from bevcli.evaluation.options import ExportOptions
 from bevcli.printing import say
 
@@ -16,7 +16,7 @@ PANEL = "Score"
 def export(
     predictions: Annotated[
         Path,
-        input_argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
+        argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
     ],
     options: ExportOptions,
 ) -> None:

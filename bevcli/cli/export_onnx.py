@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from bevcli.cli.bridge import OldArgument, Part, model_option
+from bevcli.cli.bridge import Part, model_option
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -17,9 +17,9 @@ def export_onnx(
         str | None,
         model_option(
             "tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that WEIGHTS "
-            "fit, else demo."
+            "fit, else demo.",
+            old=("",),
         ),
-        OldArgument,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],

@@ -2,9 +2,8 @@
 
 from typing import Annotated
 
-import typer
-
 from bevcli.batch.options import FindLikeOptions
+from bevcli.cli.bridge import argument
 from bevcli.printing import say
 
 PANEL = "Look"
@@ -13,8 +12,8 @@ PANEL = "Look"
 def find_like(
     run: Annotated[
         str,
-        typer.Argument(
-            help="The drive of the frame: its name in the batch, or a result folder of `bevcli batch --embed`."
+        argument(
+            "The drive of the frame: its name in the batch, or a result folder of `bevcli batch --embed`.", reads=None
         ),
     ],
     options: FindLikeOptions,

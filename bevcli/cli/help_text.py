@@ -6,13 +6,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import typer
-from typer.core import TyperCommand, TyperGroup
-
-from bevcli.registry import entries, load
-
-# The order of the commands' panels. A command states its own as `PANEL` in its file; those that state none come last.
-PANELS = ("Start", "Run", "Look", "Score", "Train", "Deploy", "Other commands")
-GROUP = "bevcli.commands"
+from typer.core import TyperCommand
 
 
 def printable(text: str) -> str:
@@ -25,7 +19,6 @@ class PlainCommand(TyperCommand):
     """A command whose `--help` lists its options by their panels."""
 
     def get_help(self, ctx: Any) -> str:
-        """The help text, printable."""
         return printable(super().get_help(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -56,33 +49,15 @@ class PlainCommand(TyperCommand):
                 name = each.metavar if is_argument and each.metavar else row[0]
                 panels.setdefault(panel or "Options", []).append((name, row[1]))
         panels["Options"] = panels.pop("Options", [])
-        _write(panels, formatter)
-
-
-class PlainGroup(TyperGroup):
-    """The program, whose `--help` lists the commands by panels. It reads their docstrings and builds none of them."""
-
-    def get_help(self, ctx: Any) -> str:
-        """The help text, printable."""
-        return printable(super().get_help(ctx))
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands by panels."""
-        panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
-        for name, entry in entries(GROUP).items():
-            found = load(GROUP, name)
-            text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
-            summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
-            panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
-            panels.setdefault(panel, []).append((name, summary))
-        _write(panels, formatter)
+        write_panels(panels, formatter)
 
 
 def _takes_path(hint: Any) -> bool:
     return hint is Path or any(_takes_path(each) for each in get_args(hint))
 
 
-def _write(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
+def write_panels(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
+    """Write the names and texts of each panel below its heading."""
     for panel, rows in panels.items():
         if rows:
             with formatter.section(panel):

@@ -4,6 +4,7 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 143 by SIGTERM; a command may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
 """
 
+import inspect
 import io
 import os
 import re
@@ -13,15 +14,19 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from bevcli._version import __version__
 from bevcli.cli.bridge import command
-from bevcli.cli.help_text import GROUP, PlainCommand, PlainGroup
+from bevcli.cli.help_text import PlainCommand, printable, write_panels
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, reason_of, say
 from bevcli.registry import entries, load
 
+# The order of the commands' panels. A command states its own as `PANEL` in its file; those that state none come last.
+PANELS = ("Start", "Run", "Look", "Score", "Train", "Deploy", "Other commands")
+GROUP = "bevcli.commands"
 # Each library words it otherwise.
 NO_MEMORY = re.compile(
     "map segment|out of memory|insufficient memory|bad_alloc|bad allocation|(?:cannot|can't|unable to) allocate"
@@ -31,8 +36,8 @@ NO_MEMORY = re.compile(
 OURS = str(Path(__file__).parents[1])
 
 
-class _Group(PlainGroup):
-    """The commands of the entry points, each imported when it is asked for, and further ones."""
+class _Group(TyperGroup):
+    """The commands of the entry points, each built when it is asked for, and further ones. `--help` builds none."""
 
     commands: dict[str, Any]
 
@@ -46,6 +51,20 @@ class _Group(PlainGroup):
         if cmd_name in self.list_commands(ctx) and self.commands[cmd_name] is None:
             self.commands[cmd_name] = click_command(cmd_name, load(GROUP, cmd_name))
         return self.commands.get(cmd_name)
+
+    def get_help(self, ctx: Any) -> str:
+        return printable(super().get_help(ctx))
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands by panels, with the summaries of their docstrings."""
+        panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
+        for name, entry in entries(GROUP).items():
+            found = load(GROUP, name)
+            text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+            summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
+            panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
+            panels.setdefault(panel, []).append((name, summary))
+        write_panels(panels, formatter)
 
 
 def click_command(name: str, found: Any) -> Any:
@@ -62,7 +81,6 @@ def click_command(name: str, found: Any) -> Any:
 app = typer.Typer(
     cls=_Group,
     rich_markup_mode=None,
-    help="Run BEVFormer on sequences from any camera rig, and look at the results.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -7,18 +7,25 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, TextIO
 
+import typer
+
 from bevcli.cli.bridge import as_flags
-from bevcli.printing import duration, one_line
+from bevcli.inference.options import ModelOptions
+from bevcli.printing import duration, one_line, say
 
 if TYPE_CHECKING:
     import rich.progress
 
     from bevcli.frame import Sequence
     from bevcli.inference.load import Model
+    from bevcli.weights.cache import NamedWeights
+    from bevcli.weights.fetch import FetchedWeights
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
+STOPPED = 130  # exit code of a download that Ctrl-C ends
+MB = 1_000_000
 
 
 class Progress:
@@ -31,12 +38,11 @@ class Progress:
         total: the amount of work, in units.
         unit: the plural of the unit, such as "frames".
         notes: printed at the start, each once.
-        stream: where to write; stderr if None.
     """
 
-    def __init__(self, total: int, unit: str, notes: Iterable[str] = (), stream: TextIO | None = None) -> None:
+    def __init__(self, total: int, unit: str, notes: Iterable[str] = ()) -> None:
         self.total, self.unit, self._notes = total, unit, dict.fromkeys(notes)
-        self.stream = sys.stderr if stream is None else stream
+        self.stream = sys.stderr
         self.done = 0
         self.detail = ""
         self.skipped = 0
@@ -142,3 +148,37 @@ def in_engine_with_bar(model: "Model", drive: "Sequence", parts: str = "") -> "M
 
     with engine_bar() as show:
         return in_engine(model, drive.rig, drive, parts=parts, report=show)
+
+
+def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
+    """The file of weights, downloaded if it is not there. Ctrl-C ends the command; what has come is kept."""
+    from bevcli.weights.fetch import fetch_weights
+
+    bar: Progress | None = None
+
+    def show(done: int, total: int | None) -> None:
+        """The bar starts when the size is known; total is None if the server does not state it."""
+        nonlocal bar
+        if bar is None:
+            note = f"{weights.name}: {weights.source.url}"
+            bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [note]))
+            bar.skip(done // MB)
+        bar.reach(done // MB)
+
+    with ExitStack() as shown:
+        try:
+            return fetch_weights(weights, show, force=force)
+        except KeyboardInterrupt:
+            say("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(STOPPED) from None
+
+
+def fetch_if_asked(options: ModelOptions) -> None:
+    """Download the weights of a model, where `fetch` asks for it and they are not there."""
+    if not options.fetch or options.weights is not None or options.untrained:
+        return
+    from bevcli.weights.cache import all_weights
+
+    named = all_weights(options.weights_dir).get(str(options.model))
+    if named is not None and named.here is None:
+        fetch_with_bar(named)

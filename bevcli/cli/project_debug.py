@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, as_flags, input_argument
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags
 from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
@@ -21,9 +20,9 @@ ERRORS_FOUND = 3
 
 
 def project_debug(
-    calibration: Annotated[Path, input_argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
+    calibration: Annotated[Path, argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
-    format_options: Annotated[dict[str, Any], Part(only=("topics", "topics_file"), classes=option_classes)],
+    format_options: Annotated[FormatValues, Part(only=("topics", "topics_file"))],
     options: CheckOptions,
     as_json: Json = False,
 ) -> None:

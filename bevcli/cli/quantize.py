@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from bevcli.cli.bridge import Part, input_argument
+from bevcli.cli.bridge import Part, argument
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -12,7 +12,7 @@ PANEL = "Deploy"
 
 
 def quantize(
-    model: Annotated[Path, input_argument("A file of `bevcli export-onnx`.", metavar="FILE.onnx")],
+    model: Annotated[Path, argument("A file of `bevcli export-onnx`.", metavar="FILE.onnx")],
     model_options: Annotated[ModelOptions, Part(only=("engine",))],
     file: FileOptions,
     options: QuantizeOptions,
@@ -22,7 +22,7 @@ def quantize(
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.benchmark.exported import compare_exported, difference_lines
+    from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.exported import load_exported
     from bevcli.engines.quantize import quantize as write_quantized
     from bevcli.inference.preprocess import calibration_images
@@ -37,4 +37,4 @@ def quantize(
     write_quantized(model, calibration_images(config, network.cameras, drives, options.frames), target)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
-        say("\n".join(difference_lines(list(compare_exported(target, model, drive, engine)))))
+        say("\n".join(difference_lines(list(check_exported(target, model, drive, engine)))))

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from bevcli.cli.bridge import argument
 from bevcli.printing import say
 from bevcli.synth.options import RenderOptions
 
@@ -12,7 +11,7 @@ PANEL = "Start"
 
 
 def render(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The sequence folder to write.")],
+    out: Annotated[Path, argument("The sequence folder to write.", reads=None)],
     options: RenderOptions,
 ) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""

@@ -10,7 +10,7 @@ import typer
 
 from bevcli.batch.options import ReproduceOptions, Workers
 from bevcli.cli.batch import SOME_FAILED, load_for_batch, run_with_progress
-from bevcli.cli.bridge import Json, Part
+from bevcli.cli.bridge import Json, Part, argument
 from bevcli.errors import InputError, WeightsError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -26,7 +26,7 @@ PANEL = "Score"
 
 
 def reproduce(
-    name: Annotated[str, typer.Argument(help="A name of `bevcli weights list`, such as tiny.")],
+    name: Annotated[str, argument("A name of `bevcli weights list`, such as tiny.", reads=None)],
     options: ReproduceOptions,
     workers: Workers,
     model: Annotated[ModelOptions, Part(only=("weights", "fetch", "weights_dir", "device", "precision"))],
@@ -84,7 +84,7 @@ def reproduce(
 
 def _get(named: "NamedWeights", model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
-    from bevcli.cli.fetching import fetch_with_bar
+    from bevcli.cli.progress import fetch_with_bar
     from bevcli.weights.fetch import by_hand
 
     if named.here is not None:

@@ -4,17 +4,16 @@ import gc
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from bevcli.calibration.options import CalibrateFirstOptions
-from bevcli.cli.bridge import InputDrive, Part, as_flags
+from bevcli.cli.bridge import FormatValues, InputDrive, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def run(
     source: SequenceOptions,
     first: CalibrateFirstOptions,
     output: OutputOptions,
-    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    format_options: FormatValues,
 ) -> None:
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
@@ -45,8 +44,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.fetching import fetch_if_asked
-        from bevcli.cli.progress import Progress, in_engine_with_bar
+        from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.inference.load import load_model
         from bevcli.rig.check_drive import CheckedDrive

@@ -4,20 +4,16 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from bevcli.errors import OutputError
+from bevcli.options import Option
 from bevcli.printing import say
-from bevcli.writing import write_whole
+from bevcli.writing import output_errors, write_whole
 
 PANEL = "Start"
 NAME, NOTEBOOK = "street", "first_steps.ipynb"
 
 
 def samples(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The folder that gets the sample.")] = Path(
-        "samples"
-    ),
+    out: Annotated[Path, Option("The folder that gets the sample.", metavar="DIR")] = Path("samples"),
 ) -> None:
     """Copy the sample drive, a rendered street, to DIR/street, and the notebook first_steps.ipynb.
 
@@ -32,11 +28,9 @@ def samples(
         if target.exists():
             say(f"{target}: exists already")
             continue
-        try:
+        with output_errors(target):
             if (source / name).is_dir():
                 shutil.copytree(source / name, target)
             else:
                 write_whole(target, (source / name).read_bytes())
-        except OSError as error:
-            raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
         say(f"{target}: copied; {advice}")

@@ -27,11 +27,7 @@ class _Signals:
         self._number = 0
         self._before: dict[signal.Signals, object] = {}
 
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def start(self) -> None:
+    def start(self) -> Self:
         """Handle signals from now on."""
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
             self._before = {number: signal.signal(number, self._receive) for number in self._handled()}
@@ -40,11 +36,9 @@ class _Signals:
             self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
             self._thread = threading.Thread(target=_end_at_second, args=(reader, self.limit_s), daemon=True)
             self._thread.start()
+        return self
 
-    def __exit__(self, *error: object) -> None:
-        self.stop()
-
-    def stop(self) -> None:
+    def stop(self, *error: object) -> None:
         """Handle them as before `start`."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
@@ -52,6 +46,8 @@ class _Signals:
             signal.set_wakeup_fd(self._fd_before)
             self._writer.close()  # ends the thread
             self._thread.join(1.0)
+
+    __enter__, __exit__ = start, stop
 
     def _handled(self) -> Iterable[signal.Signals]:
         return SIGNALS

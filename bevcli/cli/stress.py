@@ -2,15 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, input_argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.robustness.options import StressOptions, StressOutputOptions
-from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
 
@@ -20,13 +19,13 @@ PANEL = "Score"
 def stress(
     sequence: Annotated[
         list[Path] | None,
-        input_argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
     options: StressOptions,
     source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
     output: StressOutputOptions,
     as_json: Json = False,
@@ -37,8 +36,7 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.fetching import fetch_if_asked
-    from bevcli.cli.progress import Progress, in_engine_with_bar
+    from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
     from bevcli.inference.load import load_model

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import OldArgument, Part, model_option, print_note
+from bevcli.cli.bridge import Part, model_option, print_note
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -19,12 +19,9 @@ PANEL = "Train"
 
 def train(
     model: Annotated[
-        str,
-        model_option(
-            "A model name or a FILE.toml; required. Its training table holds the settings.", show_default=False
-        ),
-        OldArgument,
-    ] = "",
+        str | None,
+        model_option("A model name or a FILE.toml; required. Its training table holds the settings.", old=("",)),
+    ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
     drives: Annotated[DriveOptions, Part(only=("data", "rendered", "split", "class_map"))],

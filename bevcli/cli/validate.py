@@ -3,7 +3,7 @@
 import json
 from typing import Annotated
 
-from bevcli.cli.bridge import Json, OldArgument, Part, model_option
+from bevcli.cli.bridge import Json, Part, model_option
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.runs.options import RunOptions
@@ -16,8 +16,9 @@ PANEL = "Score"
 def validate(
     model: Annotated[
         str | None,
-        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
-        OldArgument,
+        model_option(
+            "A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.", old=("",)
+        ),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],

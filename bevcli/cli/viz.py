@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import input_argument
+from bevcli.cli.bridge import argument
 from bevcli.printing import say
 from bevcli.viewer.options import ViewOptions
 
@@ -13,7 +13,7 @@ PANEL = "Look"
 
 
 def viz(
-    recording: Annotated[Path, input_argument("A recording (.rrd), or the output folder of `bevcli run`.")],
+    recording: Annotated[Path, argument("A recording (.rrd), or the output folder of `bevcli run`.")],
     options: ViewOptions,
 ) -> None:
     """Show a recording in the viewer, or write an image, a video or a summary.

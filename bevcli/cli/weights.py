@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, command, input_argument, model_option
+from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
 from bevcli.inference.options import ModelOptions
+from bevcli.options import Option
 from bevcli.printing import aligned, say
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     from bevcli.published import own_table
     from bevcli.weights.cache import all_weights
 
-    found = list(all_weights(options.weights_dir))
+    found = list(all_weights(options.weights_dir).values())
     if as_json:
         say(json.dumps([_named_as_data(each) for each in found], indent=1))
         return
@@ -49,16 +50,16 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
 @weights_app.command(cls=PlainCommand)
 @command
 def fetch(
-    name: Annotated[str, typer.Argument(help="A name of `bevcli weights list`.")],
+    name: Annotated[str, argument("A name of `bevcli weights list`.", reads=None)],
     options: Annotated[ModelOptions, Part(only=("weights_dir",))],
-    force: Annotated[bool, typer.Option("--force", help="Download a file once more that is there.")] = False,
+    force: Annotated[bool, Option("Download a file once more that is there.")] = False,
 ) -> None:
     """Download weights by NAME, for `--model NAME`.
 
     A cut download goes on where it ended. The file is checked: its hash if that is known, else its size and the keys
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
-    from bevcli.cli.fetching import fetch_with_bar
+    from bevcli.cli.progress import fetch_with_bar
     from bevcli.weights.cache import named_weights
 
     found = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
@@ -74,15 +75,12 @@ def fetch(
 @weights_app.command(cls=PlainCommand)
 @command
 def inspect(
-    file: Annotated[
-        Path | None, input_argument("An official .pth as published, or a .safetensors.", show_default=False)
-    ] = None,
+    file: Annotated[Path | None, argument("An official .pth as published, or a .safetensors.")] = None,
     model: Annotated[
         str | None,
         model_option(
             "List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
-            panel=None,
-            show_default=False,
+            panel="",
         ),
     ] = None,
     as_json: Json = False,
@@ -119,8 +117,8 @@ def inspect(
 @weights_app.command(cls=PlainCommand)
 @command
 def convert(
-    source: Annotated[Path, input_argument("An official .pth as published, or a .safetensors.")],
-    destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
+    source: Annotated[Path, argument("An official .pth as published, or a .safetensors.")],
+    destination: Annotated[Path, argument("The .safetensors to write.", reads=None)],
     options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:
     """Write SOURCE as .safetensors with our key names.

@@ -27,7 +27,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.weights.cache import NamedWeights, find_weights, weights_folder
+from bevcli.weights.cache import NamedWeights, all_weights, weights_folder
 from bevcli.weights.fetch import by_hand, fetch_weights
 
 DEFAULT_MODEL = "demo"
@@ -187,7 +187,7 @@ def _load_network(options: ModelOptions) -> Model:
         raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    named = find_weights(str(name), options.weights_dir)
+    named = all_weights(options.weights_dir).get(str(name))
     config = load_config(name)
     tracker = _tracker(load_table(name, TRACKING, TrackerConfig), config, str(name))
     wanted = weights is None and not untrained

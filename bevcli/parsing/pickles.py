@@ -2,8 +2,8 @@
 
 The unpickler is that of the standard library in its Python form, whose table of opcodes can be replaced. Only the
 opcodes that `torch.save` writes are left in it. A name in the file becomes a `Global`, which is only a pair of strings,
-and a call becomes whatever `call` of the reader makes of it, by default a `Placeholder`. Attributes that the file wants
-to set are left out.
+and a call becomes whatever `PickleReader.call` makes of it, here a `Placeholder`. Attributes that the file wants to set
+are left out.
 """
 
 import io
@@ -58,59 +58,47 @@ class Placeholder:
         """Leaves out an element of a set."""
 
 
-def read_pickle(
-    file: io.BytesIO,
-    call: Callable[[Global, tuple[Any, ...]], Any] = lambda function, arguments: Placeholder(function),
-    persistent: Callable[[Any], Any] | None = None,
-) -> Any:
-    """The object in a pickle. Raises PickleError.
-
-    Args:
-        file: at the start of the pickle; afterwards at its end.
-        call: the object for a call of a global with a tuple of arguments.
-        persistent: the object for a persistent id.
-    """
-    start = file.tell()
-    try:
-        for count, (opcode, _, _) in enumerate(pickletools.genops(file)):
-            if opcode.name not in _CODES:
-                raise PickleError(f"unsupported opcode {opcode.name}")
-            if count == MOST_OPCODES:
-                raise PickleError(f"more than {MOST_OPCODES} opcodes")
-        file.seek(start)
-        return _Reader(file, call, persistent).load()
-    except _DAMAGE as error:
-        raise PickleError(f"damaged value ({error})") from None
-
-
-class _Reader(pickle._Unpickler):
+class PickleReader(pickle._Unpickler):
     """Python's unpickler, with plain objects in place of whatever a file could call."""
 
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]
 
-    def __init__(
-        self, file: io.BytesIO, call: Callable[[Global, tuple[Any, ...]], Any], persistent: Callable[[Any], Any] | None
-    ) -> None:
+    def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, encoding="utf-8", errors="replace")
-        self._call, self._persistent = call, persistent
+        self._file = file
+
+    def load(self) -> Any:
+        """The object in the pickle that starts here in the file. Raises PickleError."""
+        start = self._file.tell()
+        try:
+            for count, (opcode, _, _) in enumerate(pickletools.genops(self._file)):
+                if opcode.name not in _CODES:
+                    raise PickleError(f"unsupported opcode {opcode.name}")
+                if count == MOST_OPCODES:
+                    raise PickleError(f"more than {MOST_OPCODES} opcodes")
+            self._file.seek(start)
+            return super().load()
+        except _DAMAGE as error:
+            raise PickleError(f"damaged value ({error})") from None
+
+    def call(self, function: Global, arguments: tuple[Any, ...]) -> Any:
+        """The object for a call of a global."""
+        return Placeholder(function)
 
     def find_class(self, module: str, name: str) -> Global:
         """The name of a class or function: nothing is imported."""
         return Global(module, name)
 
     def persistent_load(self, pid: Any) -> Any:
-        """The object for a persistent id."""
-        if self._persistent is None:
-            raise PickleError("a persistent id outside of a PyTorch file")
-        return self._persistent(pid)
+        raise PickleError("a persistent id outside of a PyTorch file")
 
     def _reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
         if isinstance(function, Placeholder):  # a call of what an unknown call returned, such as getattr(…)
             self.stack.append(function)
         elif isinstance(function, Global) and isinstance(arguments, tuple):
-            self.stack.append(self._call(function, arguments))
+            self.stack.append(self.call(function, arguments))
         else:
             raise PickleError("a call of something that is not a function")
 

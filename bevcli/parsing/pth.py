@@ -11,7 +11,7 @@ import math
 import struct
 import sys
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.parsing.files import open_regular
-from bevcli.parsing.pickles import MOST_OPCODES, Global, PickleError, Placeholder, read_pickle
+from bevcli.parsing.pickles import MOST_OPCODES, Global, PickleError, PickleReader
 
 LARGEST_PICKLE = 32 << 20
 LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
@@ -87,20 +87,15 @@ class PthFile:
     _path: Path = field(repr=False)
     _open: Callable[[], contextlib.AbstractContextManager[_Read]] = field(repr=False)
 
-    def tensors(self, stored: Mapping[str, StoredTensor]) -> dict[str, Tensor]:
-        """The tensors of a state dict. Raises WeightsError where one does not fit the bytes that the file has."""
-        with self._open() as read:
-            storages = _Storages(self._path, read)
-            return {name: storages.tensor(name, described) for name, described in stored.items()}
+    def with_tensors(self, part: Any = None) -> Any:
+        """The contents, or a part of them, with tensors in place of `StoredTensor`.
 
-    def with_tensors(self) -> Any:
-        """The contents with tensors in place of `StoredTensor`.
-
-        Raises WeightsError as `tensors`, and for more than two million values: a tuple of a tuple of a tuple, each
-        twice, is small in a file. RecursionError where a list contains itself.
+        Raises WeightsError where a tensor does not fit the bytes that the file has, and for more than two million
+        values: a tuple of a tuple of a tuple, each twice, is small in a file. RecursionError where a list contains
+        itself.
         """
         with self._open() as read:
-            return _filled(self.contents, "", _Storages(self._path, read))
+            return _Tensors(self._path, read).filled(self.contents if part is None else part, "")
 
 
 def read_pth(path: Path) -> PthFile:
@@ -118,19 +113,18 @@ _MADE: dict[str, Callable[..., Any]] = {
     "collections.OrderedDict": lambda *_: {},
     "collections.defaultdict": lambda *_: {},
     "torch._utils._rebuild_tensor": StoredTensor,
-    "torch._utils._rebuild_tensor_v2": lambda storage, offset, shape, strides, *_: StoredTensor(
-        storage, offset, shape, strides
-    ),
+    "torch._utils._rebuild_tensor_v2": lambda *given: StoredTensor(*given[:4]),
     "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
     "torch._utils._rebuild_parameter_with_state": lambda tensor, *_: tensor,
     "torch.Size": lambda sizes=(), *_: sizes,
 }
 
 
-class _Calls:
-    """Objects for the calls and persistent ids in a file, and the names of those that are left out."""
+class _TorchReader(PickleReader):
+    """Makes the objects of a PyTorch file, and keeps the names of those that are left out."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, file: io.BytesIO, path: Path) -> None:
+        super().__init__(file)
         self._path = path
         self.left_out: set[str] = set()
         self.storages: dict[str, Storage] = {}
@@ -147,9 +141,9 @@ class _Calls:
                 "Nothing in it was run; do not use this file"
             )
         self.left_out.add(name)
-        return Placeholder(function)
+        return super().call(function, arguments)
 
-    def persistent(self, pid: Any) -> Storage:
+    def persistent_load(self, pid: Any) -> Storage:
         if not (isinstance(pid, tuple) and len(pid) >= 5 and pid[0] == "storage" and isinstance(pid[1], Global)):
             raise PickleError("a persistent id that is no storage")
         kind, key, count = pid[1], pid[2], pid[4]
@@ -166,8 +160,8 @@ class _Calls:
         return storage
 
 
-class _Storages:
-    """Reads storages when a tensor needs them, each once."""
+class _Tensors:
+    """Makes tensors, for which it reads each storage once."""
 
     def __init__(self, path: Path, read: _Read) -> None:
         self._path, self._read = path, read
@@ -175,15 +169,23 @@ class _Storages:
         self._bytes = 0
         self._values = 0
 
-    def count(self) -> None:
-        """Counts a value of the contents. Raises WeightsError where there are too many."""
+    def filled(self, value: Any, name: str) -> Any:
+        """A value with tensors in place of `StoredTensor`. name: of the value, for messages."""
         self._values += 1
         if self._values > MOST_OPCODES:
             raise WeightsError(
                 f"{self._path}: has more than {MOST_OPCODES} values, those of repeated lists counted each time"
             )
+        if isinstance(value, StoredTensor):
+            return self._tensor(name, value)
+        if isinstance(value, dict):
+            return {key: self.filled(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            items = [self.filled(item, f"{name}.{place}".lstrip(".")) for place, item in enumerate(value)]
+            return items if isinstance(value, list) else tuple(items)
+        return value
 
-    def tensor(self, name: str, stored: StoredTensor) -> Tensor:
+    def _tensor(self, name: str, stored: StoredTensor) -> Tensor:
         storage, offset = stored.storage, stored.offset
         if not isinstance(storage, Storage):
             raise WeightsError(f"{self._path}: tensor {name}: has no numbers in the file")
@@ -215,19 +217,6 @@ class _Storages:
         return torch.frombuffer(data, dtype=storage.dtype)
 
 
-def _filled(value: Any, name: str, storages: _Storages) -> Any:
-    """A value with tensors in place of `StoredTensor`. name: of the value, for messages."""
-    storages.count()
-    if isinstance(value, StoredTensor):
-        return storages.tensor(name, value)
-    if isinstance(value, dict):
-        return {key: _filled(item, f"{name}.{key}".lstrip("."), storages) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        items = [_filled(item, f"{name}.{place}".lstrip("."), storages) for place, item in enumerate(value)]
-        return items if isinstance(value, list) else tuple(items)
-    return value
-
-
 def _read_zip(path: Path, file: BinaryIO) -> PthFile:
     with zipfile.ZipFile(file) as archive:
         folder = archive.namelist()[0].split("/")[0] if archive.namelist() else ""
@@ -236,15 +225,15 @@ def _read_zip(path: Path, file: BinaryIO) -> PthFile:
             if order.decode("ascii", "replace") != sys.byteorder:
                 raise PickleError(f"its numbers have the byte order {order!r}")
         data = _entry(archive, f"{folder}/data.pkl", None, LARGEST_PICKLE)
-    calls = _Calls(path)
-    contents = read_pickle(io.BytesIO(data), calls.call, calls.persistent)
+    reader = _TorchReader(io.BytesIO(data), path)
+    contents = reader.load()
 
     @contextlib.contextmanager
     def open_storages() -> Iterator[_Read]:
         with zipfile.ZipFile(path) as archive:
             yield lambda key, size: bytearray(_entry(archive, f"{folder}/data/{key}", size, size))
 
-    return PthFile(contents, tuple(sorted(calls.left_out)), path, open_storages)
+    return PthFile(contents, tuple(sorted(reader.left_out)), path, open_storages)
 
 
 def _entry(archive: zipfile.ZipFile, name: str, expected: int | None, largest: int) -> bytes:
@@ -264,24 +253,23 @@ def _entry(archive: zipfile.ZipFile, name: str, expected: int | None, largest: i
 def _read_old(path: Path, file: BinaryIO) -> PthFile:
     """magic number, protocol, system facts, contents and storage keys as pickles, then the storages."""
     start = io.BytesIO(file.read(LARGEST_PICKLE))
-    if read_pickle(start) != _OLD_FORMAT:
+    if PickleReader(start).load() != _OLD_FORMAT:
         raise PickleError("another kind of file")
-    read_pickle(start)
-    facts = read_pickle(start)
+    PickleReader(start).load()
+    facts = PickleReader(start).load()
     if isinstance(facts, dict) and facts.get("little_endian", True) != (sys.byteorder == "little"):
         raise PickleError("its numbers have another byte order")
-    calls = _Calls(path)
-    contents = read_pickle(start, calls.call, calls.persistent)
-    keys = read_pickle(start)
+    reader = _TorchReader(start, path)
+    contents, keys = reader.load(), PickleReader(start).load()
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise PickleError("the list of its storages is damaged")
     file.seek(start.tell())
     places: dict[str, int] = {}
     for key in keys:
         header = file.read(8)
-        if len(header) < 8 or key not in calls.storages:
+        if len(header) < 8 or key not in reader.storages:
             raise PickleError(f"storage {key:.50} is missing")
-        storage = calls.storages[key]
+        storage = reader.storages[key]
         if struct.unpack("<q", header)[0] != storage.count:
             raise PickleError(f"storage {key:.50} has another size than the pickle states")
         places[key] = file.tell()
@@ -292,7 +280,7 @@ def _read_old(path: Path, file: BinaryIO) -> PthFile:
         with path.open("rb") as file:
             yield lambda key, size: _part(file, places[key], size)
 
-    return PthFile(contents, tuple(sorted(calls.left_out)), path, open_storages)
+    return PthFile(contents, tuple(sorted(reader.left_out)), path, open_storages)
 
 
 def _part(file: BinaryIO, offset: int, size: int) -> bytearray:

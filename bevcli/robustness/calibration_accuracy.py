@@ -73,14 +73,13 @@ def errors_of_drive(drive: Sequence, levels: list[int], seeds: list[int]) -> Ite
 
 
 class WrongTimes(DerivedSequence):
-    """A drive with ego-motion in which one camera states capture times that are too late by a constant."""
+    """A drive with ego-motion in which one camera states times, and poses at them, that are too late by a constant."""
 
     def __init__(self, sequence: Sequence, camera: str, late_ms: float) -> None:
         super().__init__(sequence)
         self._camera, self._late_ns = camera, round(late_ms * 1e6)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, with the wrong time and the vehicle's pose at that time."""
         frame, name, motion = self.sequence.load(place), self._camera, self.ego_motion
         if name not in frame.images or motion is None:
             return frame

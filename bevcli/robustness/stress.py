@@ -1,5 +1,6 @@
 """`stress`: runs a model over the same drives under each condition, scores each, and writes the results."""
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator, Sequence as Items
 from dataclasses import dataclass, replace
@@ -103,24 +104,21 @@ def stress(
             state = StressState(facts)
             save_state(folder.state_path, state)
         test = _Test(model, scenes, options, folder, after_frame, should_stop)
-        header = test.header()
-        done = test.done_frames(conditions, state)
+        left = [condition for condition in conditions if not state.has(condition)]
+        done = test.kept_frames(left) + (len(conditions) - len(left)) * sum(len(scene.stamps) for scene in scenes)
         if done:
             resumed(done)
-        is_complete = True
-        try:
-            for condition in conditions:
-                if not state.has(condition):
-                    scores = (*state.scores, test.run(condition))
-                    state = StressState(facts, tuple(sorted(scores, key=_place_of)))
-                    save_state(folder.state_path, state)
-                    _write_results(folder, StressResults(header, state.scores, is_complete=False), against)
-                    test.remove_boxes(condition)
-        except _Stopped:
-            is_complete = False
-        results = StressResults(header, state.scores, is_complete)
+        results = StressResults(test.header(), state.scores, is_complete=False)
+        with contextlib.suppress(_Stopped):
+            for condition in left:
+                scores = (*results.scores, test.run(condition))
+                results = replace(results, scores=tuple(sorted(scores, key=_place_of)))
+                save_state(folder.state_path, StressState(facts, results.scores))
+                _write_results(folder, results, against)
+                test.remove_boxes(condition)
+            results = replace(results, is_complete=True)
         _write_results(folder, results, against)
-        if is_complete:
+        if results.is_complete:
             _write_figures(folder, results, against, scenes[0], options)
     return results
 
@@ -155,12 +153,10 @@ class _Test:
             "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self.scenes],
         }
 
-    def done_frames(self, conditions: Items[Condition], state: StressState) -> int:
-        """The number of frames of these conditions that need not be run again."""
-        each = [len(scene.stamps) for scene in self.scenes]
-        left = [condition for condition in conditions if not state.has(condition)]
-        kept = sum(n for place, n in enumerate(each) if left and self._boxes_path(left[0], place).exists())
-        return (len(conditions) - len(left)) * sum(each) + kept
+    def kept_frames(self, left: Items[Condition]) -> int:
+        """The number of frames of the first condition that is left whose boxes are stored."""
+        scenes = [scene for n, scene in enumerate(self.scenes) if left and self._boxes_path(left[0], n).exists()]
+        return sum(len(scene.stamps) for scene in scenes)
 
     def run(self, condition: Condition) -> ConditionScores:
         """The scores under a condition. Raises _Stopped."""

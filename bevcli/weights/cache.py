@@ -1,7 +1,6 @@
 """Weights by name: the folder where downloaded files lie, and the hashes that were computed at their first download."""
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,24 +82,17 @@ def weights_folder(chosen: Path | None = None) -> Path:
     return chosen or (Path(named) if named else user_cache() / "weights")
 
 
-def all_weights(folder: Path | None = None) -> Iterator[NamedWeights]:
+def all_weights(folder: Path | None = None) -> dict[str, NamedWeights]:
     """Every name of the table of sources. folder: of `weights_folder`. Raises ConfigError."""
-    for name, source in read_sources().items():
-        yield NamedWeights(name, source, weights_folder(folder))
-
-
-def find_weights(name: str, folder: Path | None = None) -> NamedWeights | None:
-    """A name of the table of sources; None for another one. Raises ConfigError."""
-    return next((each for each in all_weights(folder) if each.name == name), None)
+    return {name: NamedWeights(name, source, weights_folder(folder)) for name, source in read_sources().items()}
 
 
 def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     """A name of the table of sources. Raises WeightsError for another one."""
-    found = find_weights(name, folder)
-    if found is None:
-        known = ", ".join(each.name for each in all_weights(folder))
-        raise WeightsError(f'no weights are known as "{name}" (expected one of {known})')
-    return found
+    known = all_weights(folder)
+    if name not in known:
+        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(known)})')
+    return known[name]
 
 
 def _read_hashes(folder: Path) -> dict[str, Known]:

@@ -17,6 +17,7 @@ import msgspec
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
+from bevcli.writing import output_errors
 
 STALL_S, STALL_BYTES = 30, 1024  # a transfer that is slower than so many bytes in a second, for so long, is cut
 CONNECT_S = 20
@@ -50,12 +51,9 @@ def download(url: str, path: Path, expected_bytes: int | None, report: Report) -
         OutputError: the disk has too little space, or the file cannot be written.
     """
     require_space(path.parent, (expected_bytes or 0) - (path.stat().st_size if path.exists() else 0))
-    try:
-        with path.open("ab") as file:
-            _lock(file, path)
-            _download(_Transfer(url, path, file, expected_bytes, report))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    with output_errors(path), path.open("ab") as file:
+        _lock(file, path)
+        _download(_Transfer(url, path, file, expected_bytes, report))
 
 
 def require_space(folder: Path, wanted: int) -> None:

@@ -3,15 +3,16 @@
 import contextlib
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bevcli.checkpoints import bundled_weights, expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
-from bevcli.errors import BevcliError, OutputError, WeightsError
+from bevcli.errors import BevcliError, WeightsError
 from bevcli.published import own_table
 from bevcli.weights.cache import HASHES, Known, NamedWeights, named_weights
 from bevcli.weights.download import Report, download
+from bevcli.writing import output_errors
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 
@@ -54,20 +55,19 @@ def fetch_weights(
     if weights.source.path is not None or (not force and weights.here is not None):
         return _check(weights, weights.file)
     partial = weights.file.with_name(PARTIAL + weights.file.name)
-    try:
+    with output_errors(weights.file.parent):
         weights.file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{weights.file.parent}: cannot be written ({error.strerror})") from None
     download(weights.source.url, partial, weights.source.bytes, report)
     try:
         found = _check(weights, partial)
     except BevcliError as error:
         _remove(partial)
-        raise WeightsError(f"{weights.source.url}: refused, and deleted: {_without(str(error), partial)}") from None
+        reason = str(error).replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
+        raise WeightsError(f"{weights.source.url}: refused, and deleted: {reason}") from None
     weights.remember(found.known)
     os.replace(partial, weights.file)
     _remove(partial)
-    return FetchedWeights(weights.file, found.known, found.checked)
+    return replace(found, path=weights.file)
 
 
 def weights_file(path_or_name: Path) -> Path:
@@ -127,7 +127,3 @@ def _remove(partial: Path) -> None:
     for path in (partial, partial.with_name(f"{partial.name}.json")):
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def _without(message: str, partial: Path) -> str:
-    return message.replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")

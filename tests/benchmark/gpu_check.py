@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, get_args
@@ -49,15 +48,6 @@ class CheckFailed(Exception):
     """A part of the check found something wrong, or could not run; the message is Markdown."""
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of the report. passed: everything in it was as it should be. text: Markdown."""
-
-    title: str
-    passed: bool
-    text: str
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the check. Returns the exit code: 0 if everything passed, else 1."""
     parser = argparse.ArgumentParser(prog="make gpu-check", description="Check bevcli on a GPU and write a report.")
@@ -71,12 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if asked.compare is not None:
             say(json.dumps(compare(asked.compare, device)))
             return 0
-        sections = check(device, tuple(asked.model or known_models()))
-        write_whole(asked.out, report(device, sections).encode())
+        text, failed = check(device, tuple(asked.model or known_models()))
+        write_whole(asked.out, text.encode())
     except BevcliError as error:
         say(f"error: {error}", err=True)
         return 1
-    failed = [section.title for section in sections if not section.passed]
     say(f"wrote {asked.out}: {'failed: ' + ', '.join(failed) if failed else 'everything passed'}")
     return 1 if failed else 0
 
@@ -90,35 +79,27 @@ def gpu_of(name: str) -> torch.device:
     return choose_device(name)
 
 
-def check(device: torch.device, models: tuple[str, ...]) -> list[Section]:
-    """All parts of the check, one after another."""
-    parts: list[tuple[str, Callable[[], str]]] = [
-        ("tests", run_tests),
-        ("CPU and GPU compared", lambda: compare_all(device, models)),
-        (f"{TRAINED_STEPS} training steps", lambda: train(device)),
-        ("speed", lambda: bench(device, models)),
-    ]
-    sections = []
-    for title, part in parts:
+def check(device: torch.device, models: tuple[str, ...]) -> tuple[str, list[str]]:
+    """Run all parts of the check, one after another. Returns the report in Markdown, and the parts that failed."""
+    parts: dict[str, Callable[[], str]] = {
+        "tests": run_tests,
+        "CPU and GPU compared": lambda: compare_all(device, models),
+        f"{TRAINED_STEPS} training steps": lambda: train(device),
+        "speed": lambda: bench(device, models),
+    }
+    cuda = torch.version.cuda or "none"
+    machine = f"{describe_machine(device)}, CUDA {cuda}, Python {sys.version.split()[0]}."
+    lines = [f"# bevcli {__version__} on {device}", "", f"{date.today().isoformat()}: {machine}"]
+    failed = []
+    for title, part in parts.items():
         say(f"gpu-check: {title} …", err=True)
         try:
-            sections.append(Section(title, True, part()))
+            text, verdict = part(), "passed"
         except CheckFailed as failure:
-            sections.append(Section(title, False, str(failure)))
-    return sections
-
-
-def report(device: torch.device, sections: Sequence[Section]) -> str:
-    """The report in Markdown."""
-    cuda = torch.version.cuda or "none"
-    lines = [
-        f"# bevcli {__version__} on {device}",
-        "",
-        f"{date.today().isoformat()}: {describe_machine(device)}, CUDA {cuda}, Python {sys.version.split()[0]}.",
-    ]
-    for section in sections:
-        lines += ["", f"## {section.title}: {'passed' if section.passed else 'FAILED'}", "", section.text]
-    return "\n".join(lines) + "\n"
+            text, verdict = str(failure), "FAILED"
+            failed.append(title)
+        lines += ["", f"## {title}: {verdict}", "", text]
+    return "\n".join(lines) + "\n", failed
 
 
 def run_tests() -> str:

@@ -7,9 +7,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from bevcli.cli.bridge import OldArgument, Part, as_flags, command
+from bevcli.cli import bridge
+from bevcli.cli.bridge import Part, as_flags, command
 from bevcli.errors import InputError
-from bevcli.options import option, options
+from bevcli.options import Option, option, options
 
 
 def parse_range(text):
@@ -49,7 +50,7 @@ def invoke(function, *arguments):
 def options_of(*arguments):
     got = []
 
-    def read(source: ReadOptions, force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False) -> None:
+    def read(source: ReadOptions, force: Annotated[bool, Option("Overwrite.")] = False) -> None:
         got.append((source, force))
 
     done = invoke(read, *arguments)
@@ -95,12 +96,14 @@ def test_a_command_may_take_a_part_of_the_options():
     assert invoke(read, "--rate", "2").exit_code == 2
 
 
-def test_fields_of_several_classes_arrive_as_a_mapping():
+def test_options_of_all_formats_arrive_as_a_mapping(monkeypatch):
     @options("Input")
     class Other:
         topic: str = option(default="t", help="A topic.")
 
-    def read(values: Annotated[dict, Part(without=("names",), classes=lambda: [ReadOptions, Other])]) -> None:
+    monkeypatch.setattr(bridge, "option_classes", lambda: [ReadOptions, Other])
+
+    def read(values: Annotated[bridge.FormatValues, Part(without=("names",))]) -> None:
         assert values["topic"] == "x"
         assert values["rate_hz"] == 2
         assert "names" not in values
@@ -184,7 +187,7 @@ def test_help_shows_no_old_spelling():
 
 
 def test_an_option_that_was_an_argument_still_is_one():
-    def read(model: Annotated[str | None, typer.Option(help="A model."), OldArgument] = None) -> None:
+    def read(model: Annotated[str | None, Option("A model.", old=("",))] = None) -> None:
         typer.echo(model)
 
     assert invoke(read, "--model", "tiny").output == "tiny\n"

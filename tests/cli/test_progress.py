@@ -1,5 +1,6 @@
 """Progress on a pipe and on a terminal."""
 
+import contextlib
 import io
 import subprocess
 import sys
@@ -18,7 +19,7 @@ class Terminal(io.StringIO):
 
 def work(stream: io.StringIO, total: int) -> list[str]:
     """Runs a progress to its end with one message in the middle; returns what was written, line by line."""
-    with Progress(total, "frames", stream=stream) as progress:
+    with contextlib.redirect_stderr(stream), Progress(total, "frames") as progress:
         for done in range(total):
             if done == total // 2:
                 progress.message("note: [half] of it :car:")

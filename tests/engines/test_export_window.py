@@ -13,7 +13,7 @@ import torch
 from memory_drive import WithoutImages
 from typer.testing import CliRunner
 
-from bevcli.benchmark.exported import FrameDifference, check_exported, compare_exported
+from bevcli.benchmark.exported import FrameDifference, check_exported
 from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.engines.export_onnx import export_onnx
@@ -120,7 +120,7 @@ def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_file, tm
 def test_int8_is_close_to_float32(window_file, tmp_path):
     file, config = window_file(), load_model(window_file()).config
     quantize(file, calibration_images(config, 6, [DRIVE], 4), tmp_path / "int8.onnx")
-    differences = list(compare_exported(tmp_path / "int8.onnx", file, DRIVE, "onnxruntime"))
+    differences = list(check_exported(tmp_path / "int8.onnx", file, DRIVE, "onnxruntime"))
     assert 1e-5 < max(row.logits for row in differences) < 0.1
     assert load_model(tmp_path / "int8.onnx").precision == "int8"
 

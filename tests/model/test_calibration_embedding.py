@@ -61,7 +61,7 @@ def test_weights_without_the_embedding_start_a_training_only(tmp_path: Path):
     path = tmp_path / "weights.safetensors"
     safetensors.torch.save_file(small_model().state_dict(), path)
     model = BEVFormer(small_config(image_tokens=WITH_RAYS))
-    missing = compare(small_model().state_dict(), model.state_dict()).missing
+    missing = compare(small_model().state_dict(), model.state_dict())["missing"]
     assert len(missing) == 6
     with pytest.raises(WeightsError, match="6 missing"):
         load_weights(path, model)

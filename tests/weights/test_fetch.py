@@ -297,7 +297,7 @@ def test_names_of_weights_name_no_other_folder(server, model):
 
 
 def test_every_name_of_the_package_has_a_model() -> None:
-    for weights in all_weights():
+    for weights in all_weights().values():
         assert load_config(weights.model)
         assert weights.source.licence
         assert weights.source.url.startswith("https://") or weights.source.page
