@@ -7,7 +7,7 @@ import glob
 import os
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import MISSING, dataclass, replace
 from inspect import Parameter, Signature, signature
@@ -296,7 +296,8 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     if not own and not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
-    for kind in option_classes() if own else [hint]:
+    classes: Iterable[type[Any]] = option_classes() if own else [hint]
+    for kind in classes:
         kinds, known = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
             stated, name = option_of(field), field.name
