@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from accuracy import WrongTimes, errors_of_drive
 from command_line import MINI_TOML, command
 from memory_drive import MemorySequence
 from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, wrong_rig
@@ -21,7 +22,6 @@ from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
-from bevcli.robustness.calibration_accuracy import WrongTimes, errors_of_drive
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 
 STREET = Path(__file__).parents[2] / "samples/street"
