@@ -241,6 +241,16 @@ def test_changed_table_rebuilds_the_index(cached):
     assert index.scenes.names.tolist() == ["scene-0901", "scene-0902", "scene-0903"]
 
 
+@pytest.mark.parametrize("content", [None, b"", b"\x93NUMPY broken"])
+def test_a_damaged_cache_is_built_anew(cached, content):
+    index, _ = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    (file,) = (cached / "cache").rglob("samples.times_us.npy")
+    file.unlink() if content is None else file.write_bytes(content)
+    again, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    assert "is cached in" in note
+    np.testing.assert_array_equal(again.samples.times_us, index.samples.times_us)
+
+
 def test_nothing_is_written_into_the_dataset(cached):
     before = sorted(path.name for path in (cached / "v1.0-trainval").iterdir())
     nuscenes_cache.open_index(cached / "v1.0-trainval")

@@ -1,14 +1,15 @@
 """Cache for the index of a large nuScenes version: memory-mapped arrays that open almost at once.
 
 The cache is in $XDG_CACHE_HOME/bevcli/nuscenes (default ~/.cache/bevcli/nuscenes), never in the dataset, with one
-folder for each version's path. The index is rebuilt if the size or modification time of a table has changed.
-Small versions are not cached.
+folder for each version's path. The index is rebuilt if the size or modification time of a table has changed, or a file
+of the cache is missing or damaged. Small versions are not cached.
 """
 
 import hashlib
 import json
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -32,21 +33,15 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
     folder = user_cache() / "nuscenes" / f"{tables.name}-{name}"
     facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
     fingerprint = json.dumps({"format": FORMAT, "tables": facts})
-    if _is_fresh(folder, fingerprint):
-        return _load(folder), ""
+    with suppress(OSError, ValueError, EOFError):  # there is no cache, or it is damaged
+        if (folder / FINGERPRINT).read_text() == fingerprint:
+            return _load(folder), ""
     index = build_index(tables, dialect)
     try:
         _save(index, folder, fingerprint)
     except OSError as error:
         return index, f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow"
     return index, f"the index of the nuScenes tables is cached in {folder}"
-
-
-def _is_fresh(folder: Path, fingerprint: str) -> bool:
-    try:
-        return (folder / FINGERPRINT).read_text() == fingerprint
-    except OSError:
-        return False
 
 
 def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
