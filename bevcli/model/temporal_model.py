@@ -99,11 +99,6 @@ class TemporalModel(nn.Module):
         """The parts that compute in the precision of a run, first the one that the images enter."""
         return ()
 
-    @property
-    def convolutional_parts(self) -> tuple[nn.Module, ...]:
-        """The parts whose weights are laid out channels-last."""
-        return self.image_parts
-
     def exchange_parts(self) -> None:
         """Exchange, in place, parts whose result is the same in every frame; see `prepare_for_inference`."""
 
