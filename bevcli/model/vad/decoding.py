@@ -33,6 +33,16 @@ class VADOutputs(ModelOutputs):
     motion: MotionOutputs
     plan: Tensor
 
+    @property
+    def further(self) -> dict[str, Tensor]:
+        return {
+            "line_class_logits": self.lines.class_logits[-1],
+            "line_points": self.lines.points[-1],
+            "future_offsets": self.motion.offsets,
+            "mode_logits": self.motion.mode_logits,
+            "plan_offsets": self.plan,
+        }
+
     def last_layers(self) -> Self:
         """See `ModelOutputs`. Features, which only the network uses, are left out."""
         lines, none = self.lines, self.plan[:0]
