@@ -63,7 +63,7 @@ def test_no_other_room_names_a_model(folder):
 
 def test_no_other_room_asks_for_the_kind_of_a_model():
     """`Network` has the shared parts, which training, timing and figures need."""
-    kinds = {name for folder in FOLDERS for name in classes_of(folder)} | {"ExportedModel", "PreparedModel"}
+    kinds = {name for folder in FOLDERS for name in classes_of(folder)} | {"ExportedModel"}
     asked = []
     for path, tree in trees_outside().items():
         for node in ast.walk(tree):

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 
 from bevcli.engines.box_differences import CENTER, NEAR_M
-from bevcli.engines.exported import ExportedOutputs, load_exported
+from bevcli.engines.exported import load_exported
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import paired_steps
-from bevcli.model.export_form import ExportForm
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
@@ -67,10 +66,10 @@ def check_exported(
     preprocess = Preprocessor(exported.config)  # of the exported file, whose images have one size
     frames = (preprocess(sequence.load(place)) for place in range(len(sequence.stamps)))
     for prepared, ours, theirs in paired_steps(network, exported, frames):
-        yield compare_outputs(prepared.frame.stamp.index, ours, theirs, exported.form)
+        yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
 
 
-def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs, form: ExportForm) -> FrameDifference:
+def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:
     """The largest differences of the last layers and the BEV map of a frame."""
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
     distances = codes[..., CENTER].norm(dim=-1)
@@ -84,7 +83,7 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs, form: 
         near=(distances <= NEAR_M).float().mean().item(),
         code=codes[..., others].max().item(),
         masks=_largest(*probabilities) if len(probabilities) == 2 else 0.0,
-        further={name: _largest(*both) for name, both in _further(form, ours, theirs).items()},
+        further={name: _largest(tensor, theirs.further[name]) for name, tensor in ours.further.items()},
     )
 
 
@@ -99,13 +98,6 @@ def difference_lines(differences: list[FrameDifference]) -> list[str]:
     rows = [heads, *((*first, *row) for first, row in zip(firsts, written, strict=True))]
     widths = [max(9, len(head)) for head in heads]
     return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
-
-
-def _further(form: ExportForm, *steps: ModelOutputs) -> dict[str, tuple[Tensor, ...]]:
-    """Both versions of each output that only this model has."""
-    outputs = (form.model_outputs(one, one.found) if isinstance(one, ExportedOutputs) else one for one in steps)
-    named = [form.further_outputs(one) for one in outputs]
-    return {name: tuple(one[name] for one in named) for name in named[0]}
 
 
 def _probabilities(segmentation: SegmentationOutputs) -> Tensor:

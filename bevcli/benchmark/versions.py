@@ -37,14 +37,14 @@ class Version:
 
     def __init__(self, model: TemporalModel, device: torch.device) -> None:
         self.runner = Runner(model, device, StepOptions())
-        self.runner.clock = StageClock(model.observed, device, *fine_stages(model))
+        self.runner.clock = StageClock(model, device, *fine_stages(model))
         self.seconds: list[float] = []
         self.queries: QueryResults = (torch.empty(0), torch.empty(0))
         self.state: RunnerState[Any] | None = None
 
     def step(self, prepared: PreparedFrame) -> Prediction:
         """Runs and times one frame, from its network inputs to its boxes."""
-        with self.runner.model.observed.register_forward_hook(self._keep):
+        with self.runner.model.register_forward_hook(self._keep):
             wait_for(self.runner.device)
             began = time.perf_counter()
             self.state, prediction = self.runner.step(self.state, prepared)

@@ -1,8 +1,10 @@
 """Engines: ONNX Runtime and OpenVINO on the CPU, with one interface. Each runs an exported file."""
 
+import contextlib
 import importlib
+import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +26,19 @@ def require(*names: str, extra: str = "onnx") -> None:
     missing = [name for name in names if find_spec(name) is None]
     if missing:
         raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[{extra}]'")
+
+
+@contextlib.contextmanager
+def errors_only(*names: str) -> Iterator[None]:
+    """Inside, these loggers of other packages tell errors only; "" is the root of all loggers."""
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 def import_openvino() -> Any:

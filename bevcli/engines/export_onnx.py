@@ -3,10 +3,9 @@
 import contextlib
 import io
 import json
-import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import torch
 
 from bevcli._version import __version__
 from bevcli.config import as_table
-from bevcli.engines.engine import require
+from bevcli.engines.engine import errors_only, require
 from bevcli.engines.options import OnnxOptions
 from bevcli.errors import BevcliError
 from bevcli.model.export_form import ExportForm, Port, pad_value_bgr
@@ -72,7 +71,13 @@ def export_onnx(
     slots = min(chosen.cameras_per_cell, form.cameras)
     inputs, outputs = form.inputs, form.outputs(decode=chosen.decode)
     step = form.step(network, chosen.deformable_convolution, slots, decode=chosen.decode).eval()
-    with _quiet(), torch.no_grad():
+    # The exporter tells about other packages and its own internals.
+    with (
+        errors_only("torch.onnx", "onnxscript", "onnx_ir"),
+        warnings.catch_warnings(action="ignore"),
+        contextlib.redirect_stdout(io.StringIO()),
+        torch.no_grad(),
+    ):
         program = torch.onnx.export(
             step,
             tuple(torch.zeros(port.shape, dtype=port.dtype) for port in inputs),
@@ -156,17 +161,3 @@ def _part(node: object) -> str:
     scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
     parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
     return parts[-1] if parts else ""
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the exporter's notes about other packages and its own internals from the terminal."""
-    levels = {logger: logger.level for logger in map(logging.getLogger, ("torch.onnx", "onnxscript", "onnx_ir"))}
-    for logger in levels:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(action="ignore"), contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)

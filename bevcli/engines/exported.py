@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,17 +70,6 @@ def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
     return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
 
 
-@dataclass(frozen=True)
-class ExportedOutputs(ModelOutputs):
-    """The outputs of an exported file, those of a model with one decoder layer.
-
-    Attributes:
-        found: every output of the file by name.
-    """
-
-    found: Mapping[str, Tensor] = field(default_factory=dict)
-
-
 class ExportedModel(TemporalModel):
     """An exported file, run by an engine on the CPU. `load_exported` makes one.
 
@@ -117,7 +106,7 @@ class ExportedModel(TemporalModel):
 
     def step(
         self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
-    ) -> tuple[ExportedOutputs, Memory]:
+    ) -> tuple[ModelOutputs, Memory]:
         """See `TemporalModel`. Raises WeightsError unless the file was exported for the frame's number of cameras."""
         count = prepared.images.shape[1]
         if count != self.cameras:
@@ -125,22 +114,27 @@ class ExportedModel(TemporalModel):
                 f"{self.file}: takes {self.cameras} cameras, but the sequence has {count}: "
                 f"use `bevcli export-onnx --cameras {count}`"
             )
-        outputs: ExportedOutputs = self(self.form.feed(prepared, memory))
-        return outputs, self.form.memory(prepared, memory, outputs.found)
+        found = self.outputs_by_name(self.form.feed(prepared, memory))
+        return self(found), self.form.memory(prepared, memory, found)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        return self.kind.decode_boxes(self, self._outputs_of_model(outputs))
+        """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
+        return self.kind.decode_boxes(self, outputs)
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
-        return self.kind.decode_results(self, self._outputs_of_model(outputs))
+        return self.kind.decode_results(self, outputs)
 
-    def _outputs_of_model(self, outputs: ModelOutputs) -> ModelOutputs:
-        """The outputs as the class of the model decodes them, which needs only the configuration of this one."""
-        assert isinstance(outputs, ExportedOutputs)
-        return self.form.model_outputs(outputs, outputs.found)
+    def forward(self, found: Mapping[str, Tensor]) -> ModelOutputs:
+        """The outputs as the model's own, with one decoder layer. found: of `outputs_by_name`."""
+        segmentation = None
+        if "mask_logits" in found:
+            masks, classes = found["mask_logits"][None], found["mask_class_logits"][None]
+            segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
+        logits, codes = found["class_logits"][None], found["box_codes"][None]
+        return self.form.model_outputs(ModelOutputs(found["bev"], logits, codes, segmentation), found)
 
-    def forward(self, feed: Mapping[str, Tensor]) -> ExportedOutputs:
-        """The outputs of the file. feed: its inputs by name, see `ExportForm.feed`.
+    def outputs_by_name(self, feed: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Every output of the file by name. feed: its inputs by name, see `ExportForm.feed`.
 
         Raises WeightsError where the engine cannot run the file, where an output has another shape than the model's,
         and where more cameras see one cell than the file has slots for.
@@ -161,13 +155,7 @@ class ExportedModel(TemporalModel):
                 f"{self.file}: takes {slots} cameras that see the same BEV cell, but the sequence has {most}: "
                 f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
-        tensors = {name: torch.from_numpy(value) for name, value in found.items()}
-        segmentation = None
-        if "mask_logits" in found:
-            masks, classes = tensors["mask_logits"][None], tensors["mask_class_logits"][None]
-            segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
-        logits, codes = tensors["class_logits"][None], tensors["box_codes"][None]
-        return ExportedOutputs(tensors["bev"], logits, codes, segmentation, tensors)
+        return {name: torch.from_numpy(value) for name, value in found.items()}
 
 
 def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:

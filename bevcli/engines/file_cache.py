@@ -36,10 +36,6 @@ class FileFacts(msgspec.Struct, frozen=True):
     calibrated_with: str = ""
     differences: Mapping[str, BoxDifferences] = {}
 
-    def with_differences(self, engine: str, found: BoxDifferences) -> "FileFacts":
-        """The facts with the differences of one more engine."""
-        return FileFacts(self.sha256, self.calibrated_with, {**self.differences, engine: found})
-
 
 @dataclass(frozen=True)
 class EngineFile:

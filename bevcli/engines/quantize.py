@@ -5,14 +5,13 @@ ONNX Runtime's static quantisation after training: weights in 8 bits, one scale 
 stays in float32: it is a small part of the work, and rounding it would move boxes.
 """
 
-import logging
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bevcli.engines.engine import check_size, require
+from bevcli.engines.engine import check_size, errors_only, require
 from bevcli.engines.exported import read_metadata
 from bevcli.errors import WeightsError
 from bevcli.writing import check_output, whole_file
@@ -48,28 +47,23 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     if read_metadata(metadata, file).precision != "fp32":
         raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
     check_output(out, file)
-    logger = logging.getLogger()
-    before = logger.level
-    logger.setLevel(logging.ERROR)  # against advice about models that have not been simplified
-    try:
-        with whole_file(out, parents=True) as unfinished:
-            quantize_static(
-                proto,
-                str(unfinished),
-                _reader(proto, images),
-                quant_format=QuantFormat.QDQ,
-                op_types_to_quantize=list(QUANTIZED_OPERATORS),
-                nodes_to_quantize=quantized_nodes(proto.graph),
-                per_channel=True,
-                activation_type=QuantType.QUInt8,
-                weight_type=QuantType.QInt8,
-                extra_options={"WeightSymmetric": True, "ActivationSymmetric": False},
-            )
-            quantized = onnx.load(str(unfinished))
-            onnx.helper.set_model_props(quantized, metadata | {"precision": "int8"})
-            onnx.save(quantized, str(unfinished))
-    finally:
-        logger.setLevel(before)
+    # Without advice about models that have not been simplified.
+    with errors_only(""), whole_file(out, parents=True) as unfinished:
+        quantize_static(
+            proto,
+            str(unfinished),
+            _reader(proto, images),
+            quant_format=QuantFormat.QDQ,
+            op_types_to_quantize=list(QUANTIZED_OPERATORS),
+            nodes_to_quantize=quantized_nodes(proto.graph),
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            extra_options={"WeightSymmetric": True, "ActivationSymmetric": False},
+        )
+        quantized = onnx.load(str(unfinished))
+        onnx.helper.set_model_props(quantized, metadata | {"precision": "int8"})
+        onnx.save(quantized, str(unfinished))
 
 
 def quantized_nodes(graph: Any) -> list[str]:

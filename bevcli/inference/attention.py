@@ -58,7 +58,7 @@ class AttentionProbe:
         self.cells = cells
         self.spatial: SpatialSamples | None = None
         self.history_share: Tensor | None = None
-        observed = model.observed.get_submodule(f"encoder.layers.{layer}")
+        observed = model.get_submodule(f"encoder.layers.{layer}")
         assert isinstance(observed, EncoderLayer)
         self._layer = observed
         self._hooks = ExitStack()

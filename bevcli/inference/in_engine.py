@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
 import torch
 
 from bevcli._version import __version__
@@ -142,7 +143,8 @@ class _Making:
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
         is_new = self.engine not in facts.differences and precision == self.choice.precision
         if is_new and self.first_frames is not None:
-            facts = facts.with_differences(self.engine, self._compare(network, self.first_frames))
+            found = {**facts.differences, self.engine: self._compare(network, self.first_frames)}
+            facts = msgspec.structs.replace(facts, differences=found)
             file.state(facts)
         return network, facts
 

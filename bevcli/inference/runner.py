@@ -71,7 +71,7 @@ class Runner:
         self.config = model.config
         self.device = device
         self.options = StepOptions() if options is None else options
-        self.clock = StageClock(model.observed, device, model.stages)
+        self.clock = StageClock(model, device, model.stages)
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
@@ -111,7 +111,7 @@ class Runner:
                 outputs, memory = self.model.step(prepared, state.memory, later)
                 found, is_finite = read_back(outputs, prepared.images)
                 if not is_finite:
-                    where = origin(self.model.observed, lambda: self.model.step(prepared, state.memory, later))
+                    where = origin(self.model, lambda: self.model.step(prepared, state.memory, later))
                     return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
             boxes = self.model.decode_boxes(found)
             if self.config.has_tracks and not self.tracks:
@@ -229,7 +229,7 @@ def paired_steps(
     outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
     with contextlib.ExitStack() as hooks:
         for runner in runners:
-            hook = runner.model.observed.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
+            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
             hooks.enter_context(hook)
         for prepared in frames:
             if prepared.frame.images:

@@ -4,6 +4,7 @@ A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). As in the release
 from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_classes
 from bevcli.model.step import ModelOutputs
 
 FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
@@ -33,6 +35,11 @@ class BestBoxes(NamedTuple):
     label: Tensor
     scores: Tensor
     codes: Tensor
+
+    def decoded(self, classes: Sequence[str]) -> Boxes3D:
+        """The boxes of a batch of one, bev frame. classes: of the class logits."""
+        codes, scores = (column[0].double().cpu().numpy() for column in (self.codes, self.scores))
+        return boxes_of_codes(codes, np.asarray(classes)[self.label[0].cpu().numpy()], scores)
 
     def with_scores(self, scores: Tensor) -> "BestBoxes":
         """The same boxes with other scores (B, K), by falling score."""
@@ -57,8 +64,7 @@ def decode(outputs: ModelOutputs, config: ModelConfig) -> Boxes3D:
     gives one box for each of its classes that is among the best scores.
     """
     best = best_boxes(outputs.class_logits[-1].detach(), outputs.box_codes[-1].detach(), config)
-    codes, scores = (column[0].double().cpu().numpy() for column in (best.codes, best.scores))
-    return boxes_of_codes(codes, np.asarray(config.classes)[best.label[0].cpu().numpy()], scores)
+    return best.decoded(config.classes)
 
 
 def best_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> BestBoxes:
@@ -66,12 +72,10 @@ def best_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> 
 
     class_logits: (B, Q, classes). box_codes: (B, Q, 10).
     """
-    classes, decoder = len(config.classes), config.decoder
-    scores = class_logits.float().sigmoid().flatten(1)  # (B, Q · classes)
-    best, index = scores.topk(min(decoder.max_boxes, scores.shape[1]))
-    query = index // classes
+    decoder = config.decoder
+    scores, query, label = best_classes(class_logits.float(), decoder.max_boxes)
     codes = box_codes.gather(1, query[..., None].expand(-1, -1, box_codes.shape[-1]))
-    boxes = BestBoxes(query, index % classes, best, codes)
+    boxes = BestBoxes(query, label, scores, codes)
     if decoder.merge_duplicates:
         boxes = merged(boxes, decoder.merge_duplicates)
     if decoder.fade_duplicates:

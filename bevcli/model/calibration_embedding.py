@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
+from bevcli.model.deformable_attention import LevelShapes
 from bevcli.model.upload import upload
 
 RAY_FEATURES = 9
@@ -34,23 +34,15 @@ class CalibrationEmbedding(nn.Module):
         for parameter in self.layers[-1].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, image_features: FeatureMaps, image_from_bev: Tensor, image_size: tuple[int, int]) -> FeatureMaps:
-        """Scaled and shifted tokens, of the same shape and dtype.
-
-        Args:
-            image_features: tokens (B·N, S, C) of B·N images.
-            image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input, on the CPU or the device.
-            image_size: (height, width) of the network's input, pixels.
-        """
-        shapes = image_features.level_shapes
-        return modulated(image_features, *self.factor_and_shift(image_from_bev, shapes, image_size))
-
-    def factor_and_shift(
+    def forward(
         self, image_from_bev: Tensor, level_shapes: LevelShapes, image_size: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
-        """What tokens are multiplied by and what is added to them, (B·N, S, C) float32 each; depends on no image.
+        """The scale and the shift of image features, (B·N, S, C) float32 each; see `FeatureMaps.scaled`.
 
-        image_from_bev, image_size: as for `forward`. level_shapes: (rows, columns) of each feature map.
+        Args:
+            image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input, on the CPU or the device.
+            level_shapes: (rows, columns) of each feature map.
+            image_size: (height, width) of the network's input, pixels.
         """
         device = next(self.layers.parameters()).device
         # In float32: half precision is too coarse for rays.
@@ -58,12 +50,6 @@ class CalibrationEmbedding(nn.Module):
             rays = ray_features(image_from_bev.flatten(0, 1), level_shapes, image_size, self.height_m)
             scale, shift = self.layers(upload(rays, device)).chunk(2, dim=-1)
             return 1 + scale, shift
-
-
-def modulated(image_features: FeatureMaps, factor: Tensor, shift: Tensor) -> FeatureMaps:
-    """The tokens times the factor plus the shift, in their dtype. factor, shift: (B·N, S, C) float32."""
-    tokens = image_features.tokens
-    return FeatureMaps((tokens * factor + shift).to(tokens.dtype), image_features.level_shapes)
 
 
 def ray_features(

@@ -223,6 +223,19 @@ def class_branch(channels: int, classes: int) -> nn.Sequential:
     return nn.Sequential(*hidden[0], *hidden[1], last)
 
 
+def best_classes(class_logits: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Scores, queries and labels, (B, K) each, of the K best pairs of a query and a class, by falling score.
+
+    A query stands there once for each of its classes that is among the best. K is the smaller one of `count` and the
+    number of pairs.
+
+    class_logits: (B, Q, classes).
+    """
+    scores, classes = class_logits.sigmoid().flatten(1), class_logits.shape[-1]  # (B, Q · classes)
+    best, index = scores.topk(min(count, scores.shape[1]))
+    return best, index // classes, index % classes
+
+
 class RegressionBranch(nn.Sequential):
     """Linear layers with ReLU between them that predict numbers such as positions and sizes."""
 

@@ -25,6 +25,10 @@ class FeatureMaps:
     tokens: Tensor
     level_shapes: LevelShapes
 
+    def scaled(self, scale: Tensor, shift: Tensor) -> "FeatureMaps":
+        """The tokens times the scale plus the shift, in their dtype. scale, shift: (G, S, C) float32."""
+        return FeatureMaps((self.tokens * scale + shift).to(self.tokens.dtype), self.level_shapes)
+
 
 class DeformableAttention(nn.Module):
     """The learned parts that the three deformable attentions of BEVFormer share.

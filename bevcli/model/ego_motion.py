@@ -139,7 +139,10 @@ def _source_cells(
     half = torch.tensor([grid.columns / 2, grid.rows / 2], device=rotation_deg.device)
     angle = torch.deg2rad(rotation_deg.double())
     rotation = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).unflatten(-1, (2, 2))
-    pivot = torch.tensor(_center_cells(grid, center), device=half.device).double() - half
+    # x and y of the centre of rotation, in cells from the map's corner.
+    named = {"original": ORIGINAL_ROTATION_CENTER, "center": (grid.columns / 2, grid.rows / 2)}
+    pivot_cells = named[center] if isinstance(center, str) else center
+    pivot = torch.tensor(pivot_cells, device=half.device).double() - half
     translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
     scaled = rotation.float() / half[:, None]  # (B, 2, 2)
     affine = upload(torch.cat([scaled, translation[..., None]], dim=-1), device)  # (B, 2, 3)
@@ -151,12 +154,3 @@ def _source_cells(
     row = (((source_y + 1) * grid.rows - 1) / 2).round().long()
     column = (((source_x + 1) * grid.columns - 1) / 2).round().long()
     return row, column
-
-
-def _center_cells(grid: BevGrid, center: RotationCenter) -> tuple[float, float]:
-    """x and y of the centre of rotation, in cells from the map's corner."""
-    if center == "original":
-        return ORIGINAL_ROTATION_CENTER
-    if center == "center":
-        return grid.columns / 2, grid.rows / 2
-    return float(center[0]), float(center[1])

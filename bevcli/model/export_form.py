@@ -1,6 +1,6 @@
 """The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -50,7 +50,12 @@ class ExportForm:
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         """The outputs, in the order of the results of the step's `forward`. decode: with boxes."""
-        return (*_output_ports(self.config), *(box_ports(self.config) if decode else ()))
+        boxes = _box_ports(self.config) if decode else ()
+        return (*_output_ports(self.config), *self.further_outputs(), *boxes)
+
+    def further_outputs(self) -> Iterable[Port]:
+        """The outputs of `ModelOutputs.further`."""
+        return ()
 
     def facts(self) -> dict[str, Any]:
         """Further metadata of the file."""
@@ -63,10 +68,6 @@ class ExportForm:
     def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> ModelOutputs:
         """The outputs as the model's own decoders take them. found: all outputs of the file by name."""
         return outputs
-
-    def further_outputs(self, outputs: ModelOutputs) -> dict[str, Tensor]:
-        """The outputs that only this model has, by their names in the file. outputs: as of `model_outputs`."""
-        return {}
 
     def memory(self, prepared: PreparedFrame, memory: Any, found: Mapping[str, Tensor]) -> Any:
         """The memory after a frame. memory: before it. found: the file's outputs by name."""
@@ -145,7 +146,7 @@ def _output_ports(config: ModelConfig) -> Iterator[Port]:
         )
 
 
-def box_ports(config: ModelConfig) -> Iterator[Port]:
+def _box_ports(config: ModelConfig) -> Iterator[Port]:
     """The boxes that a file may have, decoded."""
     count = min(config.decoder.max_boxes, config.decoder.queries * len(config.classes))
     yield Port(

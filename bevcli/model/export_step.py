@@ -20,6 +20,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
 from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.step import ModelOutputs
 
 
 class ExportedStep(nn.Module):
@@ -70,16 +71,12 @@ class ExportedStep(nn.Module):
         )
 
     def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
-        """The outputs that all files have, in their order. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
-        network = self.network
-        class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
-        outputs = [bev, class_logits[-1], box_codes[-1], most_cameras]
-        if network.segmentation_head is not None:
-            segmentation = network.segmentation_head(bev, network.bev_queries.position())
-            outputs += [segmentation.mask_logits[-1], segmentation.class_logits[-1]]
-        if self.decode:
-            outputs += decode_boxes(class_logits[-1], box_codes[-1], self.config)
-        return tuple(outputs)
+        """The outputs in the order of `ExportForm.outputs`. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
+        found: ModelOutputs = self.network.detect(bev)
+        logits, codes, segmentation = found.class_logits[-1], found.box_codes[-1], found.segmentation
+        masks = () if segmentation is None else (segmentation.mask_logits[-1], segmentation.class_logits[-1])
+        boxes = decode_boxes(logits, codes, self.config) if self.decode else ()
+        return (bev, logits, codes, most_cameras, *masks, *found.further.values(), *boxes)
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:

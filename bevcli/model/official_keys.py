@@ -34,8 +34,8 @@ _RENAMES = (
     (r"^(encoder\..*)\.attentions\.0\.", r"\1.temporal_self_attention.attention."),
     (r"^(encoder\..*)\.attentions\.1\.deformable_attention\.", r"\1.spatial_cross_attention.attention."),
     (r"^(encoder\..*)\.attentions\.1\.output_proj\.", r"\1.spatial_cross_attention.attention.output_proj."),
-    (r"^(decoder\..*)\.attentions\.0\.attn\.", r"\1.self_attention."),
-    (r"^(decoder\..*)\.attentions\.1\.", r"\1.cross_attention."),
+    (r"\.attentions\.0\.attn\.", ".self_attention."),  # of all decoders
+    (r"\.attentions\.1\.", ".cross_attention."),
     (r"\.value_proj\.", ".value_projection."),
     (r"\.output_proj\.", ".output_projection."),
     (r"\.ffns\.0\.layers\.0\.0\.", ".feed_forward.expand."),

@@ -100,6 +100,11 @@ class ModelOutputs:
     box_codes: Tensor
     segmentation: SegmentationOutputs | None = None
 
+    @property
+    def further(self) -> dict[str, Tensor]:
+        """The last layers' outputs that only this model has, by their names in an exported file."""
+        return {}
+
     def last_layers(self) -> Self:
         """The outputs of the last layers, all that results are decoded from."""
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()

@@ -95,19 +95,9 @@ class TemporalModel(nn.Module):
         return next(self.parameters()).device
 
     @property
-    def observed(self) -> nn.Module:
-        """The module whose `forward` returns the outputs of a step and whose submodules have the paper's names."""
-        return self
-
-    @property
     def image_parts(self) -> tuple[nn.Module, ...]:
         """The parts that compute in the precision of a run, first the one that the images enter."""
         return ()
-
-    @property
-    def convolutional_parts(self) -> tuple[nn.Module, ...]:
-        """The parts whose weights are laid out channels-last."""
-        return self.image_parts
 
     def exchange_parts(self) -> None:
         """Exchange, in place, parts whose result is the same in every frame; see `prepare_for_inference`."""

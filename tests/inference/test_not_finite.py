@@ -38,7 +38,7 @@ def test_the_module_where_numbers_stop_being_finite_is_named(mini_model, module,
         first = output[0] if isinstance(output, tuple | list) else output
         first[0] = value
 
-    hook = model.observed.get_submodule(module).register_forward_hook(spoil)
+    hook = model.get_submodule(module).register_forward_hook(spoil)
     try:
         found = run(model, frames=1)[0]
     finally:

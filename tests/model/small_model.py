@@ -79,7 +79,7 @@ def small_inputs(seed: int = 0, batch: int = 1) -> ModelInputs:
 
 def step_of_file(exported: ExportedModel, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
     """One step of an exported BEVFormer."""
-    outputs: ModelOutputs = exported(recurrent_feed(inputs, history, exported.config))
+    outputs: ModelOutputs = exported(exported.outputs_by_name(recurrent_feed(inputs, history, exported.config)))
     return outputs
 
 

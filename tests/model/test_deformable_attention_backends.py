@@ -10,7 +10,6 @@ from bevcli.model.deformable_attention import GridSampling, level_sizes, samplin
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.upload import Tables
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
 PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()
@@ -106,7 +105,7 @@ def test_the_gpu_equals_the_cpu(dtype):
     gpu = torch.device("cuda")
     values, shapes, locations, weights, counts = case(32, dtype=dtype)
     on_gpu = (values.to(gpu), shapes, locations.to(gpu), weights.to(gpu), counts)
-    found = fastest_sampling(gpu, Tables())(*on_gpu).float().cpu()
+    found = fastest_sampling(gpu)(*on_gpu).float().cpu()
     expected = PLAIN(values, shapes, locations, weights, counts)
     torch.testing.assert_close(found, expected, rtol=2e-2 if dtype != torch.float32 else 1e-4, atol=1e-3)
 

@@ -24,7 +24,7 @@ from bevcli.checkpoints import expected_state
 from bevcli.config import load_config
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.official_keys import from_official
-from bevcli.model.prepare import PreparedModel, prepare_for_inference
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs
 from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.model.vad.motion_head import line_positions
@@ -41,7 +41,7 @@ def model() -> VAD:
 
 
 @cache
-def prepared_model() -> PreparedModel:
+def prepared_model() -> VAD:
     return prepare_for_inference(model(), torch.device("cpu"))
 
 

@@ -116,7 +116,7 @@ def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
         if len(calls) in (2, 3):  # the second frame, and the search in it
             output[0][0] = float("nan")
 
-    hook = model.prepared.observed.get_submodule("neck").register_forward_hook(spoil)
+    hook = model.prepared.get_submodule("neck").register_forward_hook(spoil)
     try:
         first = run_all(model, tmp_path / "out", should_stop=iter([False, False, True]).__next__)
     finally:

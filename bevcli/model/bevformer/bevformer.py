@@ -45,7 +45,8 @@ class BEVFormer(Network):
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
         image_features = self.image_features(inputs.images, inputs.camera_index)
         if self.calibration_embedding is not None:
-            image_features = self.calibration_embedding(image_features, inputs.image_from_bev, inputs.image_size)
+            rays = inputs.image_from_bev, image_features.level_shapes, inputs.image_size
+            image_features = image_features.scaled(*self.calibration_embedding(*rays))
         return self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),
@@ -106,7 +107,8 @@ class RecurrentStep(ExportedStep):
         network = self.network
         image_features = self.image_features(images, camera_index)
         if network.calibration_embedding is not None:
-            image_features = network.calibration_embedding(image_features, image_from_bev, self.image_size)
+            rays = image_from_bev, image_features.level_shapes, self.image_size
+            image_features = image_features.scaled(*network.calibration_embedding(*rays))
         bev_query = network.bev_queries(can_bus)
         position = network.bev_queries.position()
         history = network.align_history(previous_bev, rotation)

@@ -156,10 +156,6 @@ class BEVFormerV2(Network):
         images, camera_index = (upload(x, self.device) for x in (prepared.images, prepared.camera_index))
         return FrameFeatures.of(prepared, self.image_features(images, camera_index))
 
-    @property
-    def convolutional_parts(self) -> tuple[nn.Module, ...]:
-        return self.image_parts if self.fusion is None else (*self.image_parts, self.fusion)
-
     def exchange_parts(self) -> None:
         """See `TemporalModel`: no ego-motion enters the BEV queries, and they take the place of the history."""
         first, *others = self.encoder.layers

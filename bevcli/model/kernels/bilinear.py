@@ -1,4 +1,4 @@
-"""Compiled loops for bilinear sampling and weighted sums of samples; they store no sampled values.
+"""Compiled loops for bilinear sampling, weighted sums of samples, which they do not store, and max-pooling.
 
 The functions take arrays and no Python objects. Several threads may run one on disjoint ranges of queries or rows.
 The compiled code is cached on disk (in NUMBA_CACHE_DIR, next to this file, or in the user's cache folder).
@@ -292,3 +292,27 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
         start, target = image * height * width * channels, row * taps * channels
         for tap in range(taps):
             sum_samples(flat, start, channels, cells, shares, tap, tap + 1, sums, target + tap * channels, channels)
+
+
+@njit(nogil=True)
+def max_of_windows(values, out, begin, end):  # type: ignore[no-untyped-def]
+    """Writes rows begin to end - 1 of the maxima of 3 x 3 windows at every second place, or 0 where they are negative.
+
+    PyTorch's max-pooling takes six times as long in bfloat16.
+
+    values: (B, H, W, C) signed integers. out: (B, H', W', C), H' and W' half of H and W, rounded up; its rows are those
+    of all B images, one after another.
+    """
+    _, height, width, channels = values.shape
+    rows, columns = out.shape[1:3]
+    for row in range(begin, end):
+        image, y = row // rows, 2 * (row % rows)
+        for column in range(columns):
+            x, found = 2 * column, out[image, y // 2, column]
+            for c in range(channels):
+                found[c] = 0
+            for v in range(max(y - 1, 0), min(y + 2, height)):
+                for u in range(max(x - 1, 0), min(x + 2, width)):
+                    read = values[image, v, u]
+                    for c in range(channels):
+                        found[c] = max(found[c], read[c])

@@ -167,7 +167,7 @@ class CompiledPool(nn.Module):
 
     def pooled(self, x: Tensor) -> Tensor:
         """As `forward`, by the compiled loop."""
-        from bevcli.model.kernels.pooling import max_of_windows
+        from bevcli.model.kernels.bilinear import max_of_windows
 
         x = x.permute(0, 2, 3, 1).contiguous()  # (B, H, W, C)
         bits = torch.int32 if x.dtype == torch.float32 else torch.int16

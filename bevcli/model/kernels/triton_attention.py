@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import accumulate
 
 import torch
@@ -10,23 +11,20 @@ import triton
 import triton.language as tl
 from torch import Tensor, nn
 
-from bevcli.model.upload import Tables
+from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
+KEPT_TABLES = 32  # those of the sampling of all layers of a model, and of some frames' hits
 
 
 class TritonSampling(nn.Module):
     """Takes the place of `GridSampling` on a GPU, without gradients."""
 
-    def __init__(self, tables: Tables) -> None:
-        """tables: keeps the level shapes and the queries of each map on the GPU."""
-        super().__init__()
-        self.tables = tables
-
     def forward(
         self,
         values: Tensor,
-        level_shapes: Sequence[tuple[int, int]],
+        level_shapes: LevelShapes,
         locations: Tensor,
         weights: Tensor,
         queries_per_map: Sequence[int],
@@ -34,8 +32,8 @@ class TritonSampling(nn.Module):
         """Arguments and result as for `GridSampling`."""
         maps, cells, heads, depth = values.shape
         queries, _, levels, points, _ = locations.shape
-        ends = self.tables(list(accumulate(queries_per_map)), torch.int32, values.device)
-        shapes = self.tables(level_shapes, torch.int32, values.device)
+        ends = _table(tuple(accumulate(queries_per_map)), values.device)
+        shapes = _table(level_shapes, values.device)
         out = values.new_empty(queries, heads, depth, dtype=torch.float32)
         if queries:
             # Triton launches on the current GPU, which need not be that of the tensors.
@@ -53,6 +51,12 @@ class TritonSampling(nn.Module):
                     **constants(heads, depth, levels, points),
                 )
         return out.flatten(1)
+
+
+@lru_cache(KEPT_TABLES)
+def _table(rows: tuple[int, ...] | LevelShapes, device: torch.device) -> Tensor:
+    """The rows as int32 on a device. Equal tables, as all layers of a model need them, are uploaded once."""
+    return upload(torch.tensor(rows, dtype=torch.int32), device)
 
 
 def constants(heads: int, depth: int, levels: int, points: int) -> dict[str, int]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from bevcli.frame import MOST_MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.decoder import DecoderConfig
+from bevcli.model.decoder import DecoderConfig, best_classes
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.segmentation import LocationDecoder, split_heads
 from bevcli.model.uniad.map_encoder import FlatListAttention, MapEncoder
@@ -147,9 +147,7 @@ class MapHead(nn.Module):
         cells = self.encoder(bev)
         things, locations = self.location_decoder(cells)
         class_logits = self.class_branch(things)
-        scores, index = class_logits.sigmoid().flatten(1).topk(self.max_things)
-        classes = class_logits.shape[-1]
-        queries, labels = index // classes, index % classes
+        scores, queries, labels = best_classes(class_logits, self.max_things)
         selected = things.gather(1, queries[..., None].expand(-1, -1, things.shape[-1]))  # (B, K, C)
         content, position = self.stuff_queries.chunk(2, dim=-1)
         return MapOutputs(

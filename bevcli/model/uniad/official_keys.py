@@ -43,8 +43,6 @@ NAMES = (
     (r"^seg_head\.things_mask_head\.", "map_head.thing_masks."),
     (r"^seg_head\.stuff_mask_head\.", "map_head.stuff_masks."),
     (r"^(map_head\.encoder\..*)\.attentions\.0\.", r"\1.self_attention."),
-    (r"^(map_head\.location_decoder\..*)\.attentions\.0\.attn\.", r"\1.self_attention."),
-    (r"^(map_head\.location_decoder\..*)\.attentions\.1\.", r"\1.cross_attention."),
     (r"^(map_head\.\w+_masks)\.blocks\.", r"\1.layers."),
     (r"^(map_head\.\w+_masks)\.attnen\.linear_l1\.0\.", r"\1.masks.hidden."),
     (r"^(map_head\.\w+_masks)\.attnen\.linear\.0\.", r"\1.masks.output."),

@@ -10,7 +10,8 @@ from torch import Tensor
 from bevcli.frame import MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.model.box_coding import best_boxes, boxes_of_codes, decode
+from bevcli.model.box_coding import best_boxes, boxes_of_codes
+from bevcli.model.decoder import best_classes
 from bevcli.model.step import ModelOutputs, SceneAttention
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.line_decoder import LineOutputs
@@ -33,6 +34,16 @@ class VADOutputs(ModelOutputs):
     motion: MotionOutputs
     plan: Tensor
 
+    @property
+    def further(self) -> dict[str, Tensor]:
+        return {
+            "line_class_logits": self.lines.class_logits[-1],
+            "line_points": self.lines.points[-1],
+            "future_offsets": self.motion.offsets,
+            "mode_logits": self.motion.mode_logits,
+            "plan_offsets": self.plan,
+        }
+
     def last_layers(self) -> Self:
         """See `ModelOutputs`. Features, which only the network uses, are left out."""
         lines, none = self.lines, self.plan[:0]
@@ -42,8 +53,8 @@ class VADOutputs(ModelOutputs):
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
     """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    boxes = decode(outputs, config)
-    queries = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config).query[0]
+    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config)
+    boxes, queries = best.decoded(config.classes), best.query[0]
     offsets = _array(outputs.motion.offsets[0, queries])  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
     seconds = np.broadcast_to(np.array(config.future_times_s)[:, None], (*places.shape[:3], 1))
@@ -52,16 +63,11 @@ def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
 
 
 def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
-    """The line_decoder.max_lines lines with the best scores, by falling score, bev frame.
-
-    A query gives one line for each of its classes that is among the best scores.
-    """
+    """The line_decoder.max_lines lines with the best scores, by falling score, bev frame; see `best_classes`."""
     decoder = config.line_decoder
-    scores = outputs.lines.class_logits[-1, 0].sigmoid().flatten()  # (N · classes,)
-    best, index = scores.topk(min(decoder.max_lines, len(scores)))
-    points = line_places(outputs.lines.points[-1, 0, index // len(decoder.classes)], config)  # (K, P, 2)
-    classes = np.asarray(decoder.classes)[(index % len(decoder.classes)).cpu().numpy()]
-    return MapLines(tuple(points), classes, _array(best))
+    scores, queries, labels = (each[0] for each in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
+    points = line_places(outputs.lines.points[-1, 0, queries], config)  # (K, P, 2)
+    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
 
 
 def line_places(points: Tensor, config: VADConfig) -> Array:

@@ -26,7 +26,5 @@ NAMES = (
     (r"^pts_bbox_head\.ego_map_decoder\.layers\.0\.", "planner.line_attention."),
     (r"^pts_bbox_head\.ego_map_pos_mlp\.", "planner.line_position."),
     (r"^pts_bbox_head\.ego_fut_decoder\.", "planner.path_branch."),
-    (r"^(line_decoder\..*)\.attentions\.0\.attn\.", r"\1.self_attention."),
-    (r"^(line_decoder\..*)\.attentions\.1\.", r"\1.cross_attention."),
     (r"^((motion_head|planner)\..*)\.attentions\.0\.attn\.", r"\1.attention."),
 )

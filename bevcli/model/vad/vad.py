@@ -1,4 +1,7 @@
-"""VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
+"""VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path.
+
+Then its exported form.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -7,14 +10,14 @@ from torch import Tensor
 
 from bevcli.frame import FrameResult
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer.bevformer import BEVFormer, RecurrentForm
 from bevcli.model.config import ModelConfig
+from bevcli.model.export_form import Port
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import FrameTruth, ModelOutputs, SceneAttention
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan, scene_attentions
-from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
 from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, attention_weights, line_positions
@@ -96,7 +99,7 @@ class VAD(BEVFormer):
         return bev
 
     @classmethod
-    def export_form(cls, config: ModelConfig, cameras: int) -> VADForm:
+    def export_form(cls, config: ModelConfig, cameras: int) -> "VADForm":
         return VADForm(config, cameras)
 
     @classmethod
@@ -114,3 +117,42 @@ class VAD(BEVFormer):
         yield "planner: vehicle to objects", "planner.agent_attention", "planner.agent_position"
         yield "planner: vehicle to lines", "planner.line_attention", "planner.line_position"
         yield "planner: paths", "planner"
+
+
+class VADForm(RecurrentForm):
+    """The exported form: BEVFormer's, with lines, futures and planned paths as further outputs."""
+
+    config: VADConfig
+
+    def further_outputs(self) -> Iterator[Port]:
+        lines, motion, queries = self.config.line_decoder, self.config.motion, self.config.decoder.queries
+        commands = self.config.commands
+        yield Port(
+            "line_class_logits",
+            (1, lines.lines, len(lines.classes)),
+            f"(1, N, classes): of lines of the map: {', '.join(lines.classes)}.",
+        )
+        yield Port(
+            "line_points",
+            (1, lines.lines, lines.line_points, 2),
+            "(1, N, P, 2): points of the lines, x and y, 0 to 1 over x_range_m and y_range_m.",
+        )
+        yield Port(
+            "future_offsets",
+            (1, queries, motion.modes, motion.steps, 2),
+            f"(1, Q, M, T, 2): movement of each object in each step of {motion.step_s:g} s, x and y in metres, bev "
+            "frame. Sums over the steps, added to the centre, are places.",
+        )
+        yield Port("mode_logits", (1, queries, motion.modes), "(1, Q, M): of the futures.")
+        yield Port(
+            "plan_offsets",
+            (1, len(commands), motion.steps, 2),
+            f"(1, commands, T, 2): movement of the vehicle in each step, for the commands {', '.join(commands)}.",
+        )
+
+    def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> VADOutputs:
+        none = torch.zeros(0)  # features between the heads are not in the file
+        lines = LineOutputs(found["line_class_logits"][None], found["line_points"][None], none)
+        motion = MotionOutputs(found["future_offsets"], found["mode_logits"], none)
+        parts = outputs.bev, outputs.class_logits, outputs.box_codes
+        return VADOutputs(*parts, lines=lines, motion=motion, plan=found["plan_offsets"])
