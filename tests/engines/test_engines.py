@@ -196,7 +196,8 @@ def test_an_output_that_is_missing_or_misshapen_is_named(small_file, tmp_path):
             wrong.CopyFrom(logits)
             wrong.name = "box_codes"
             for node in proto.graph.node[:-1]:
-                node.output[:] = ["unused" if each == "box_codes" else each for each in node.output]
+                for names in (node.input, node.output):
+                    names[:] = ["unused" if each == "box_codes" else each for each in names]
             proto.graph.output.append(wrong)
         onnx.save(proto, tmp_path / "changed.onnx")
         with pytest.raises(WeightsError, match=message):
