@@ -14,7 +14,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
-from bevcli.synth.assets.triangles import TriangleSoup
+from bevcli.synth.assets.mesh import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground, true_lines
 from bevcli.synth.render.lens import lens_parts
 from bevcli.synth.render.rasteriser import ShadowMap

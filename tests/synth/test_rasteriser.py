@@ -8,8 +8,7 @@ import pytest
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
-from bevcli.synth.assets.mesh import Mesh
-from bevcli.synth.assets.triangles import TriangleSoup
+from bevcli.synth.assets.mesh import Mesh, TriangleSoup
 from bevcli.synth.render.rasteriser import rasterise
 from bevcli.synth.rig import nuscenes_like_rig
 

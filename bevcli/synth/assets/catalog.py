@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.synth.assets import people, roadworks, vehicles
-from bevcli.synth.assets.mesh import Mesh, joined
+from bevcli.synth.assets.mesh import Mesh, joined, made
 from bevcli.synth.assets.paint import BUS_PAINTS, CAR_PAINTS, CLOTHES, MACHINE_PAINTS, TRUCK_PAINTS, Color, linear
 from bevcli.synth.assets.people import CYCLES, RIDDEN
+from bevcli.synth.assets.roadworks import MACHINES
 from bevcli.synth.assets.street_furniture import StreetFurniture
 
 OWN_PAINTS: dict[str, tuple[Color, ...]] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
@@ -72,7 +73,7 @@ def draw_body(
 _CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Color, ...], tuple[Color, ...]]] = {
     "car": (vehicles.CAR_SHAPES, vehicles.car, CAR_PAINTS, CAR_PAINTS),
     "truck": (vehicles.TRUCK_NAMES, vehicles.truck, TRUCK_PAINTS, TRUCK_PAINTS),
-    "construction_vehicle": (roadworks.MACHINES, roadworks.machine, MACHINE_PAINTS, TRUCK_PAINTS),
+    "construction_vehicle": (MACHINES, lambda look: made(MACHINES[look]), MACHINE_PAINTS, TRUCK_PAINTS),
     "bus": (vehicles.BUSES, vehicles.bus, BUS_PAINTS, BUS_PAINTS),
     "trailer": (vehicles.TRAILER_NAMES, vehicles.trailer, TRUCK_PAINTS, TRUCK_PAINTS),
     "barrier": (roadworks.BARRIER_NAMES, roadworks.barrier, CAR_PAINTS, CLOTHES),

@@ -1,19 +1,22 @@
-"""Coloured low-polygon meshes, and the primitives that they are built from.
+"""Coloured low-polygon meshes: what they are made of, the primitives that build them, and meshes placed in the world.
 
 A mesh has its own frame: x forward, y left, z up, the origin in the middle of the bottom. Lengths are in metres.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import rigid
-from bevcli.synth.assets.paint import Color, Finish, Surface, linear
+from bevcli.synth.assets.paint import Color, Finish, Material, Surface, linear
 
 Point = tuple[float, float, float]  # x, y, z, metres
+NO_FACADES = np.zeros((0, 16), np.float32)
+Row = tuple[Any, ...]  # of a table of parts: the function that makes a part, and its arguments
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,95 @@ class Mesh:
         scale = np.asarray(size_lwh, dtype=np.float64) / (high - low)
         middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, faces=((self.faces - middle) * scale).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class TriangleSoup:
+    """T triangles of M meshes in the world frame, each mesh a range that the rasteriser can skip as a whole.
+
+    A soup of one mesh in its own frame is a template: its normals and its sphere are computed once, and it is placed
+    many times.
+
+    Attributes:
+        corners: (T, 3, 3) corner points, metres; counter-clockwise seen from outside.
+        normals: (T, 3) unit vectors that point outwards.
+        albedo: (T, 3) linear RGB.
+        material: (T,) values of `Material`.
+        facade: (T,) row of `facades`; -1 for a triangle that is not part of a facade.
+        facades: (K, 16) descriptions of walls, made in `world.scenery`.
+        mesh_ranges: (M, 2) first triangle of each mesh, and one past its last.
+        mesh_objects: (M,) index of the annotated object that the mesh belongs to; -1 for none.
+        mesh_spheres: (M, 4) bounding spheres: centre x, y, z and radius, metres.
+    """
+
+    corners: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    material: NDArray[np.uint8]
+    facade: NDArray[np.int32]
+    facades: NDArray[np.float32]
+    mesh_ranges: NDArray[np.int64]
+    mesh_objects: NDArray[np.int32]
+    mesh_spheres: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    @classmethod
+    def from_mesh(
+        cls, mesh: Mesh, facade: NDArray[np.int32] | None = None, facades: NDArray[np.float32] = NO_FACADES
+    ) -> Self:
+        """One mesh, in its own frame or with its faces in world coordinates already. facade: default: none."""
+        corners = mesh.faces
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        points = corners.reshape(-1, 3)
+        low, high = points.min(0), points.max(0)
+        sphere = np.array([[*((low + high) / 2), np.linalg.norm(high - low) / 2 + 1e-3]], np.float32)
+        facade = np.full(len(corners), -1, np.int32) if facade is None else facade
+        whole, no_object = np.array([[0, len(corners)]]), np.full(1, -1, np.int32)
+        return cls(corners, normals, mesh.albedo, mesh.material, facade, facades, whole, no_object, sphere)
+
+    @classmethod
+    def gather(cls, parts: Sequence[Self], objects: Sequence[int] | None = None) -> Self:
+        """All meshes of all parts, in their order.
+
+        objects: (M,) index of each mesh's object, -1 for none; default: those of the parts. Meshes of one object must
+        follow each other.
+        """
+        rows = np.cumsum([0, *(len(part.facades) for part in parts)], dtype=np.int32)
+        starts = np.cumsum([0, *(len(part) for part in parts)])
+        shifted = [
+            replace(
+                part, facade=np.where(part.facade >= 0, part.facade + row, -1), mesh_ranges=part.mesh_ranges + start
+            )
+            for part, row, start in zip(parts, rows, starts, strict=False)
+        ]
+        soup = cls(*(np.concatenate([getattr(part, field.name) for part in shifted]) for field in fields(cls)))
+        return soup if objects is None else replace(soup, mesh_objects=np.asarray(objects, np.int32))
+
+    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32]) -> Self:
+        """The meshes with these linear colours (3,) on their PAINT and DYE faces."""
+        albedo = self.albedo.copy()
+        albedo[self.material == Material.PAINT] = paint
+        albedo[self.material == Material.DYE] = dye
+        return replace(self, albedo=albedo)
+
+    def placed(self, position: tuple[float, float, float], yaw: float) -> Self:
+        """A soup of one mesh, turned by `yaw` (radians) and moved to a world position (metres)."""
+        cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
+        corners = (_turned(self.corners, cosine, sine) + position).astype(np.float32)
+        normals = _turned(self.normals, cosine, sine).astype(np.float32)
+        x, y, z = position
+        cx, cy, cz, radius = self.mesh_spheres[0]
+        sphere = np.array([[cosine * cx - sine * cy + x, sine * cx + cosine * cy + y, cz + z, radius]], np.float32)
+        return replace(self, corners=corners, normals=normals, mesh_spheres=sphere)
+
+
+def _turned(vectors: NDArray[np.float32], cosine: float, sine: float) -> NDArray[np.float64]:
+    """Vectors (..., 3) turned about z."""
+    x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1)
 
 
 def from_faces(faces: ArrayLike, surface: Surface) -> Mesh:
@@ -140,8 +232,24 @@ def side_profile(
     return loft(rings, surface)
 
 
+def twin_blocks(center: Point, size_lwh: Point, surface: Surface) -> Mesh:
+    """Two cuboids on both sides of the plane y = 0. center: the middle of one of them."""
+    x, y, z = center
+    return joined(block((x, side * y, z), size_lwh, surface) for side in (-1, 1))
+
+
 def wheel(x: float, y: float, radius: float, width: float, hub: Color = (122, 124, 128)) -> Mesh:
     """A tyre with a hub, standing on z = 0; its axle is parallel to y."""
     tyre = rod((x, y - width / 2, radius), (x, y + width / 2, radius), radius, (22, 22, 24), sections=12)
     rim = rod((x, y - width / 2 - 0.012, radius), (x, y + width / 2 + 0.012, radius), radius * 0.52, hub, sections=8)
     return joined([tyre, rim])
+
+
+def axles(positions: Iterable[float], y: float, radius: float, width: float, *hub: Color) -> Mesh:
+    """Two wheels at each position along x (metres), at -y and y."""
+    return joined(wheel(x, side * y, radius, width, *hub) for x in positions for side in (-1, 1))
+
+
+def made(rows: Iterable[Row]) -> list[Mesh]:
+    """The parts that rows of a table describe."""
+    return [make(*arguments) for make, *arguments in rows]

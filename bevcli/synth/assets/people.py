@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, loft, rod, side_profile
+from bevcli.synth.assets.mesh import Mesh, Row, ball, block, cone, crossbar, loft, made, rod, side_profile
 from bevcli.synth.assets.paint import HEADLAMP, PAINT, TAIL_LAMP, TRIM, Color, Finish, Material, Surface
 
 SKIN: tuple[Color, ...] = ((224, 176, 146), (196, 144, 112), (142, 96, 70), (98, 66, 50))
@@ -25,26 +25,27 @@ def person(name: str, stride: int) -> list[Mesh]:
     k = PERSON_NAMES.index(name)
     skin, hair, legs = SKIN[k % 4], HAIR[(k + 1) % 4], TROUSERS[k % 4]
     swing = 0.26 * stride
-    parts = [
+    x, z = 0.02, 1.62  # of the middle of the head, metres
+    things: dict[str, list[Row]] = {
+        "woman": [(cone, 0.55, 1.0, 0.27, 0.17, SHIRT), (ball, (-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair)],
+        "worker": [
+            (ball, (0.02, 0, 1.73), (0.15, 0.14, 0.09), (250, 210, 40)),
+            (block, (0, 0, 1.2), (0.31, 0.43, 0.06), (236, 240, 200)),
+        ],
+        "backpack": [(block, (-0.2, 0, 1.22), (0.18, 0.32, 0.46), (150, 52, 44))],
+        "coat": [(cone, 0.5, 1.3, 0.26, 0.2, SHIRT)],
+    }
+    return [
         *_leg(0.1, swing, legs),
         *_leg(-0.1, -swing, legs),
         _torso((240, 120, 30) if name == "worker" else SHIRT),
         *_arm(0.25, -swing * 0.9, skin),
         *_arm(-0.25, swing * 0.9, skin),
-        *_head(skin, hair),
+        rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin),
+        ball((x, 0, z), (0.105, 0.085, 0.125), skin),
+        ball((x - 0.025, 0, z + 0.035), (0.105, 0.095, 0.105), hair),
+        *made(things.get(name, [])),
     ]
-    if name == "woman":
-        parts += [cone(0.55, 1.0, 0.27, 0.17, SHIRT), ball((-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair)]
-    elif name == "worker":
-        parts += [
-            ball((0.02, 0, 1.73), (0.15, 0.14, 0.09), (250, 210, 40)),
-            block((0, 0, 1.2), (0.31, 0.43, 0.06), (236, 240, 200)),
-        ]
-    elif name == "backpack":
-        parts.append(block((-0.2, 0, 1.22), (0.18, 0.32, 0.46), (150, 52, 44)))
-    elif name == "coat":
-        parts.append(cone(0.5, 1.3, 0.26, 0.2, SHIRT))
-    return parts
 
 
 def _leg(y: float, swing: float, color: Color) -> list[Mesh]:
@@ -72,15 +73,6 @@ def _torso(surface: Surface) -> Mesh:
     ring = np.stack([0.13 * np.cos(angle), 0.2 * np.sin(angle)], -1)
     levels = ((low, 0.86), ((low + high) / 2, 0.9), (high - 0.08, 1.12), (high, 0.75))
     return loft([np.column_stack([ring * scale, np.full(8, z)]) for z, scale in levels], surface)
-
-
-def _head(skin: Color, hair: Color) -> list[Mesh]:
-    x, z = 0.02, 1.62  # of its middle, metres
-    return [
-        rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin),
-        ball((x, 0, z), (0.105, 0.085, 0.125), skin),
-        ball((x - 0.025, 0, z + 0.035), (0.105, 0.095, 0.105), hair),
-    ]
 
 
 def rider(seat: Place, bars: Place, pedal: Place, helmet: Color) -> list[Mesh]:

@@ -3,43 +3,41 @@
 A barrier's long side is its width, as in nuScenes annotations.
 """
 
-from typing import Any
+from itertools import product
 
-from bevcli.synth.assets.mesh import Mesh, block, cone, crossbar, rod, side_profile, wheel
+from bevcli.synth.assets.mesh import Mesh, Row, axles, block, cone, crossbar, joined, rod, side_profile, twin_blocks
 from bevcli.synth.assets.paint import CARGO, GLASS, PAINT, TRIM, Color
 
 WORN_STEEL = (96, 96, 98)
 BLACK_RUBBER = (30, 30, 32)
 
 
-def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) -> list[Mesh]:
+def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) -> Mesh:
     """A cabin with windows, a roof and four posts."""
     length, width, height = size
+    posts = [(x + sx * length, y + sy * width) for sx in (-0.5, 0.5) for sy in (-0.5, 0.5)]
     parts = [
         block((x, y, bottom + height * 0.15), (length, width, height * 0.3), PAINT),
         block((x, y, bottom + height * 0.62), (length * 0.94, width * 0.94, height * 0.66), GLASS),
         block((x, y, bottom + height), (length * 1.06, width * 1.06, 0.1), PAINT),
     ]
-    for at in ((x + sx * length, y + sy * width) for sx in (-0.5, 0.5) for sy in (-0.5, 0.5)):
-        parts.append(rod((*at, bottom), (*at, bottom + height), 0.05, TRIM, sections=4))
-    return parts
+    return joined([*parts, *(rod((*at, bottom), (*at, bottom + height), 0.05, TRIM, sections=4) for at in posts)])
 
 
-def _track(y: float, length: float, height: float, width: float) -> list[Mesh]:
+def _track(y: float, length: float, height: float, width: float) -> Mesh:
     """A crawler track with its rollers."""
     half, foot, shoulder = length / 2, length / 2 - height / 2, length / 2 - height * 0.35
     outline = [
         (-foot, 0), (foot, 0), (half, height * 0.5), (shoulder, height), (-shoulder, height), (-half, height * 0.5),
     ]  # fmt: skip
-    parts = [side_profile(outline, width / 2, BLACK_RUBBER, y=y)]
     start, end, z = y - width / 2 - 0.02, y + width / 2 + 0.02, height * 0.45
-    for x in (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7):
-        parts.append(rod((x, start, z), (x, end, z), height * 0.3, WORN_STEEL, sections=8))
-    return parts
+    places = (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7)
+    rollers = [rod((x, start, z), (x, end, z), height * 0.3, WORN_STEEL, sections=8) for x in places]
+    return joined([side_profile(outline, width / 2, BLACK_RUBBER, y=y), *rollers])
 
 
 MIXER_DRUM = [(-3.6, 1.6), (-2.0, 1.25), (0.6, 1.35), (1.2, 1.9), (0.9, 2.9), (-1.0, 3.2), (-3.4, 2.6)]
-MACHINES: dict[str, tuple[tuple[Any, ...], ...]] = {
+MACHINES: dict[str, tuple[Row, ...]] = {
     "excavator": (
         (_track, 1.05, 3.6, 0.85, 0.5),
         (_track, -1.05, 3.6, 0.85, 0.5),
@@ -57,15 +55,15 @@ MACHINES: dict[str, tuple[tuple[Any, ...], ...]] = {
         (block, (0.6, 0, 1.1), (2.4, 1.2, 0.6), PAINT),
         (block, (-2.7, 0, 1.3), (0.2, 2.0, 0.8), TRIM),
         (_cabin, -0.3, 0, 1.5, (1.3, 1.4, 1.7)),
-        *[(wheel, x, y, 0.75, 0.55, (220, 190, 60)) for x in (-1.7, 1.4) for y in (-1.0, 1.0)],
+        (axles, (-1.7, 1.4), 1.0, 0.75, 0.55, (220, 190, 60)),
         *[(rod, (0.6, y, 1.6), (2.7, y, 0.7), 0.11, PAINT) for y in (-0.6, 0.6)],
         (side_profile, [(2.6, 0.15), (3.6, 0.1), (3.5, 0.3), (2.9, 1.1), (2.6, 1.1)], 1.35, WORN_STEEL),
     ),
     "backhoe": (
         (block, (0.9, 0, 1.2), (2.0, 1.0, 0.7), PAINT),
         (_cabin, -0.6, 0, 0.9, (1.5, 1.6, 1.9)),
-        *[(wheel, -1.1, y, 0.72, 0.5, (220, 190, 60)) for y in (-0.9, 0.9)],
-        *[(wheel, 1.4, y, 0.48, 0.35, (220, 190, 60)) for y in (-0.85, 0.85)],
+        (axles, (-1.1,), 0.9, 0.72, 0.5, (220, 190, 60)),
+        (axles, (1.4,), 0.85, 0.48, 0.35, (220, 190, 60)),
         *[(rod, (0.9, y, 1.3), (2.5, y, 0.6), 0.09, PAINT) for y in (-0.6, 0.6)],
         (side_profile, [(2.4, 0.1), (3.2, 0.1), (3.1, 0.3), (2.6, 0.9), (2.4, 0.9)], 1.15, WORN_STEEL),
         (rod, (-1.6, 0, 1.0), (-2.7, 0, 3.1), 0.14, PAINT),
@@ -85,15 +83,15 @@ MACHINES: dict[str, tuple[tuple[Any, ...], ...]] = {
     ),
     "roller": (
         (crossbar, 1.7, 0.72, 1.0, 0.72, WORN_STEEL, 14),
-        *[(block, (1.5, y, 0.85), (1.9, 0.1, 0.25), PAINT) for y in (-1.06, 1.06)],
+        (twin_blocks, (1.5, 1.06, 0.85), (1.9, 0.1, 0.25), PAINT),
         (block, (-1.3, 0, 1.3), (2.0, 1.5, 0.8), PAINT),
         (_cabin, 0.1, 0, 1.0, (1.2, 1.4, 1.9)),
-        *[(wheel, -1.4, y, 0.7, 0.5) for y in (-0.85, 0.85)],
+        (axles, (-1.4,), 0.85, 0.7, 0.5),
     ),
     "crane": (
         (block, (0, 0, 0.95), (8.2, 2.4, 0.6), PAINT),
         (_cabin, 3.2, 0.4, 1.2, (1.5, 1.4, 1.3)),
-        *[(wheel, x, y, 0.6, 0.4) for x in (-3.0, -1.6, 1.4, 2.8) for y in (-1.05, 1.05)],
+        (axles, (-3.0, -1.6, 1.4, 2.8), 1.05, 0.6, 0.4),
         (block, (-1.2, 0, 1.8), (3.0, 2.0, 1.0), PAINT),
         (_cabin, -0.4, -0.6, 1.6, (1.3, 0.9, 1.5)),
         (rod, (-2.2, 0.2, 2.4), (4.6, 0.2, 3.5), 0.34, PAINT, 4),
@@ -105,18 +103,11 @@ MACHINES: dict[str, tuple[tuple[Any, ...], ...]] = {
         (block, (-0.6, 0, 0.95), (7.6, 1.0, 0.3), TRIM),
         (_cabin, 3.1, 0, 0.9, (1.7, 2.3, 1.9)),
         (block, (3.1, 0, 0.8), (2.0, 2.4, 0.7), PAINT),
-        *[(wheel, x, y, 0.5, 0.35) for x in (-2.6, -1.3, 2.8) for y in (-1.05, 1.05)],
+        (axles, (-2.6, -1.3, 2.8), 1.05, 0.5, 0.35),
         (rod, (-3.6, 0, 2.9), (-4.3, 0, 1.6), 0.2, PAINT),
         *[(rod, (-3.2, y, 1.0), (-3.4, y * 0.3, 2.8), 0.07, PAINT) for y in (-0.8, 0.8)],
     ),
-}  # of each construction vehicle, the functions that make its parts, and their arguments
-
-
-def machine(name: str) -> list[Mesh]:
-    """The parts of a construction vehicle. name: a key of MACHINES."""
-    made = [make(*arguments) for make, *arguments in MACHINES[name]]
-    return [part for parts in made for part in (parts if isinstance(parts, list) else [parts])]
-
+}  # of each construction vehicle
 
 ORANGE: Color = (240, 92, 26)
 WHITE: Color = (240, 240, 236)
@@ -146,16 +137,15 @@ def barrier(name: str) -> list[Mesh]:
     walls = {"concrete": ((172, 168, 160),), "plastic": (RED, WHITE) * 2, "white_plastic": (WHITE, RED) * 2}
     if name in walls:
         return _jersey(walls[name])
-    parts = [block((0, y, 0.05), (0.5, 0.14, 0.1), (46, 46, 48)) for y in (-0.95, 0.95)]
+    feet = twin_blocks((0, 0.95, 0.05), (0.5, 0.14, 0.1), (46, 46, 48))
     if name == "plank":
-        parts += [block((0, y, 0.5), (0.06, 0.06, 1.0), (150, 152, 150)) for y in (-0.95, 0.95)]
-        for z in (0.85, 0.45):
-            for k in range(10):
-                parts.append(block((0.04, -1.25 + 0.25 * (k + 0.5), z), (0.04, 0.25, 0.2), RED if k % 2 else WHITE))
+        parts = [feet, twin_blocks((0, 0.95, 0.5), (0.06, 0.06, 1.0), (150, 152, 150))]
+        for z, k in product((0.85, 0.45), range(10)):
+            parts.append(block((0.04, -1.25 + 0.25 * (k + 0.5), z), (0.04, 0.25, 0.2), RED if k % 2 else WHITE))
         return parts
-    parts += [block((0, 0, z), (0.05, 2.5, 0.06), (206, 208, 204)) for z in (0.2, 1.02)]
+    parts = [block((0, 0, z), (0.05, 2.5, 0.06), (206, 208, 204)) for z in (0.2, 1.02)]
     parts += [block((0, -1.2 + 0.2 * k, 0.6), (0.03, 0.03, 0.84), (206, 208, 204)) for k in range(13)]
-    return [*parts, block((0.03, 0, 0.72), (0.03, 0.9, 0.3), ORANGE)]
+    return [feet, *parts, block((0.03, 0, 0.72), (0.03, 0.9, 0.3), ORANGE)]
 
 
 def _jersey(colors: tuple[Color, ...]) -> list[Mesh]:

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, joined, rod
+from bevcli.synth.assets.mesh import Mesh, Row, TriangleSoup, ball, block, cone, crossbar, joined, made, rod
 from bevcli.synth.assets.paint import Color, Finish, Material
-from bevcli.synth.assets.triangles import TriangleSoup
 
 BARK: Color = (92, 74, 58)
 GALVANISED_STEEL: Color = (112, 116, 120)
@@ -22,6 +21,37 @@ SIGNS: tuple[tuple[int, Color, Color], ...] = (  # corners, colour of the rim an
 TREE_KINDS = 12  # number of tree meshes
 
 
+_GLOW = Finish((255, 236, 190), Material.GLOW)
+_WOOD, _HYDRANT_RED = (134, 96, 62), (186, 44, 36)
+OBJECTS: dict[str, tuple[Row, ...]] = {
+    "lamp": (
+        (cone, 0, 7.6, 0.1, 0.06, GALVANISED_STEEL, 6),
+        (rod, (0, 0, 7.5), (1.8, 0, 7.9), 0.045, GALVANISED_STEEL, 5),
+        (block, (2.1, 0, 7.9), (0.8, 0.26, 0.12), DARK),
+        (block, (2.1, 0, 7.82), (0.6, 0.2, 0.05), _GLOW),
+        (block, (0, 0, 0.3), (0.3, 0.3, 0.6), GALVANISED_STEEL),
+    ),
+    "bench": (
+        (block, (0, 0, 0.45), (0.45, 1.7, 0.06), _WOOD),
+        (block, (-0.24, 0, 0.75), (0.06, 1.7, 0.36), _WOOD),
+        *[(block, (0, y, 0.22), (0.4, 0.06, 0.44), DARK) for y in (0.7, -0.7)],
+    ),
+    "litter bin": ((cone, 0, 0.9, 0.26, 0.3, (52, 84, 66)), (cone, 0.9, 1.0, 0.31, 0.2, DARK)),
+    "hydrant": (
+        (cone, 0, 0.6, 0.13, 0.12, _HYDRANT_RED),
+        (ball, (0, 0, 0.62), (0.14, 0.14, 0.14), _HYDRANT_RED),
+        (crossbar, 0, 0.45, 0.22, 0.06, _HYDRANT_RED),
+    ),
+    "bus shelter": (
+        (block, (0, 0, 2.45), (1.5, 4.0, 0.1), DARK),
+        (block, (-0.65, 0, 1.3), (0.04, 3.8, 1.9), Finish((60, 74, 80), Material.GLASS)),
+        *[(rod, (x, y, 0), (x, y, 2.4), 0.05, DARK, 5) for x in (-0.65, 0.6) for y in (-1.9, 1.9)],
+        (block, (-0.35, 0, 0.45), (0.35, 2.6, 0.06), _WOOD),
+        (block, (0, 1.95, 1.3), (1.2, 0.08, 1.7), (210, 120, 70)),
+    ),
+}  # the lamp's arm reaches along x; a bench and the shelter with its glass back wall are open towards +x
+
+
 class StreetFurniture:
     """The templates of all repeated objects. They do not depend on the drive."""
 
@@ -29,11 +59,9 @@ class StreetFurniture:
         rng = np.random.Generator(np.random.PCG64(20))
         self.trees = [TriangleSoup.from_mesh(tree(k, rng)) for k in range(TREE_KINDS)]
         self.bushes = [TriangleSoup.from_mesh(bush(rng)) for _ in range(4)]
-        self.lamp = _template(lamp_post())
         self.signs = [_template(sign_post(k)) for k in range(6)]
-        self.small = [_template(parts) for parts in (bench(), litter_bin(), hydrant())]
-        self.shelter = _template(bus_shelter())
         self.signals = {light: _template(signal_head(light)) for light in ("red", "yellow", "green")}
+        self.lamp, *self.small, self.shelter = (_template(made(rows)) for rows in OBJECTS.values())
 
 
 def _template(parts: list[Mesh]) -> TriangleSoup:
@@ -84,17 +112,6 @@ def bush(rng: np.random.Generator) -> Mesh:
     return _crumpled(joined(parts), rng)
 
 
-def lamp_post() -> list[Mesh]:
-    """A street lamp whose arm reaches along x."""
-    return [
-        cone(0, 7.6, 0.1, 0.06, GALVANISED_STEEL, sections=6),
-        rod((0, 0, 7.5), (1.8, 0, 7.9), 0.045, GALVANISED_STEEL, sections=5),
-        block((2.1, 0, 7.9), (0.8, 0.26, 0.12), DARK),
-        block((2.1, 0, 7.82), (0.6, 0.2, 0.05), Finish((255, 236, 190), Material.GLOW)),
-        block((0, 0, 0.3), (0.3, 0.3, 0.6), GALVANISED_STEEL),
-    ]
-
-
 def sign_post(kind: int) -> list[Mesh]:
     """A traffic sign that faces along x. kind: 0 stop, 1 speed limit, 2 yield, 3 direction, 4 warning, 5 parking."""
     pole = rod((0, 0, 0), (0, 0, 2.6), 0.035, GALVANISED_STEEL, sections=5)
@@ -120,39 +137,3 @@ def signal_head(lit: str) -> list[Mesh]:
             surface = Finish(on, Material.GLOW) if name == lit else off
             parts.append(rod((0.2, y, z + 0.33 - 0.33 * k), (0.25, y, z + 0.33 - 0.33 * k), 0.12, surface, 8))
     return parts
-
-
-def bench() -> list[Mesh]:
-    """A bench that faces along x."""
-    wood = (134, 96, 62)
-    return [
-        block((0, 0, 0.45), (0.45, 1.7, 0.06), wood),
-        block((-0.24, 0, 0.75), (0.06, 1.7, 0.36), wood),
-        *[block((0, y, 0.22), (0.4, 0.06, 0.44), DARK) for y in (0.7, -0.7)],
-    ]
-
-
-def litter_bin() -> list[Mesh]:
-    """A litter bin."""
-    return [cone(0, 0.9, 0.26, 0.3, (52, 84, 66)), cone(0.9, 1.0, 0.31, 0.2, DARK)]
-
-
-def hydrant() -> list[Mesh]:
-    """A fire hydrant."""
-    red = (186, 44, 36)
-    return [
-        cone(0, 0.6, 0.13, 0.12, red),
-        ball((0, 0, 0.62), (0.14, 0.14, 0.14), red),
-        crossbar(0, 0.45, 0.22, 0.06, red),
-    ]
-
-
-def bus_shelter() -> list[Mesh]:
-    """A bus shelter with a glass back wall, open towards +x."""
-    return [
-        block((0, 0, 2.45), (1.5, 4.0, 0.1), DARK),
-        block((-0.65, 0, 1.3), (0.04, 3.8, 1.9), Finish((60, 74, 80), Material.GLASS)),
-        *[rod((x, y, 0), (x, y, 2.4), 0.05, DARK, sections=5) for x in (-0.65, 0.6) for y in (-1.9, 1.9)],
-        block((-0.35, 0, 0.45), (0.35, 2.6, 0.06), (134, 96, 62)),
-        block((0, 1.95, 1.3), (1.2, 0.08, 1.7), (210, 120, 70)),
-    ]

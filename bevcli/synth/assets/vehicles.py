@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bevcli.synth.assets.mesh import Mesh, block, rod, side_profile, wheel
+from bevcli.synth.assets.mesh import Mesh, Row, axles, block, made, rod, side_profile, twin_blocks, wheel
 from bevcli.synth.assets.paint import CARGO, DYED_PAINT, GLASS, HEADLAMP, PAINT, TAIL_LAMP, TRIM, Finish, Material
 
 
@@ -78,7 +78,7 @@ def car(name: str) -> list[Mesh]:
 
 
 def _details(s: CarShape, half: float) -> list[Mesh]:
-    """Wheels and their arches, lamps, bumpers, number plates and mirrors."""
+    """Bumpers, number plates, lamps, mirrors, sills, and wheels with their arches."""
     lamp_z, tail_z, lamp = s.nose - 0.1, s.tail - 0.12, Finish((255, 250, 230), Material.GLOW)
     parts = [
         block((s.at(0.995), 0, s.clearance + 0.2), (0.06, half * 1.5, 0.16), TRIM),
@@ -86,14 +86,12 @@ def _details(s: CarShape, half: float) -> list[Mesh]:
         block((s.at(0.005), 0, s.clearance + 0.2), (0.06, half * 1.6, 0.16), TRIM),
         block((s.at(0.0), 0, s.clearance + 0.42), (0.04, 0.5, 0.12), (225, 225, 220)),
         block((s.at(1.0), 0, s.clearance + 0.26), (0.04, 0.5, 0.11), (225, 225, 220)),
+        twin_blocks((s.at(0.98), half * 0.74, lamp_z), (0.16, half * 0.34, 0.13), lamp),
+        twin_blocks((s.at(0.012), half * 0.76, tail_z), (0.1, half * 0.3, 0.16), TAIL_LAMP),
+        twin_blocks((s.at(s.cabin[3] - 0.04), half * 0.95, s.belt + 0.07), (0.14, half * 0.1, 0.12), TRIM),
+        twin_blocks((s.at(0.5), half * 0.955, s.clearance + 0.05), (s.length * 0.5, 0.06, 0.1), TRIM),
     ]
     for side in (-1, 1):
-        parts += [
-            block((s.at(0.98), side * half * 0.74, lamp_z), (0.16, half * 0.34, 0.13), lamp),
-            block((s.at(0.012), side * half * 0.76, tail_z), (0.1, half * 0.3, 0.16), TAIL_LAMP),
-            block((s.at(s.cabin[3] - 0.04), side * half * 0.95, s.belt + 0.07), (0.14, half * 0.1, 0.12), TRIM),
-            block((s.at(0.5), side * half * 0.955, s.clearance + 0.05), (s.length * 0.5, 0.06, 0.1), TRIM),
-        ]
         for x in (s.at(0.185), s.at(0.81)):
             z, y = s.wheel_radius + 0.02, side * half
             parts.append(rod((x, y * 0.8, z), (x, y * 0.972, z), s.wheel_radius + 0.05, (12, 12, 13), sections=12))
@@ -105,102 +103,89 @@ TRUCK_NAMES = ("pickup", "delivery", "box", "flatbed", "tanker", "dumper", "garb
 _TRUCK_SIZES = {
     "box": (7.6, 3.3), "flatbed": (8.0, 2.7), "tanker": (8.4, 3.1), "dumper": (7.4, 3.1), "garbage": (8.2, 3.3),
     "tractor": (6.2, 3.2),
-}  # length and height, metres  # fmt: skip
+}  # length and height, metres, of trucks with a cab before their load  # fmt: skip
+PICKUP_BODY = [(-2.8, 0.55), (-2.7, 0.35), (2.7, 0.35), (2.8, 0.6), (2.75, 1.05), (1.2, 1.15), (-2.8, 1.1)]
+DELIVERY_BODY = [(-3.1, 0.4), (3.0, 0.4), (3.1, 0.7), (3.0, 1.15), (2.3, 1.35), (1.75, 2.4), (1.3, 2.75), (-3.1, 2.75)]
+_SMALL_TRUCKS: dict[str, tuple[Row, ...]] = {
+    "pickup": (
+        (side_profile, PICKUP_BODY, 0.98, PAINT),
+        (side_profile, [(-0.65, 1.12), (1.35, 1.12), (0.75, 1.83), (-0.5, 1.83)], 0.9, GLASS, 0.0, 0.76),
+        (block, (0.12, 0, 1.83), (1.35, 1.56, 0.07), PAINT),
+        (block, (-1.75, 0, 1.1), (1.9, 1.6, 0.06), (20, 20, 22)),
+        (twin_blocks, (-1.8, 0.9, 1.2), (2.0, 0.14, 0.18), PAINT),
+        (block, (-2.72, 0, 1.2), (0.12, 1.9, 0.18), PAINT),
+        (block, (2.78, 0, 0.82), (0.08, 1.0, 0.25), TRIM),
+        (block, (2.76, 0, 0.5), (0.1, 1.9, 0.2), TRIM),
+        (block, (-2.78, 0, 0.5), (0.1, 1.9, 0.18), TRIM),
+        (twin_blocks, (2.74, 0.78, 0.88), (0.12, 0.3, 0.18), HEADLAMP),
+        (twin_blocks, (-2.78, 0.86, 0.95), (0.06, 0.18, 0.3), TAIL_LAMP),
+        *[(rod, (-0.6, side * 0.89, 1.12), (-0.48, side * 0.77, 1.82), 0.05, PAINT, 4) for side in (-1, 1)],
+        *[(rod, (0.3, side * 0.89, 1.12), (0.2, side * 0.77, 1.82), 0.05, PAINT, 4) for side in (-1, 1)],
+        *[(rod, (1.3, side * 0.89, 1.12), (0.74, side * 0.77, 1.82), 0.05, PAINT, 4) for side in (-1, 1)],
+        (axles, (-1.75, 1.85), 0.84, 0.4, 0.3),
+    ),
+    "delivery": (
+        (side_profile, DELIVERY_BODY, 1.0, PAINT, 0.0, 0.95),
+        (side_profile, [(1.72, 1.45), (2.36, 1.4), (1.83, 2.4), (1.4, 2.5)], 0.93, GLASS, 0.0, 0.9),
+        (block, (1.45, 0, 1.85), (0.8, 1.985, 0.7), GLASS),
+        (block, (-0.9, 0, 1.7), (3.2, 2.0, 0.35), CARGO),
+        (block, (3.06, 0, 0.6), (0.1, 1.9, 0.25), TRIM),
+        (block, (-3.08, 0, 0.5), (0.1, 1.9, 0.2), TRIM),
+        (block, (-3.1, 0, 1.7), (0.04, 0.04, 1.9), TRIM),
+        (twin_blocks, (3.02, 0.75, 0.92), (0.14, 0.34, 0.2), HEADLAMP),
+        (twin_blocks, (-3.1, 0.9, 1.3), (0.06, 0.14, 0.5), TAIL_LAMP),
+        (axles, (-1.9, 2.05), 0.84, 0.37, 0.3),
+    ),
+}  # the other trucks, whole
 
 
 def truck(name: str) -> list[Mesh]:
     """The parts of a truck. name: one of TRUCK_NAMES."""
-    if name not in _TRUCK_SIZES:
-        return _pickup() if name == "pickup" else _delivery()
+    if name in _SMALL_TRUCKS:
+        return made(_SMALL_TRUCKS[name])
     length, height = _TRUCK_SIZES[name]
     half, rear = 1.2, -length / 2
     bed = length - 2.3
     return [
         *_cab(length / 2, half, min(height, 3.0)),
         block((rear + bed / 2, 0, 0.85), (bed, 1.0, 0.3), TRIM),
-        *_axles((rear + 1.1, rear + 2.4, length / 2 - 1.2), half, 0.5),
-        *_load(name, rear, bed, half, height),
-        *[block((rear + 0.03, side * half * 0.8, 0.9), (0.08, 0.3, 0.16), TAIL_LAMP) for side in (-1, 1)],
+        axles((rear + 1.1, rear + 2.4, length / 2 - 1.2), half - 0.16, 0.5, 0.3),
+        *made(_loads(rear, bed, half, height)[name]),
+        twin_blocks((rear + 0.03, half * 0.8, 0.9), (0.08, 0.3, 0.16), TAIL_LAMP),
     ]
 
 
-def _load(name: str, rear: float, bed: float, half: float, height: float) -> list[Mesh]:
-    """The body behind a truck's cab. rear: x of its end; bed: its length; half: half its width; metres."""
+def _loads(rear: float, bed: float, half: float, height: float) -> dict[str, list[Row]]:
+    """The body behind the cab of each truck. rear: x of its end; bed: its length; half: half its width; metres."""
     middle, front = rear + bed / 2, rear + bed
-    if name == "box":
-        return [
-            block((middle, 0, height / 2 + 0.5), (bed, 2 * half, height - 1.0), CARGO),
-            block((middle, 0, 1.3), (bed + 0.02, 2 * half + 0.02, 0.5), PAINT),
-        ]
-    if name == "flatbed":
-        return [
-            block((middle, 0, 1.1), (bed, 2 * half, 0.18), (112, 92, 70)),
-            block((middle + 0.6, 0.1, 1.7), (2.2, 1.8, 1.0), (150, 116, 80)),
-            block((middle - 1.6, -0.2, 1.5), (1.5, 1.6, 0.7), (120, 124, 126)),
-            block((front - 0.06, 0, 1.7), (0.1, 2 * half, 1.1), TRIM),
-        ]
-    if name == "tanker":
-        return [
-            rod((rear + 0.1, 0, 2.05), (front - 0.15, 0, 2.05), 1.05, CARGO, 12),
-            block((middle, 0, 3.08), (bed * 0.5, 0.5, 0.06), TRIM),
-        ]
-    if name == "dumper":
-        outline = [(rear + 0.15, 1.1), (front - 0.3, 1.1), (front - 0.1, height - 0.2), (rear, height - 0.5)]
-        ribs = [(x, side * half, 1.9) for x in (rear + 1, middle, front - 1) for side in (-1, 1)]
-        return [side_profile(outline, half, DYED_PAINT), *[block(at, (0.1, 0.06, 1.4), TRIM) for at in ribs]]
-    if name == "garbage":
-        hold = [(rear + 0.9, 1.0), (front - 0.1, 1.0), (front - 0.1, height), (rear + 0.9, height)]
-        hatch = [(rear, 0.7), (rear + 0.95, 0.7), (rear + 0.95, height - 0.1), (rear + 0.35, height - 0.3)]
-        return [side_profile(hold, half, DYED_PAINT), side_profile(hatch, half * 0.96, (90, 96, 92))]
-    return [
-        block((rear + 1.6, 0, 1.15), (1.2, 0.9, 0.14), (70, 70, 72)),
-        rod((front - 0.2, 0.8, 1), (front - 0.2, 0.8, height), 0.08, (180, 182, 184)),
-    ]
-
-
-def _pickup() -> list[Mesh]:
-    body = [(-2.8, 0.55), (-2.7, 0.35), (2.7, 0.35), (2.8, 0.6), (2.75, 1.05), (1.2, 1.15), (-2.8, 1.1)]
-    glass = [(-0.65, 1.12), (1.35, 1.12), (0.75, 1.83), (-0.5, 1.83)]
-    parts = [
-        side_profile(body, 0.98, PAINT),
-        side_profile(glass, 0.9, GLASS, top_half_width=0.76),
-        block((0.12, 0, 1.83), (1.35, 1.56, 0.07), PAINT),
-        block((-1.75, 0, 1.1), (1.9, 1.6, 0.06), (20, 20, 22)),
-        block((-1.8, 0.9, 1.2), (2.0, 0.14, 0.18), PAINT),
-        block((-1.8, -0.9, 1.2), (2.0, 0.14, 0.18), PAINT),
-        block((-2.72, 0, 1.2), (0.12, 1.9, 0.18), PAINT),
-        block((2.78, 0, 0.82), (0.08, 1.0, 0.25), TRIM),
-        block((2.76, 0, 0.5), (0.1, 1.9, 0.2), TRIM),
-        block((-2.78, 0, 0.5), (0.1, 1.9, 0.18), TRIM),
-    ]
-    for side in (-1, 1):
-        parts += [
-            block((2.74, side * 0.78, 0.88), (0.12, 0.3, 0.18), HEADLAMP),
-            block((-2.78, side * 0.86, 0.95), (0.06, 0.18, 0.3), TAIL_LAMP),
-        ]
-        for low, high in ((-0.6, -0.48), (0.3, 0.2), (1.3, 0.74)):
-            parts.append(rod((low, side * 0.89, 1.12), (high, side * 0.77, 1.82), 0.05, PAINT, 4))
-    return [*parts, *_axles((-1.75, 1.85), 1.0, 0.4)]
-
-
-def _delivery() -> list[Mesh]:
-    body = [(-3.1, 0.4), (3.0, 0.4), (3.1, 0.7), (3.0, 1.15), (2.3, 1.35), (1.75, 2.4), (1.3, 2.75), (-3.1, 2.75)]
-    shield = [(1.72, 1.45), (2.36, 1.4), (1.83, 2.4), (1.4, 2.5)]
-    parts = [
-        side_profile(body, 1.0, PAINT, top_half_width=0.95),
-        side_profile(shield, 0.93, GLASS, top_half_width=0.9),
-        block((1.45, 0, 1.85), (0.8, 1.985, 0.7), GLASS),
-        block((-0.9, 0, 1.7), (3.2, 2.0, 0.35), CARGO),
-        block((3.06, 0, 0.6), (0.1, 1.9, 0.25), TRIM),
-        block((-3.08, 0, 0.5), (0.1, 1.9, 0.2), TRIM),
-        block((-3.1, 0, 1.7), (0.04, 0.04, 1.9), TRIM),
-    ]
-    for side in (-1, 1):
-        parts += [
-            block((3.02, side * 0.75, 0.92), (0.14, 0.34, 0.2), HEADLAMP),
-            block((-3.1, side * 0.9, 1.3), (0.06, 0.14, 0.5), TAIL_LAMP),
-        ]
-    return [*parts, *_axles((-1.9, 2.05), 1.0, 0.37)]
+    skip = [(rear + 0.15, 1.1), (front - 0.3, 1.1), (front - 0.1, height - 0.2), (rear, height - 0.5)]
+    hold = [(rear + 0.9, 1.0), (front - 0.1, 1.0), (front - 0.1, height), (rear + 0.9, height)]
+    hatch = [(rear, 0.7), (rear + 0.95, 0.7), (rear + 0.95, height - 0.1), (rear + 0.35, height - 0.3)]
+    return {
+        "box": [
+            (block, (middle, 0, height / 2 + 0.5), (bed, 2 * half, height - 1.0), CARGO),
+            (block, (middle, 0, 1.3), (bed + 0.02, 2 * half + 0.02, 0.5), PAINT),
+        ],
+        "flatbed": [
+            (block, (middle, 0, 1.1), (bed, 2 * half, 0.18), (112, 92, 70)),
+            (block, (middle + 0.6, 0.1, 1.7), (2.2, 1.8, 1.0), (150, 116, 80)),
+            (block, (middle - 1.6, -0.2, 1.5), (1.5, 1.6, 0.7), (120, 124, 126)),
+            (block, (front - 0.06, 0, 1.7), (0.1, 2 * half, 1.1), TRIM),
+        ],
+        "tanker": [
+            (rod, (rear + 0.1, 0, 2.05), (front - 0.15, 0, 2.05), 1.05, CARGO, 12),
+            (block, (middle, 0, 3.08), (bed * 0.5, 0.5, 0.06), TRIM),
+        ],
+        "dumper": [
+            (side_profile, skip, half, DYED_PAINT),
+            *[(twin_blocks, (x, half, 1.9), (0.1, 0.06, 1.4), TRIM) for x in (rear + 1, middle, front - 1)],
+        ],
+        "garbage": [(side_profile, hold, half, DYED_PAINT), (side_profile, hatch, half * 0.96, (90, 96, 92))],
+        "tractor": [
+            (block, (rear + 1.6, 0, 1.15), (1.2, 0.9, 0.14), (70, 70, 72)),
+            (rod, (front - 0.2, 0.8, 1), (front - 0.2, 0.8, height), 0.08, (180, 182, 184)),
+        ],
+    }
 
 
 def _cab(nose: float, half: float, height: float) -> list[Mesh]:
@@ -208,83 +193,69 @@ def _cab(nose: float, half: float, height: float) -> list[Mesh]:
     back = nose - 2.1
     body = [(back, 0.6), (nose, 0.45), (nose, 1.5), (nose - 0.12, height - 0.25), (nose - 0.5, height), (back, height)]
     glass = [(nose - 0.4, 1.55), (nose + 0.015, 1.55), (nose - 0.1, 2.4), (nose - 0.4, 2.4)]
-    parts = [
+    return [
         side_profile(body, half * 0.98, PAINT, top_half_width=half * 0.94),
         side_profile(glass, half * 0.9, GLASS),
         block((nose - 0.95, 0, 1.95), (0.9, half * 1.955, 0.75), GLASS),
         block((nose, 0, 1.15), (0.05, half * 1.2, 0.4), TRIM),
         block((nose - 0.03, 0, 0.6), (0.12, half * 1.96, 0.3), TRIM),
+        twin_blocks((nose, half * 0.78, 0.8), (0.06, 0.34, 0.18), HEADLAMP),
+        twin_blocks((nose - 0.15, half - 0.05, 2.0), (0.12, 0.1, 0.5), TRIM),
     ]
-    for side in (-1, 1):
-        parts.append(block((nose, side * half * 0.78, 0.8), (0.06, 0.34, 0.18), HEADLAMP))
-        parts.append(block((nose - 0.15, side * (half - 0.05), 2.0), (0.12, 0.1, 0.5), TRIM))
-    return parts
-
-
-def _axles(positions: tuple[float, ...], half: float, radius: float) -> list[Mesh]:
-    """Two wheels at each position along x (metres). half: half the vehicle's width; radius of the wheels; metres."""
-    return [wheel(x, side * (half - 0.16), radius, 0.3) for x in positions for side in (-1, 1)]
 
 
 TRAILER_NAMES = ("box", "curtain", "container", "tanker", "flatbed", "utility")
+_UTILITY_TRAILER: tuple[Row, ...] = (
+    (block, (-0.5, 0, 0.75), (3.6, 1.9, 0.12), (96, 92, 86)),
+    (twin_blocks, (-0.5, 0.93, 1.05), (3.6, 0.06, 0.6), PAINT),
+    (block, (-2.28, 0, 1.05), (0.06, 1.9, 0.6), PAINT),
+    (block, (1.28, 0, 1.05), (0.06, 1.9, 0.6), PAINT),
+    (rod, (1.2, 0, 0.6), (2.4, 0, 0.5), 0.06, TRIM),
+    (block, (-0.4, 0.1, 1.3), (2.2, 1.3, 0.7), (140, 110, 78)),
+    (axles, (-0.7,), 1.08 - 0.16, 0.34, 0.3),
+    (twin_blocks, (-2.3, 0.8, 0.7), (0.06, 0.2, 0.12), TAIL_LAMP),
+)
 
 
 def trailer(name: str) -> list[Mesh]:
     """The parts of a trailer. name: one of TRAILER_NAMES."""
     if name == "utility":
-        return _utility_trailer()
+        return made(_UTILITY_TRAILER)
     half, front, rear = 1.27, 6.2, -6.2
     return [
         block((0, 0, 1.1), (12.4, 1.0, 0.28), TRIM),
         block((front - 2.6, 0, 0.6), (0.2, 1.4, 0.9), TRIM),
         block((rear + 0.08, 0, 0.6), (0.12, 2.3, 0.2), TRIM),
-        *_axles((rear + 1.2, rear + 2.5, rear + 3.8), half, 0.5),
-        *_cargo(name, front, half),
-        *[block((rear - 0.01, side * half * 0.8, 1.1), (0.06, 0.3, 0.16), TAIL_LAMP) for side in (-1, 1)],
+        axles((rear + 1.2, rear + 2.5, rear + 3.8), half - 0.16, 0.5, 0.3),
+        *made(_cargo(name, front, half)),
+        twin_blocks((rear - 0.01, half * 0.8, 1.1), (0.06, 0.3, 0.16), TAIL_LAMP),
     ]
 
 
-def _cargo(name: str, front: float, half: float) -> list[Mesh]:
+def _cargo(name: str, front: float, half: float) -> list[Row]:
     """Everything above a trailer's frame. front: half its length; half: half its width; metres."""
     length, rear = 2 * front, -front
     if name == "tanker":
         silver = Finish((198, 200, 202), Material.PAINT)
-        tank = rod((rear + 0.05, 0, 2.35), (front - 0.05, 0, 2.35), 1.1, silver, 12)
-        return [tank, block((0, 0, 3.45), (length * 0.7, 0.5, 0.08), TRIM)]
+        tank = (rod, (rear + 0.05, 0, 2.35), (front - 0.05, 0, 2.35), 1.1, silver, 12)
+        return [tank, (block, (0, 0, 3.45), (length * 0.7, 0.5, 0.08), TRIM)]
     if name == "flatbed":
-        parts = [
-            block((0, 0, 1.3), (length, 2 * half, 0.16), (120, 98, 74)),
-            block((front - 0.06, 0, 1.9), (0.12, 2 * half, 1.3), PAINT),
+        logs = [(y, 1.75, 0.38, (128, 104, 84)) for y in (-0.8, 0, 0.8)]
+        logs += [(y, 2.35, 0.36, (138, 112, 90)) for y in (-0.4, 0.4)]
+        return [
+            (block, (0, 0, 1.3), (length, 2 * half, 0.16), (120, 98, 74)),
+            (block, (front - 0.06, 0, 1.9), (0.12, 2 * half, 1.3), PAINT),
+            *[(rod, (rear + 1.2, y, z), (front - 1.5, y, z), radius, color, 8) for y, z, radius, color in logs],
         ]
-        lower, upper = (128, 104, 84), (138, 112, 90)  # of the logs
-        for y, z, radius, color in (
-            (-0.8, 1.75, 0.38, lower), (0, 1.75, 0.38, lower), (0.8, 1.75, 0.38, lower),
-            (-0.4, 2.35, 0.36, upper), (0.4, 2.35, 0.36, upper),
-        ):  # fmt: skip
-            parts.append(rod((rear + 1.2, y, z), (front - 1.5, y, z), radius, color, sections=8))
-        return parts
     height, ribs = (3.8, int(length / 0.8)) if name == "container" else (3.9, 4)
-    parts = [block((0, 0, height / 2 + 0.62), (length, 2 * half, height - 1.24), CARGO)]
-    for k in range(ribs):
-        x = rear + (k + 0.5) * length / ribs
-        parts.append(block((x, 0, height / 2 + 0.62), (0.1, 2 * half + 0.05, height - 1.3), PAINT))
-    parts.append(block((rear, 0, height / 2 + 0.6), (0.05, 0.06, height - 1.4), TRIM))
-    if name == "curtain":
-        parts.append(block((0, 0, height - 1.1), (length * 0.5, 2 * half + 0.03, 0.8), PAINT))
-    return parts
-
-
-def _utility_trailer() -> list[Mesh]:
-    return [
-        block((-0.5, 0, 0.75), (3.6, 1.9, 0.12), (96, 92, 86)),
-        *[block((-0.5, y, 1.05), (3.6, 0.06, 0.6), PAINT) for y in (-0.93, 0.93)],
-        block((-2.28, 0, 1.05), (0.06, 1.9, 0.6), PAINT),
-        block((1.28, 0, 1.05), (0.06, 1.9, 0.6), PAINT),
-        rod((1.2, 0, 0.6), (2.4, 0, 0.5), 0.06, TRIM),
-        block((-0.4, 0.1, 1.3), (2.2, 1.3, 0.7), (140, 110, 78)),
-        *_axles((-0.7,), 1.08, 0.34),
-        *[block((-2.3, y, 0.7), (0.06, 0.2, 0.12), TAIL_LAMP) for y in (-0.8, 0.8)],
+    rib = (0.1, 2 * half + 0.05, height - 1.3)
+    rows = [
+        (block, (0, 0, height / 2 + 0.62), (length, 2 * half, height - 1.24), CARGO),
+        *[(block, (rear + (k + 0.5) * length / ribs, 0, height / 2 + 0.62), rib, PAINT) for k in range(ribs)],
+        (block, (rear, 0, height / 2 + 0.6), (0.05, 0.06, height - 1.4), TRIM),
     ]
+    curtain = (block, (0, 0, height - 1.1), (length * 0.5, 2 * half + 0.03, 0.8), PAINT)
+    return [*rows, curtain] if name == "curtain" else rows
 
 
 BUSES = {
@@ -318,12 +289,14 @@ def bus(name: str) -> list[Mesh]:
         display = Finish((255, 170, 40), Material.GLOW)
         parts.append(block((nose - 0.05, 0, min(height - 0.25, 2.75)), (0.12, 1.7, 0.28), display))
         parts += [block((x, -half + 0.01, 1.4), (1.1, 0.05, 2.0), GLASS) for x in (nose - 1.0, 0.0)]
-    parts.append(block((0, 0, floor + 0.35), (length * 0.92, half * 2.01, 0.22), CARGO))
-    for side in (-1, 1):
-        parts.append(block((front - 0.02, side * half * 0.75, 0.75), (0.08, 0.4, 0.2), HEADLAMP))
-        parts.append(block((-front, side * half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL_LAMP))
     places = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
-    return [*parts, *_axles(places, half + 0.02, 0.46)]
+    return [
+        *parts,
+        block((0, 0, floor + 0.35), (length * 0.92, half * 2.01, 0.22), CARGO),
+        twin_blocks((front - 0.02, half * 0.75, 0.75), (0.08, 0.4, 0.2), HEADLAMP),
+        twin_blocks((-front, half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL_LAMP),
+        axles(places, half + 0.02 - 0.16, 0.46, 0.3),
+    ]
 
 
 def _bus_windows(start: float, end: float, z: float, height: float, half: float) -> list[Mesh]:

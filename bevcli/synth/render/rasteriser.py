@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.jit import njit
-from bevcli.synth.assets.triangles import TriangleSoup
+from bevcli.synth.assets.mesh import TriangleSoup
 
 # mypy: disable-error-code="no-untyped-def"
 # The kernels have no type hints: numba takes the types from the first call.

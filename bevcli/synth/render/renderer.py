@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.synth.assets.triangles import TriangleSoup
+from bevcli.synth.assets.mesh import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture
 from bevcli.synth.render.lens import LensPart
 from bevcli.synth.render.rasteriser import ShadowMap, VisibilityBuffer, rasterise

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.mesh import Mesh, from_faces, joined, prism
+from bevcli.synth.assets.mesh import Mesh, TriangleSoup, from_faces, joined, prism
 from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
-from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle, side_of
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
 from bevcli.synth.world.traffic import Signals
