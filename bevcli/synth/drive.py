@@ -114,7 +114,7 @@ class RenderedDrive:
         names = self._city.stream("weather-name")
         name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
         self.weather = make_weather(name, self._city.stream("weather"))
-        self.simulation = Simulation(self._city, self._assets.catalog, frames / rate_hz)
+        self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
         self._ground = GroundPlan(self._city)
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
