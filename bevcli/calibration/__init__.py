@@ -11,11 +11,10 @@ In the order of the work:
     solve                robust least squares
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     levels               whether a camera has measured its height from a pavement
-    measure              all of it in rounds, and the part of the result that the drive shows, with its covariance
+    measure              all of it in rounds, and the images and matches that show it
 
 Outputs:
     estimates            what is said about each camera and the whole rig, with the text for the terminal
     result               the corrected rig, the drive with it, and the files
-    evidence             the images and matches behind it
     drawings             calibration.png and recording.rrd
 """

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text, delay_text, either_text
-from bevcli.calibration.evidence import Evidence
-from bevcli.calibration.matches import PointMatches, match_points
-from bevcli.calibration.measure import PARTS, Measurement, measure, observed
+from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict, change_text, delay_text, either_text
+from bevcli.calibration.matches import match_points
+from bevcli.calibration.measure import PARTS, Measurement, measure
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import values
 from bevcli.calibration.result import CalibrationResult, corrected_rig
-from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, Views, read_views
+from bevcli.calibration.solve import Solution
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_RIG, Unknowns
+from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, read_views
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.frame import Sequence
@@ -26,6 +27,9 @@ FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
+LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
+LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
+FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
 SHORT_PAIRS = 8  # of frames, for findings
 
@@ -65,25 +69,24 @@ def calibrate(
             f"{drive.name}: no points were found in both frames of a pair (expected {FEWEST_MATCHES} or more a "
             "camera): choose a part of the drive in which the images are sharp and show something"
         )
-    return judge(drive, views, matches, measure(views, matches, chosen, after_step))
+    return judge(drive, measure(views, matches, chosen, after_step))
 
 
-def judge(drive: Sequence, views: Views, matches: PointMatches, measurement: Measurement) -> CalibrationResult:
+def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
     """The result of a measurement: what is observed, with a verdict for each camera."""
     changes, covariances, whole = observed(measurement)
-    evidence = Evidence(views, matches, measurement)
-    found = enumerate(zip(changes, covariances, strict=True))
-    cameras = tuple(_estimate(index, evidence, *each) for index, each in found)
+    found, views = enumerate(zip(changes, covariances, strict=True)), measurement.views
+    cameras = tuple(_estimate(index, measurement, *each) for index, each in found)
     rig = corrected_rig(views.stated, cameras)
-    return CalibrationResult(drive.name, views.stated, rig, cameras, whole, len(views.pairs), drive.facts, evidence)
+    return CalibrationResult(drive.name, views.stated, rig, cameras, whole, len(views.pairs), drive.facts, measurement)
 
 
-def _estimate(index: int, evidence: Evidence, change: Array, covariance: Array) -> CameraEstimate:
+def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:
     """The estimate of a camera. change, covariance: of `observed`, (7,) and (7, 7)."""
-    views, matches, measurement = evidence.views, evidence.points, evidence.measurement
+    views, groups = measurement.views, measurement.matches.group
     deviations = np.sqrt(np.diag(covariance))
-    mine = matches.same & (matches.camera == index)
-    count, pairs = int(mine.sum()), len(np.unique(matches.group[mine]))
+    mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
+    count, pairs = int(mine.sum()), len(np.unique(groups[mine]))
     reason = _reason(count, pairs, np.degrees(deviations[:3]))
     enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
@@ -136,6 +139,57 @@ def _yaw_pitch_roll(turn: Array) -> tuple[float, float, float]:
 def _triple(values: Array) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
+
+
+def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
+    """The changes along directions that the drive shows, with their covariance; all else stays as it is stated.
+
+    Returns:
+        (C, 7) rotation, radians in the camera frame; position, metres in the ego frame; delay, seconds.
+        (C, 7, 7) covariances of them; a direction that is not observed has the deviation of the stated value.
+        The whole rig.
+    """
+    unknowns, solution = measurement.unknowns, measurement.solution
+    deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
+    covariance = _honest(unknowns, solution)
+    scale = deviations[:count]
+    marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
+    sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
+    seen, unseen = axes[:, sizes >= LEAST_INFORMATION], axes[:, sizes < LEAST_INFORMATION]
+    change = scale * (seen @ (seen.T @ (solution.x[:count] / scale)))
+    within = seen @ np.diag(1 / (1 + sizes[sizes >= LEAST_INFORMATION])) @ seen.T + unseen @ unseen.T
+    whole = np.outer(scale, scale) * within + np.diag(np.tile(FINEST, unknowns.cameras) ** 2)
+    blocks = whole.reshape(unknowns.cameras, OF_CAMERA, unknowns.cameras, OF_CAMERA)
+    changes = unknowns.of_camera(change)
+    of_rig, of_rig_deviations = solution.x[-OF_RIG:], np.sqrt(np.diag(covariance)[-OF_RIG:])
+    (along, across), (along_deviation, across_deviation) = np.degrees([of_rig[1:], of_rig_deviations[1:]]).tolist()
+    rig = RigEstimate(
+        scale=float(of_rig[0]),
+        scale_deviation=float(of_rig_deviations[0]),
+        height_m=-float(changes[:, HEIGHT].mean()),
+        height_deviation_m=float(np.sqrt(blocks[:, HEIGHT, :, HEIGHT].sum()) / unknowns.cameras),
+        tilt_deg=(along, across),
+        tilt_deviation_deg=(along_deviation, across_deviation),
+    )
+    return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
+
+
+def _honest(unknowns: Unknowns, solution: Solution) -> Array:
+    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
+
+    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
+    however small its residuals are.
+    """
+    prior = np.diag(1 / unknowns.deviations**2)
+    matrix = solution.information + prior
+    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    pulls = []
+    for pair in range(unknowns.pairs):
+        groups = unknowns.groups[:, 0] == pair
+        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
+    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
+    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
+    return covariance * np.outer(factor, factor)
 
 
 def motion_findings(drive: Sequence) -> tuple[Finding, ...]:

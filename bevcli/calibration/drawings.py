@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text
-from bevcli.calibration.evidence import Evidence, ShownMatches, epipolar_piece
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.calibration.measure import Measurement
+from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities, log_cameras
 from bevcli.recording.blueprint import Layout
 from bevcli.rig.drawings import FAINT, INK, PAPER, save
 from bevcli.rig.mounting import horizon
-from bevcli.rig.overlay import GROUND, HORIZON, Pixels, draw_lines, ground_lines, visible_runs
+from bevcli.rig.overlay import GROUND, HORIZON, draw_lines, ground_lines, visible_runs
 from bevcli.rig.rig_recording import Lines, camera_views, log_image, log_lines, rig_recording, rig_view
 
 ROW_INCHES, WIDTH_INCHES = 2.9, 15.0
@@ -31,7 +31,7 @@ HEADINGS = (
 TABLE = "calibration"  # in the recording
 
 
-def write_sheet(path: Path, evidence: Evidence, cameras: tuple[CameraEstimate, ...]) -> None:
+def write_sheet(path: Path, measurement: Measurement, cameras: tuple[CameraEstimate, ...]) -> None:
     """Write the sheet as a PNG, one row a camera. Raises OutputError."""
     height = ROW_INCHES * len(cameras) + 0.6
     figure = Figure(figsize=(WIDTH_INCHES, height), dpi=90, facecolor=PAPER)
@@ -41,8 +41,7 @@ def write_sheet(path: Path, evidence: Evidence, cameras: tuple[CameraEstimate, .
         bottom, size = 1 - (0.6 + ROW_INCHES * (row + 1)) / height, (ROW_INCHES - 0.45) / height
         for column in (0, 1):
             axes = figure.add_axes((0.01 + 0.38 * column, bottom + 0.1 / height, 0.37, size))
-            camera = evidence.camera(row, measured=column == 1)
-            _draw_image(axes, evidence.image(row), camera, evidence.matches(row, measured=column == 1))
+            _draw_image(axes, measurement, row, measured=column == 1)
         figure.text(0.01, bottom + size + 0.13 / height, _title(estimate), color=COLORS[estimate.verdict], fontsize=10)
         axes = figure.add_axes((0.82, bottom + 0.45 / height, 0.16, size - 0.4 / height))
         _draw_ellipse(axes, estimate)
@@ -54,15 +53,16 @@ def _title(estimate: CameraEstimate) -> str:
     return f"{estimate.camera}: {estimate.verdict.value}; {text}"
 
 
-def _draw_image(axes: Axes, grey: Pixels | None, camera: Camera, matches: ShownMatches) -> None:
+def _draw_image(axes: Axes, measurement: Measurement, index: int, *, measured: bool) -> None:
     """The image with the ground grid and the horizon, matched points, and pieces of their epipolar lines."""
     axes.set(xticks=[], yticks=[])
+    grey, camera = measurement.image(index), measurement.camera(index, measured=measured)
     blank = np.full((camera.height, camera.width), 40, dtype=np.uint8)
     canvas = np.repeat((blank if grey is None else grey)[..., None], 3, axis=-1)
     draw_lines(canvas, ground_lines(camera), GROUND, 1)
     draw_lines(canvas, visible_runs(horizon(camera)), HORIZON, 2)
-    for point, ray in zip(matches.pixels_b, matches.rays_a, strict=True):
-        draw_lines(canvas, epipolar_piece(camera, matches.camera_b_from_camera_a, ray, point), LINE, 2)
+    for point, pieces in measurement.shown_matches(index, measured=measured):
+        draw_lines(canvas, pieces, LINE, 2)
         cv2.circle(canvas, (round(point[0]), round(point[1])), 4, POINT, -1, cv2.LINE_AA)
     axes.imshow(canvas)
 
@@ -86,44 +86,39 @@ def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
     axes.grid(color=FAINT, alpha=0.25)
 
 
-def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> None:
+def write_calibration_recording(path: Path, measurement: Measurement, table: str) -> None:
     """Write the recording: frame 0 shows the stated calibration, frame 1 the measured one. Raises OutputError.
 
     table: the text of the result.
     """
-    rig = evidence.views.rig
+    rig = measurement.views.rig
     with rig_recording(path, "bevcli-calibrate", rig, _layout(rig)) as stream:
         text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
         stream.log(TABLE, text, static=True)
         for index in range(len(rig.cameras)):
-            _log_image(stream, evidence, index)
+            _log_image(stream, measurement, index)
         for step in (0, 1):
             stream.set_time(entities.FRAME_TIMELINE, sequence=step)
             for index in range(len(rig.cameras)):
-                _log_camera(stream, evidence, index, measured=step == 1)
+                _log_camera(stream, measurement, index, measured=step == 1)
 
 
-def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> None:
+def _log_image(stream: rr.RecordingStream, measurement: Measurement, index: int) -> None:
     """What both calibrations share: the image and its matched points."""
-    name, pixels = evidence.views.rig.names[index], evidence.image(index)
+    name, pixels = measurement.views.rig.names[index], measurement.image(index)
     if pixels is None:
         return
     log_image(stream, name, pixels)
-    points = evidence.matches(index, measured=True).pixels_b
+    points = [point for point, _ in measurement.shown_matches(index, measured=True)]
     dots = rr.Points2D(points, colors=POINT, radii=rr.Radius.ui_points(2.5), draw_order=30)
     stream.log(entities.overlay(name, "matches"), dots, static=True)
 
 
-def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, measured: bool) -> None:
+def _log_camera(stream: rr.RecordingStream, measurement: Measurement, index: int, *, measured: bool) -> None:
     """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
-    camera, matches = evidence.camera(index, measured=measured), evidence.matches(index, measured=measured)
+    camera, matches = measurement.camera(index, measured=measured), measurement.shown_matches(index, measured=measured)
     stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera))
-    motion = matches.camera_b_from_camera_a
-    pieces = [
-        piece
-        for ray, point in zip(matches.rays_a, matches.pixels_b, strict=True)
-        for piece in epipolar_piece(camera, motion, ray, point)
-    ]
+    pieces = [piece for _, lines in matches for piece in lines]
     lines: dict[str, Lines] = {
         "epipolar_lines": (pieces, LINE, 1.2),
         "ground_grid": (ground_lines(camera), GROUND, 0.6),

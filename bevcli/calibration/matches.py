@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.calibration.residuals import EpipolarResiduals
 from bevcli.calibration.views import THREADS, Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
@@ -22,26 +23,18 @@ _Features = tuple[Array, NDArray[np.float32]]  # pixels (F, 2) and descriptors (
 
 
 @dataclass(frozen=True)
-class PointMatches:
+class PointMatches(EpipolarResiduals):
     """M matches of all pairs.
 
     Attributes:
-        group: (M,) index of the group in `Views.groups`, in order.
         same: (M,) whether both images are of the same camera.
-        camera: (M,) index of the camera of the first image.
         pixels_a: (M, 2) in the reduced image of the first frame.
         pixels_b: (M, 2) in that of the second frame.
-        rays_a: (M, 3) unit directions in the camera frame.
-        rays_b: (M, 3).
     """
 
-    group: NDArray[np.int64]
     same: NDArray[np.bool_]
-    camera: NDArray[np.int64]
     pixels_a: Array
     pixels_b: Array
-    rays_a: Array
-    rays_b: Array
 
 
 def match_points(views: Views) -> PointMatches:
@@ -62,8 +55,8 @@ def match_points(views: Views) -> PointMatches:
     for index, camera in enumerate(views.rig.cameras):
         rays_a[first == index] = camera.rays(pixels_a[first == index])
         rays_b[second == index] = camera.rays(pixels_b[second == index])
-    group = np.repeat(np.arange(len(counts)), counts)
-    return PointMatches(group, first == second, first, pixels_a, pixels_b, rays_a, rays_b)
+    group, focal = np.repeat(np.arange(len(counts)), counts), [each.intrinsics[0, 0] for each in views.rig.cameras]
+    return PointMatches(group, rays_a, rays_b, np.array(focal)[first], first == second, pixels_a, pixels_b)
 
 
 def _features(pixels: NDArray[np.uint8]) -> _Features:

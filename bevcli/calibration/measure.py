@@ -1,20 +1,23 @@
-"""The measurement: rounds of rotations from points, heights from the road, and both together; what the drive shows."""
+"""The measurement: rounds of rotations from points, heights from the road, and both together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bevcli.calibration.estimates import RigEstimate
 from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
-from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals, values
+from bevcli.calibration.residuals import RoadResiduals, values
 from bevcli.calibration.road import road_residuals, search_heights
 from bevcli.calibration.solve import Solution, Term, solve, spread
-from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, OF_RIG, Unknowns
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, Unknowns, geometry_at
 from bevcli.calibration.views import Views
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
+from bevcli.rig.overlay import visible_runs
 
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
 POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
@@ -24,26 +27,79 @@ SMALLEST_TURN = np.radians(0.005)  # of it
 KERB_M = 0.09  # less than from the road to a pavement
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
-LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
-LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
-FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
+MOST_SHOWN = 60  # matches of a camera
+DEPTHS_M = np.geomspace(0.7, 300, 400)  # along the ray of a point
+PIECE_PX = 30.0  # length of the shown piece of an epipolar line to each side
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the drive says about the unknowns.
+    """What the drive says about the unknowns, and what shows it: of each camera the pair of images with most matches.
 
     Attributes:
+        views: the frame pairs.
+        matches: of all pairs.
         unknowns: their layout.
         solution: their best values, with the information and pull of each group.
-        points: residuals of matched points.
+        points: the matches that were used.
         road: residuals of points of the road.
     """
 
+    views: Views
+    matches: PointMatches
     unknowns: Unknowns
     solution: Solution
-    points: EpipolarResiduals
+    points: PointMatches
     road: RoadResiduals
+
+    def image(self, index: int) -> NDArray[np.uint8] | None:
+        """(h, w) grey, the second image of the shown pair of a camera; None where it has no matches."""
+        group = self._shown.get(index)
+        return None if group is None else self.views.sides(self.views.groups()[group])[1].pixels
+
+    def camera(self, index: int, *, measured: bool) -> Camera:
+        """A camera of the reduced images with its stated or its measured pose."""
+        camera = self.views.rig.cameras[index]
+        return replace(camera, ego_from_camera=self.unknowns.ego_from_camera(self._x(measured))[index])
+
+    def shown_matches(self, index: int, *, measured: bool) -> list[tuple[Array, list[Array]]]:
+        """Some matches of the shown pair of a camera.
+
+        Of each the pixel (2,) in the image, and its piece of the epipolar line by either calibration, as lines (P, 2).
+        """
+        group, camera = self._shown.get(index), self.camera(index, measured=measured)
+        if group is None:
+            return []
+        mine = np.flatnonzero(self.matches.group == group)
+        chosen = mine[:: 1 + len(mine) // MOST_SHOWN]
+        motion = geometry_at(self.unknowns, self._x(measured)).camera_b_from_camera_a[group]
+        pairs = zip(self.matches.pixels_b[chosen], self.matches.rays_a[chosen], strict=True)
+        return [(point, _epipolar_piece(camera, motion, ray, point)) for point, ray in pairs]
+
+    def _x(self, measured: bool) -> Array:
+        return self.solution.x * (1.0 if measured else 0.0)
+
+    @cached_property
+    def _shown(self) -> dict[int, int]:
+        """Camera -> the group of its shown pair."""
+        counts = np.bincount(self.matches.group[self.matches.same], minlength=len(self.unknowns.groups))
+        best: dict[int, int] = {}
+        for group in np.argsort(counts):
+            if counts[group]:
+                best[int(self.unknowns.groups[group, 1])] = int(group)
+        return best
+
+
+def _epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, point: Array) -> list[Array]:
+    """The part of a ray's image that is nearest to a point, as lines (P, 2) in pixels."""
+    points = DEPTHS_M[:, None] * ray @ camera_b_from_camera_a[:3, :3].T + camera_b_from_camera_a[:3, 3]
+    pixels = camera.project(points)[0]
+    distance = np.linalg.norm(pixels - point, axis=-1)
+    if not np.isfinite(distance).any():
+        return []
+    nearest = pixels[np.nanargmin(distance)]
+    near = np.linalg.norm(pixels - nearest, axis=-1) < PIECE_PX
+    return visible_runs(np.where(near[:, None], pixels, np.nan))
 
 
 def measure(
@@ -51,8 +107,7 @@ def measure(
 ) -> Measurement:
     """Measure all unknowns. progress: called PARTS times."""
     unknowns = Unknowns.of(views, options)
-    points = epipolar_residuals(views, matches)
-    within, x = points.where(matches.same), np.zeros(len(unknowns.deviations))
+    within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
         x = solve(unknowns, [Term(within, scale)], x).x
     within = consistent(unknowns, within, x)
@@ -60,7 +115,7 @@ def measure(
     heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
     x[heights] += search_heights(views, unknowns, x)
     progress()
-    ties = points.where(~matches.same)
+    ties = matches.where(~matches.same)
     for most_px in FLOWS_PX:
         road = road_residuals(views, unknowns, x, most_px)
         progress()
@@ -76,18 +131,16 @@ def measure(
     for _ in range(LEARNINGS):
         solution = solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
         x, unknowns = solution.x, with_learned_turns(unknowns, solution)
-    return Measurement(unknowns, solution, within, road)
+    return Measurement(views, matches, unknowns, solution, within, road)
 
 
-def _terms(
-    unknowns: Unknowns, points: EpipolarResiduals, road: RoadResiduals, x: Array, road_scale: float
-) -> list[Term]:
+def _terms(unknowns: Unknowns, points: PointMatches, road: RoadResiduals, x: Array, road_scale: float) -> list[Term]:
     """Both kinds of residuals, with the spread that they have at x (P,)."""
     scales = ((points, POINT_SCALE_PX), (road, road_scale))
     return [Term(each, np.maximum(least, spread(unknowns, each, x))) for each, least in scales]
 
 
-def consistent(unknowns: Unknowns, points: EpipolarResiduals, x: Array) -> EpipolarResiduals:
+def consistent(unknowns: Unknowns, points: PointMatches, x: Array) -> PointMatches:
     """The points that fit at x (P,), of the image pairs in which most of them do.
 
     Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
@@ -113,54 +166,3 @@ def with_learned_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
     learned = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
     deviations[turns] = np.minimum(deviations[turns], np.tile(learned, unknowns.pairs))
     return replace(unknowns, deviations=deviations)
-
-
-def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
-    """The changes along directions that the drive shows, with their covariance; all else stays as it is stated.
-
-    Returns:
-        (C, 7) rotation, radians in the camera frame; position, metres in the ego frame; delay, seconds.
-        (C, 7, 7) covariances of them; a direction that is not observed has the deviation of the stated value.
-        The whole rig.
-    """
-    unknowns, solution = measurement.unknowns, measurement.solution
-    deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
-    covariance = _honest(unknowns, solution)
-    scale = deviations[:count]
-    marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
-    sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
-    seen, unseen = axes[:, sizes >= LEAST_INFORMATION], axes[:, sizes < LEAST_INFORMATION]
-    change = scale * (seen @ (seen.T @ (solution.x[:count] / scale)))
-    within = seen @ np.diag(1 / (1 + sizes[sizes >= LEAST_INFORMATION])) @ seen.T + unseen @ unseen.T
-    whole = np.outer(scale, scale) * within + np.diag(np.tile(FINEST, unknowns.cameras) ** 2)
-    blocks = whole.reshape(unknowns.cameras, OF_CAMERA, unknowns.cameras, OF_CAMERA)
-    changes = unknowns.of_camera(change)
-    of_rig, of_rig_deviations = solution.x[-OF_RIG:], np.sqrt(np.diag(covariance)[-OF_RIG:])
-    (along, across), (along_deviation, across_deviation) = np.degrees([of_rig[1:], of_rig_deviations[1:]]).tolist()
-    rig = RigEstimate(
-        scale=float(of_rig[0]),
-        scale_deviation=float(of_rig_deviations[0]),
-        height_m=-float(changes[:, HEIGHT].mean()),
-        height_deviation_m=float(np.sqrt(blocks[:, HEIGHT, :, HEIGHT].sum()) / unknowns.cameras),
-        tilt_deg=(along, across),
-        tilt_deviation_deg=(along_deviation, across_deviation),
-    )
-    return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
-
-
-def _honest(unknowns: Unknowns, solution: Solution) -> Array:
-    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
-
-    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
-    however small its residuals are.
-    """
-    prior = np.diag(1 / unknowns.deviations**2)
-    matrix = solution.information + prior
-    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    pulls = []
-    for pair in range(unknowns.pairs):
-        groups = unknowns.groups[:, 0] == pair
-        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
-    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
-    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
-    return covariance * np.outer(factor, factor)

@@ -7,9 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.unknowns import GroupGeometry, Indices, Unknowns, geometry, geometry_at
-from bevcli.calibration.views import Views
 from bevcli.geometry.transforms import Array
 
 STEP = 1e-6  # of an unknown, for derivatives
@@ -102,12 +100,6 @@ def rays_of_road_points(geometry: GroupGeometry, group: Indices, rays_a: Array) 
     points = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - start
     points = np.einsum("nji,nj->ni", pose[:, :3, :3], points)
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
-
-
-def epipolar_residuals(views: Views, matches: PointMatches) -> EpipolarResiduals:
-    """The residuals of matched points."""
-    focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[matches.camera]
-    return EpipolarResiduals(matches.group, matches.rays_a, matches.rays_b, focal)
 
 
 def values(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict, rig_text, table
-from bevcli.calibration.evidence import Evidence
+from bevcli.calibration.measure import Measurement
 from bevcli.calibration.unknowns import moved
 from bevcli.frame import DerivedSequence, DriveFacts, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
@@ -28,7 +28,7 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
-        evidence: what it was measured from.
+        measurement: what it was measured from.
     """
 
     name: str
@@ -38,7 +38,7 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
-    evidence: Evidence
+    measurement: Measurement
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(each for each in self.cameras if each.camera == camera)
@@ -74,8 +74,8 @@ class CalibrationResult:
         folder = Path(folder)
         paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png", "recording.rrd")]
         write_whole(paths[1], f"{self.to_json()}\n".encode(), parents=True)
-        write_sheet(paths[2], self.evidence, self.cameras)
-        write_calibration_recording(paths[3], self.evidence, self.text())
+        write_sheet(paths[2], self.measurement, self.cameras)
+        write_calibration_recording(paths[3], self.measurement, self.text())
         write_calibration(paths[0], self.rig, self.facts)
         return paths
 

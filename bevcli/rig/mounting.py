@@ -32,11 +32,6 @@ class Mounting:
         """Height above the ground plane of the ego frame, metres."""
         return float(self.position[2])
 
-    @property
-    def horizontal_distance(self) -> float:
-        """Distance from the ego origin on the ground plane, metres."""
-        return float(np.hypot(self.position[0], self.position[1]))
-
 
 def mounting_of(ego_from_camera: Array) -> Mounting:
     """The mounting of a camera with this pose (4, 4)."""

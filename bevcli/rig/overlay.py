@@ -1,7 +1,5 @@
 """A camera's image with pillars, ground grid and horizon, as its calibration projects them."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +22,18 @@ BACKDROP: Color = (44, 49, 58)
 Pixels = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class PillarPoints:
-    """The M pillar points in a camera's image: pixels (M, 2), distances (M,) in metres, and RGB (M, 3) by height."""
+def pillars_in(camera: Camera, ego_from_bev: Array) -> tuple[Array, Array, NDArray[np.uint8]]:
+    """The M pillar points that are inside the camera's image, the farthest first. ego_from_bev: (4, 4).
 
-    pixels: Array
-    distances: Array
-    colors: NDArray[np.uint8]
-
-
-def pillars_in(camera: Camera, ego_from_bev: Array) -> PillarPoints:
-    """The pillar points that are inside the camera's image, the farthest first. ego_from_bev: (4, 4)."""
+    Returns pixels (M, 2), distances (M,) in metres, and RGB (M, 3) by height.
+    """
     points = apply(ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
     pixels = pixels_in_image(camera, points)
     distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
     colors = np.tile(height_colors(), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
     order = np.argsort(-distances)
     order = order[np.isfinite(pixels[order]).all(-1)]
-    return PillarPoints(pixels[order], distances[order], colors[order])
+    return pixels[order], distances[order], colors[order]
 
 
 def height_colors() -> NDArray[np.uint8]:
@@ -99,7 +91,10 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
     _blend_lines(canvas, ground_lines(shown), GROUND, 0.55)
     _blend_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
     _blend_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
-    _draw_pillars(canvas, pillars_in(shown, ego_from_bev))
+    for pixel, distance, color in zip(*pillars_in(shown, ego_from_bev), strict=True):
+        radius = float(np.clip(60 / distance, 1.2, 6)) * (width / 800)
+        center = tuple(np.round(pixel * 16).astype(int).tolist())
+        cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
     _draw_distances(canvas, shown)
     return canvas
 
@@ -114,14 +109,6 @@ def _blend_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: floa
     layer = canvas.copy()
     draw_lines(layer, lines, color, thickness)
     cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
-
-
-def _draw_pillars(canvas: Pixels, points: PillarPoints) -> None:
-    scale = canvas.shape[1] / 800
-    for pixel, distance, color in zip(points.pixels, points.distances, points.colors, strict=True):
-        radius = float(np.clip(60 / distance, 1.2, 6)) * scale
-        center = tuple(np.round(pixel * 16).astype(int).tolist())
-        cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
 
 
 def _draw_distances(canvas: Pixels, camera: Camera) -> None:

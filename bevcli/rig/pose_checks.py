@@ -243,10 +243,10 @@ def units_per_metre(length: float) -> float:
 def _defects(camera: Camera) -> list[Finding]:
     """The implausible properties of a pose, the most severe first."""
     mounting, name = mounting_of(camera.ego_from_camera), camera.name
-    low, high = HEIGHTS_M
+    (low, high), away_m = HEIGHTS_M, np.hypot(*mounting.position[:2])
     defects = []
-    if mounting.horizontal_distance > MAX_DISTANCE_M:
-        found = f"{mounting.horizontal_distance:.1f} m from the ego origin"
+    if away_m > MAX_DISTANCE_M:
+        found = f"{away_m:.1f} m from the ego origin"
         defects.append(_defect("camera-far", name, "is not on the vehicle", found, f"at most {MAX_DISTANCE_M:g} m"))
     if not low <= mounting.height <= high:
         found, expected = f"{mounting.height:.2f} m", f"{low:g} to {high:g} m above the ground"

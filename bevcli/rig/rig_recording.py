@@ -81,9 +81,9 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
     stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
     if pixels is not None:
         log_image(stream, camera.name, pixels)
-    points = overlay.pillars_in(camera, ego_from_bev)
-    radii = np.clip(60 / np.maximum(points.distances, 1e-3), 1.2, 6) * camera.width / 800
-    dots = rr.Points2D(points.pixels, colors=points.colors, radii=radii, draw_order=30)
+    points, distances, colors = overlay.pillars_in(camera, ego_from_bev)
+    radii = np.clip(60 / np.maximum(distances, 1e-3), 1.2, 6) * camera.width / 800
+    dots = rr.Points2D(points, colors=colors, radii=radii, draw_order=30)
     stream.log(entities.overlay(camera.name, "pillars"), dots, static=True)
     lines: dict[str, Lines] = {
         "ground_grid": (overlay.ground_lines(camera), (*overlay.GROUND, 120), 0.6),

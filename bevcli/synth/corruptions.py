@@ -67,8 +67,13 @@ LOW_LIGHT = {0: (0.6, 600, 0.008), 1: (0.5, 250, 0.012), 2: (0.4, 120, 0.018), 3
 
 def brightness(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
     """A brighter image: the value of HSV is raised and clipped; hue and saturation stay."""
+    return _with_hsv(pixels_bgr, 2, 1.0, BRIGHTNESS[level])
+
+
+def _with_hsv(pixels_bgr: Pixels, channel: int, factor: float, added: float) -> Pixels:
+    """The image with a channel of HSV multiplied and raised, and clipped to 0 to 1."""
     hsv = cv2.cvtColor(pixels_bgr.astype(np.float32) / 255, cv2.COLOR_BGR2HSV)
-    hsv[..., 2] = np.clip(hsv[..., 2] + BRIGHTNESS[level], 0, 1)
+    hsv[..., channel] = np.clip(factor * hsv[..., channel] + added, 0, 1)
     return to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR))
 
 
@@ -192,7 +197,4 @@ def jpeg(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixel
 
 def saturation(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
     """Pale (levels 1 and 2) or gaudy colours."""
-    factor, added = SATURATION[level]
-    hsv = cv2.cvtColor(pixels_bgr.astype(np.float32) / 255, cv2.COLOR_BGR2HSV)
-    hsv[..., 1] = np.clip(factor * hsv[..., 1] + added, 0, 1)
-    return to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR))
+    return _with_hsv(pixels_bgr, 1, *SATURATION[level])

@@ -15,7 +15,7 @@ from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.mesh import TriangleSoup
-from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground, true_lines
+from bevcli.synth.render.ground import GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.synth.render.lens import lens_parts
 from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_through_lens, render_view
@@ -86,7 +86,7 @@ class RenderedDrive:
         assets: the meshes, if they are built already.
         supersampling: samples per pixel along each axis (anti-aliasing).
         threads: number of cameras rendered in parallel.
-        map_window: extent and cell size of the ground truth maps.
+        map_half_extent_m: from the origin of the bev frame to each side of the ground truth maps, metres.
         camera_delays_s: camera name to the time of its images after that of the frame, 0 to 0.1 s; default: none.
     """
 
@@ -100,13 +100,13 @@ class RenderedDrive:
         assets: Assets | None = None,
         supersampling: int = 1,
         threads: int = 1,
-        map_window: MapWindow = MapWindow(),
+        map_half_extent_m: float = 32.0,
         camera_delays_s: Mapping[str, float] | None = None,
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
         self.rig = rig or nuscenes_like_rig(400, 225)
         self._lenses = {camera.name: lens_parts(camera) for camera in self.rig.cameras if camera.distortion}
-        self.map_window = map_window
+        self._map_half_extent_m = map_half_extent_m
         self._delays_s = camera_delays_s or {}
         self._supersampling, self._threads = supersampling, threads
         self._assets = assets or Assets.build()
@@ -114,7 +114,7 @@ class RenderedDrive:
         names = self._city.stream("weather-name")
         name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
         self.weather = make_weather(name, self._city.stream("weather"))
-        self.simulation = Simulation(self._city, self._assets.catalog, frames / rate_hz)
+        self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
         self._ground = GroundPlan(self._city)
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
@@ -173,8 +173,8 @@ class RenderedDrive:
         views = {name: views[name] for name in self.rig.names}
         boxes = self._boxes(states, views, pose)
         bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
-        pieces = self._ground.pieces_around(pose.translation[:2], self.map_window.half_extent_m * 1.5)
-        bev_map = draw_map(pieces, boxes, bev_from_world, self.map_window)
+        pieces = self._ground.pieces_around(pose.translation[:2], self._map_half_extent_m * 1.5)
+        bev_map = draw_map(pieces, boxes, bev_from_world, self._map_half_extent_m)
         poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
         times = {name: timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
         return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map, true_lines(pieces, bev_from_world))

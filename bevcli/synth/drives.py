@@ -19,7 +19,6 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
-from bevcli.synth.render.ground import MapWindow
 from bevcli.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
@@ -115,7 +114,7 @@ class RenderedDrives(FolderDrives):
         half_extent = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
         drive = RenderedDrive(
             seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn.rig, assets=self._assets,
-            supersampling=drawn.supersampling, map_window=MapWindow(half_extent), camera_delays_s=drawn.delays_s,
+            supersampling=drawn.supersampling, map_half_extent_m=half_extent, camera_delays_s=drawn.delays_s,
         )  # fmt: skip
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)

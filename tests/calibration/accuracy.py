@@ -67,7 +67,7 @@ def errors_of_drive(drive: Sequence, levels: list[int], seeds: list[int]) -> Ite
     for level in levels:
         for seed in seeds:
             noisy = _with_noise(drive, views, level, seed)
-            result = judge(drive, noisy, matches, measure(noisy, matches, options))
+            result = judge(drive, measure(noisy, matches, options))
             for right, estimate in zip(views.stated.cameras, result.cameras, strict=True):
                 yield _error(drive.name, level, seed, right, result, estimate)
 
@@ -97,7 +97,7 @@ def delays_of_drive(drive: Sequence, delays_ms: list[float]) -> Iterator[str]:
     for index, late_ms in enumerate(delays_ms):
         camera = views.rig.names[index % len(views.rig.names)]
         late = read_views(WrongTimes(drive, camera, late_ms), options.pairs)
-        found = judge(drive, late, matches, measure(late, matches, options))[camera]
+        found = judge(drive, measure(late, matches, options))[camera]
         turned = np.degrees(np.linalg.norm(found.change[:3]))
         yield (
             f"{drive.name} {camera}: planted {-late_ms:+.0f} ms, found {found.delay_ms:+.1f} ± "

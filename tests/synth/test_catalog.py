@@ -21,14 +21,14 @@ PLAUSIBLE = {
 
 @pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_there_are_enough_variants(assets: Assets, name: str):
-    looks = {v.name.removesuffix("_standing") for v in assets.catalog.by_class[name]}
+    looks = {v.name.removesuffix("_standing") for v in assets.by_class[name]}
     assert len(looks) >= (6 if name in VEHICLES else 4)
 
 
 @pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_sizes_are_plausible(assets: Assets, name: str):
     low, high = np.array(PLAUSIBLE[name])
-    for variant in assets.catalog.by_class[name]:
+    for variant in assets.by_class[name]:
         assert (variant.size_lwh > low).all(), variant.name
         assert (variant.size_lwh < high).all(), variant.name
 
@@ -36,7 +36,7 @@ def test_sizes_are_plausible(assets: Assets, name: str):
 @pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
     rng = np.random.default_rng(3)
-    for variant in assets.catalog.by_class[name]:
+    for variant in assets.by_class[name]:
         body = draw_body(variant, rng, "one")
         for pose in variant.poses:
             points = pose.fitted(body.size_lwh).faces.reshape(-1, 3)
@@ -48,7 +48,7 @@ def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
 @pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_meshes_have_no_holes_and_no_inverted_faces(assets: Assets, name: str):
     """From every side, the faces that point to the viewer cover the same area as all faces."""
-    for variant in assets.catalog.by_class[name]:
+    for variant in assets.by_class[name]:
         for pose in variant.poses:
             faces = pose.fitted(variant.size_lwh / variant.size_lwh.max()).faces
             for view in ((1, 0.3, 0.4), (-0.7, 1, 0.2), (0.2, -1, 1), (-1, -0.4, -0.6)):

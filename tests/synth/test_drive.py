@@ -151,14 +151,16 @@ def test_ego_motion_is_plausible_for_a_car(assets: Assets):
 
 def test_map_agrees_with_the_boxes(drive: RenderedDrive, frame: RenderedFrame):
     """The middle of every vehicle's box is a vehicle cell; moving and parked vehicles are on road cells."""
-    window = drive.map_window
+    bev_map = frame.bev_map
+    (x0, half), (_, y1), (cells, _) = bev_map.x_range_m, bev_map.y_range_m, bev_map.cells.shape
     bev = frame.boxes.transformed(inverse(frame.world_from_ego.matrix @ drive.rig.ego_from_bev))
-    near = (np.abs(bev.centers[:, :2]) < window.half_extent_m - 1).all(axis=1)
+    near = (np.abs(bev.centers[:, :2]) < half - 1).all(axis=1)
     vehicles = near & np.isin(bev.classes, ("car", "truck", "bus", "trailer", "motorcycle", "bicycle"))
     assert vehicles.sum() > 5
     for row in np.nonzero(vehicles)[0]:
-        column, line = np.round(window.pixels(bev.centers[row : row + 1]))[0].astype(int)
-        cell = frame.bev_map.cells[line, column]
+        x, y, _ = bev.centers[row]
+        column, line = int((x - x0) / (half - x0) * cells), int((y1 - y) / (y1 + half) * cells)
+        cell = bev_map.cells[line, column]
         assert cell & 8
         if bev.instances[row].startswith(("moving", "parked")):
             assert cell & 1

@@ -22,7 +22,7 @@ class EvenCity(CityPlan):
 
 def standing(city: CityPlan, assets: Assets) -> list[tuple[StandingActor, int, int, int]]:
     """The actors at the kerbs of 60 stretches, each with axis, street and crossing street."""
-    roadside = Roadside(city, assets.catalog)
+    roadside = Roadside(city, assets)
     stretches = [(axis, index, cross) for axis in (0, 1) for index in range(5) for cross in range(6)]
     return [(actor, *stretch) for stretch in stretches for actor in roadside.stretch(*stretch)]
 

@@ -1,6 +1,6 @@
 """The catalog of annotated objects: the variants of each class, and a drawn individual of a variant."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,43 +83,36 @@ _CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Colo
 }
 
 
-class Catalog:
-    """All variants by class. It does not depend on the drive."""
-
-    def __init__(self) -> None:
-        self.by_class: dict[str, tuple[Variant, ...]] = {}
-        for name, (looks, make, paints, dyes) in _CLASSES.items():
-            meshes = {look: joined(make(look)) for look in looks}
-            self.by_class[name] = tuple(
-                Variant(name, look, (mesh,), mesh.extents, OWN_PAINTS.get(look, paints), dyes)
-                for look, mesh in meshes.items()
-            )
-        # A walking person has two mirrored strides of the same size.
-        walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
-        self.by_class["pedestrian"] = (*walking, *standing)
-
-    def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
-        """Draw a variant of a class. names: draw from these variants only."""
-        choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
-        return choices[int(rng.integers(len(choices)))]
-
-
 @dataclass(frozen=True)
 class Assets:
     """The meshes that all drives share. Build them once and pass them to every drive.
 
     Attributes:
-        catalog: the annotated objects.
+        by_class: all variants of the annotated objects, by class.
         furniture: the repeated objects without annotations.
     """
 
-    catalog: Catalog
+    by_class: Mapping[str, tuple[Variant, ...]]
     furniture: StreetFurniture
 
     @staticmethod
     def build() -> "Assets":
         """Build every mesh. This takes about half a second."""
-        return Assets(Catalog(), StreetFurniture())
+        by_class: dict[str, tuple[Variant, ...]] = {}
+        for name, (looks, make, paints, dyes) in _CLASSES.items():
+            meshes = {look: joined(make(look)) for look in looks}
+            by_class[name] = tuple(
+                Variant(name, look, (mesh,), mesh.extents, OWN_PAINTS.get(look, paints), dyes)
+                for look, mesh in meshes.items()
+            )
+        # A walking person has two mirrored strides of the same size.
+        walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
+        return Assets({**by_class, "pedestrian": (*walking, *standing)}, StreetFurniture())
+
+    def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
+        """Draw a variant of a class. names: draw from these variants only."""
+        choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
+        return choices[int(rng.integers(len(choices)))]
 
 
 def _person(name: str, *strides: int) -> Variant:

@@ -87,45 +87,25 @@ def roughness() -> NDArray[np.float32]:
     return total.astype(np.float32)
 
 
+CELL_M = 0.25  # size of a cell of the map
 BOUNDARY_M = 0.5  # width of lane boundaries in the map; wider than their paint, so that no cell misses them
 
 
-@dataclass(frozen=True)
-class MapWindow:
-    """The square of the bev frame that a map covers.
-
-    Attributes:
-        half_extent_m: from the origin to each side, metres.
-        cell_m: size of a cell, metres.
-    """
-
-    half_extent_m: float = 32.0
-    cell_m: float = 0.25
-
-    @property
-    def cells(self) -> int:
-        """Number of cells along a side."""
-        return round(2 * self.half_extent_m / self.cell_m)
-
-    def pixels(self, points_bev: Array) -> Array:
-        """Column and row (P, 2) of points (P, 2 or 3) in the bev frame. (0, 0) is the middle of the first cell."""
-        columns = (points_bev[..., 0] + self.half_extent_m) / self.cell_m - 0.5
-        rows = (self.half_extent_m - points_bev[..., 1]) / self.cell_m - 0.5
-        return np.stack([columns, rows], -1)
-
-
-def draw_map(pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Array, window: MapWindow) -> BevMap:
-    """Draw the map.
+def draw_map(
+    pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Array, half_extent_m: float = 32.0
+) -> BevMap:
+    """Draw the map of a square of the bev frame.
 
     pieces: the painted ground around the vehicle. boxes_world: boxes in the world frame; only those of
-    VEHICLE_CLASSES are drawn. bev_from_world: (4, 4).
+    VEHICLE_CLASSES are drawn. bev_from_world: (4, 4). half_extent_m: from the origin to each side of the square.
     """
 
     def pixels(points: Array) -> Array:
-        world = np.column_stack([points[:, :2], np.zeros(len(points))])
-        return window.pixels(apply(bev_from_world, world))
+        """Column and row (P, 2); (0, 0) is the middle of the first cell."""
+        return (moved(bev_from_world, points) * (1, -1) + half_extent_m) / CELL_M - 0.5
 
-    layers = {name: np.zeros((window.cells, window.cells), np.uint8) for name in MAP_CLASSES}
+    side = round(2 * half_extent_m / CELL_M)
+    layers = {name: np.zeros((side, side), np.uint8) for name in MAP_CLASSES}
     for piece in pieces:
         for outline in piece.roads:
             fill(layers["drivable_road"], pixels(outline), 1)
@@ -133,14 +113,19 @@ def draw_map(pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Ar
             fill(layers["pedestrian_crossing"], pixels(outline), 1)
         for line in piece.lane_boundaries:
             fixed = np.round(pixels(line) * 2**SUBPIXEL_BITS).astype(np.int32)
-            width = max(round(BOUNDARY_M / window.cell_m), 1)
+            width = round(BOUNDARY_M / CELL_M)
             cv2.polylines(layers["lane_boundary"], [fixed], False, 1, width, cv2.LINE_8, SUBPIXEL_BITS)
     vehicles = boxes_world[np.isin(boxes_world.classes, VEHICLE_CLASSES)]
     for corners in vehicles.corners():
-        fill(layers["vehicle"], pixels(corners[:4]), 1)
+        fill(layers["vehicle"], pixels(corners[:4, :2]), 1)
     cells = sum((layer * MAP_CLASSES[name] for name, layer in layers.items()), np.zeros_like(layers["vehicle"]))
-    extent = (-window.half_extent_m, window.half_extent_m)
+    extent = (-half_extent_m, half_extent_m)
     return BevMap(cells.astype(np.uint8), extent, extent)
+
+
+def moved(bev_from_world: Array, points: Array) -> Array:
+    """Points (P, 2) of the ground, from the world frame to the bev frame."""
+    return apply(bev_from_world, np.pad(points, ((0, 0), (0, 1))))[:, :2]
 
 
 GAP_M = 0.05  # roads so near to each other are one
@@ -149,13 +134,10 @@ DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES
 
 def true_lines(pieces: list[GroundPiece], bev_from_world: Array) -> MapLines:
     """Lane dividers, pedestrian crossings (closed) and road boundaries, as by `lines_in_area`, bev frame."""
-
-    def moved(points: Array) -> Array:
-        return apply(bev_from_world, np.pad(points, ((0, 0), (0, 1))))[:, :2]
-
-    roads = union_all([Polygon(moved(road)).buffer(GAP_M) for piece in pieces for road in piece.roads]).buffer(-GAP_M)
+    outlines = [moved(bev_from_world, road) for piece in pieces for road in piece.roads]
+    roads = union_all([Polygon(outline).buffer(GAP_M) for outline in outlines]).buffer(-GAP_M)
     found: list[tuple[str, BaseGeometry]] = [(BOUNDARY, roads.boundary)]
     for piece in pieces:
-        found += [(DIVIDER, LineString(moved(line))) for line in piece.lane_boundaries]
-        found += [(CROSSING, Polygon(moved(outline)).boundary) for outline in piece.crossings]
+        found += [(DIVIDER, LineString(moved(bev_from_world, line))) for line in piece.lane_boundaries]
+        found += [(CROSSING, Polygon(moved(bev_from_world, outline)).boundary) for outline in piece.crossings]
     return lines_in_area(found)

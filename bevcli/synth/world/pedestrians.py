@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Body, Catalog, draw_body
+from bevcli.synth.assets.catalog import Assets, Body, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
 from bevcli.synth.world.route import DIRECTIONS, distances_along, node_center, points_at, street_of
@@ -76,7 +76,7 @@ class Walker:
         return ActorState(self.body, position, yaw, attribute, velocity, int(place / STRIDE_M) % 2)
 
 
-def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
+def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
     """People who walk around a block on its pavement. span_s: start and end of the simulation, seconds."""
     rng = city.stream("strollers", column, row)
     land = city.block(column, row)
@@ -91,13 +91,13 @@ def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], col
         lap = float(np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum())
         walked = (span_s[1] - span_s[0]) * speed
         path = np.concatenate([ring] * (int(np.ceil(walked / lap)) + 1) + [ring[:1]])
-        body = _person(catalog, rng, f"stroller-{column}-{row}-{k}")
+        body = _person(assets, rng, f"stroller-{column}-{row}-{k}")
         walkers.append(Walker(city, body, path, np.array(span_s), np.array([0.0, walked]), (-1.0, -1.0)))
     return walkers
 
 
 def crossers(
-    city: CityPlan, catalog: Catalog, signals: Signals, span_s: tuple[float, float], node: tuple[int, int]
+    city: CityPlan, assets: Assets, signals: Signals, span_s: tuple[float, float], node: tuple[int, int]
 ) -> list[Walker]:
     """People who cross a street at a junction, over the whole simulation.
 
@@ -108,13 +108,13 @@ def crossers(
     begin = span_s[0] - 30
     while begin < span_s[1]:
         name = f"crosser-{node[0]}-{node[1]}-{len(walkers)}"
-        walkers.append(_crosser(city, catalog, signals, node, begin, rng, name, len(walkers)))
+        walkers.append(_crosser(city, assets, signals, node, begin, rng, name, len(walkers)))
         begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
     return walkers
 
 
 def _crosser(
-    city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], begin: float,
+    city: CityPlan, assets: Assets, signals: Signals, node: tuple[int, int], begin: float,
     rng: np.random.Generator, name: str, index: int,
 ) -> Walker:  # fmt: skip
     """One person who walks to the kerb, waits for the signal, crosses the road and walks on.
@@ -138,11 +138,11 @@ def _crosser(
         start += 0.25
     start += rng.uniform(0, 1.0) if start > arrival else 0.0
     end = start + (2 * reach - kerb) / speed
-    body = _person(catalog, rng, name)
+    body = _person(assets, rng, name)
     times, places = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
     return Walker(city, body, path, times, places, (ALONG_PAVEMENT_M, far))
 
 
-def _person(catalog: Catalog, rng: np.random.Generator, name: str) -> Body:
+def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:
     names = [n for n in PERSON_NAMES if n != "worker"]
-    return draw_body(catalog.draw("pedestrian", rng, names), rng, name, 0.03, rng.uniform(0.94, 1.05))
+    return draw_body(assets.draw("pedestrian", rng, names), rng, name, 0.03, rng.uniform(0.94, 1.05))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Body, Catalog, draw_body
+from bevcli.synth.assets.catalog import Assets, Body, draw_body
 from bevcli.synth.assets.people import CYCLES, PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street, side_of
 from bevcli.synth.world.traffic import ActorState
@@ -33,8 +33,8 @@ class StandingActor(ActorState):
 class Roadside:
     """The standing actors of a city. They are made when they are first needed, and kept."""
 
-    def __init__(self, city: CityPlan, catalog: Catalog) -> None:
-        self.city, self.catalog = city, catalog
+    def __init__(self, city: CityPlan, assets: Assets) -> None:
+        self.city, self.assets = city, assets
         self.stretch = lru_cache(maxsize=None)(self._stretch)
         self.block = lru_cache(maxsize=None)(self._block)
 
@@ -59,7 +59,7 @@ class Roadside:
         names: Collection[str] | None = None,
     ) -> Body:
         """Draw a look, of those with these names, and an individual of it."""
-        return draw_body(self.catalog.draw(class_name, rng, names), rng, instance, spread)
+        return draw_body(self.assets.draw(class_name, rng, names), rng, instance, spread)
 
     def _kerbside(self, axis: int, index: int, cross: int, side: int) -> list[StandingActor]:
         """One side of a stretch. side: +1 or -1, the sign of the offset from the centre line."""
@@ -102,17 +102,17 @@ class Roadside:
         """
         start, end = closed
         edge, middle = street.half_width - 3.05, street.half_width - 1.4
-        barrier = self.catalog.draw("barrier", rng)
+        barrier = self.assets.draw("barrier", rng)
         for k, at in enumerate(np.arange(start + 4.0, end - 3.9, rng.choice([2.65, 2.65, 4.0]))):
             body = draw_body(barrier, rng, f"barrier-{name}-{k}", 0.02)
             yield self._stand(street, body, float(at), side * edge, np.pi / 2)
-        cone = self.catalog.draw("traffic_cone", rng)
+        cone = self.assets.draw("traffic_cone", rng)
         across = np.linspace(street.half_width - 0.3, edge + 0.1, 4)
         along = [*(start + 0.75 * np.arange(4)), *(end - 0.75 * np.arange(4))]
         for k, (at, offset) in enumerate(zip(along, [*across, *across], strict=True)):
             body = draw_body(cone, rng, f"cone-{name}-{k}", 0.03)
             yield self._stand(street, body, at, side * offset)
-        machines = [(v.name, v.size_lwh) for v in self.catalog.by_class["construction_vehicle"]]
+        machines = [(v.name, v.size_lwh) for v in self.assets.by_class["construction_vehicle"]]
         small = [look for look, size in machines if size[0] < end - start - 8 and size[1] < 2.72]
         machine = self._body("construction_vehicle", rng, f"machine-{name}", names=small)
         space = (start + 4 + machine.size_lwh[0] / 2, end - 4 - machine.size_lwh[0] / 2)
@@ -199,7 +199,7 @@ class Roadside:
 
     def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> Iterator[StandingActor]:
         """Barriers along the edges of a rectangle of the plan, with gaps."""
-        barrier = self.catalog.draw("barrier", rng)
+        barrier = self.assets.draw("barrier", rng)
         for side in range(4):
             start, way, _, length = side_of(low, high, side)
             for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Catalog, draw_body
+from bevcli.synth.assets.catalog import Assets, draw_body
 from bevcli.synth.assets.people import RIDDEN
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
 from bevcli.synth.world.pedestrians import Walker, crossers, strollers
@@ -28,8 +28,8 @@ SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
 class VehicleSpawner:
     """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
 
-    def __init__(self, city: CityPlan, catalog: Catalog, route_m: float) -> None:
-        self.city, self.catalog, self.route_m = city, catalog, route_m
+    def __init__(self, city: CityPlan, assets: Assets, route_m: float) -> None:
+        self.city, self.assets, self.route_m = city, assets, route_m
         self._rng = city.stream("population")
         self._count = 0
 
@@ -82,7 +82,7 @@ class VehicleSpawner:
         return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
 
     def _units(self, bicycle: bool) -> tuple[Unit, ...]:
-        rng, draw = self._rng, self.catalog.draw
+        rng, draw = self._rng, self.assets.draw
         class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
         self._count += 1
         name = f"moving-{self._count}"
@@ -135,17 +135,17 @@ class EgoTrack:
 class Simulation:
     """All actors of a drive of `duration_s` seconds. The same city gives the same simulation."""
 
-    def __init__(self, city: CityPlan, catalog: Catalog, duration_s: float) -> None:
-        self.city, self.catalog = city, catalog
-        self.roadside = Roadside(city, catalog)
+    def __init__(self, city: CityPlan, assets: Assets, duration_s: float) -> None:
+        self.city, self.assets = city, assets
+        self.roadside = Roadside(city, assets)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
-        self.spawner = VehicleSpawner(city, catalog, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
-        self.ego_body = draw_body(catalog.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
+        self.spawner = VehicleSpawner(city, assets, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
+        self.ego_body = draw_body(assets.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
         self._ego = self.spawner.spawn_ego((Unit(self.ego_body, 0.0),))
         first = self._ego.route.passes[0]
         self.signals = Signals(city, (first.node, first.direction % 2))
-        self._crossers = lru_cache(maxsize=None)(partial(crossers, city, catalog, self.signals, self.span_s))
-        self._strollers = lru_cache(maxsize=None)(partial(strollers, city, catalog, self.span_s))
+        self._crossers = lru_cache(maxsize=None)(partial(crossers, city, assets, self.signals, self.span_s))
+        self._strollers = lru_cache(maxsize=None)(partial(strollers, city, assets, self.span_s))
         self._driving: list[DrivingActor] = []
         self._run()
         self.ego = _smoothed(self._ego)

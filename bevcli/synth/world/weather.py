@@ -24,21 +24,17 @@ class Weather:
             the sun, from above and, reflected by the ground, from below; the colours of the sky overhead and at the
             horizon; the colours of the haze and of the clouds.
         clouds: (512, 512) cloud cover, 0 to 1, on a horizontal plane; it repeats in both directions.
-        haze_m: distance after which about 63 % of the light comes from the haze, metres.
-        lamps: brightness of lamps and lit windows, relative.
-        shadow_softness_m: width of the edge of shadows, metres.
+        kind: the numbers of its name.
     """
 
     name: str
     to_sun: NDArray[np.float64]
     light: NDArray[np.float64]
     clouds: NDArray[np.float32]
-    haze_m: float
-    lamps: float
-    shadow_softness_m: float
+    kind: "WeatherKind"
 
 
-class _Kind(NamedTuple):
+class WeatherKind(NamedTuple):
     """The numbers of one kind of weather. A range is drawn uniformly; a number is taken as it is."""
 
     elevation: Range | float  # of the sun, radians
@@ -49,21 +45,21 @@ class _Kind(NamedTuple):
     horizon: Color
     cloud: Color
     cloud_threshold: Range | float  # noise above it is cloud, 0 to 1
-    haze_m: float
-    lamps: float
-    shadow_softness_m: float
+    haze_m: float  # distance after which about 63 % of the light comes from the haze, metres
+    lamps: float  # brightness of lamps and lit windows, relative
+    shadow_softness_m: float  # width of the edge of shadows, metres
 
 
 _KINDS = {
-    "noon": _Kind(
+    "noon": WeatherKind(
         (0.65, 1.05), (1.0, 0.95, 0.86), 1.25, (0.32, 0.39, 0.50),
         (84, 136, 206), (190, 212, 232), (255, 255, 255), (0.45, 0.62), 420.0, 0.5, 0.05,
     ),
-    "evening": _Kind(
+    "evening": WeatherKind(
         (0.22, 0.38), (1.0, 0.70, 0.42), 0.95, (0.26, 0.28, 0.38),
         (92, 118, 178), (250, 206, 160), (255, 214, 178), (0.42, 0.6), 300.0, 1.2, 0.12,
     ),
-    "overcast": _Kind(
+    "overcast": WeatherKind(
         1.35, (0.95, 0.98, 1.0), 0.22, (0.50, 0.53, 0.57),
         (150, 158, 168), (205, 210, 214), (222, 226, 230), 0.2, 230.0, 0.8, 0.8,
     ),
@@ -86,9 +82,7 @@ def make_weather(name: str, rng: np.random.Generator) -> Weather:
         np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
         np.array([sun, sky, bounce, linear(kind.zenith), horizon, haze, linear(kind.cloud)], np.float64),
         _clouds(rng, _drawn(kind.cloud_threshold, rng)),
-        kind.haze_m,
-        kind.lamps,
-        kind.shadow_softness_m,
+        kind,
     )
 
 
