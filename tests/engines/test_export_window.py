@@ -167,6 +167,7 @@ def test_commands_export_check_and_time_a_window(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # each of its steps takes seconds in both programs
 def test_the_published_window_equals_ours_over_a_real_drive(shared, tmp_path):
     drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
     model = Model(original.rule_model_v2("v2-t2"))
