@@ -200,24 +200,6 @@ def split_heads(tokens: Tensor, heads: int) -> Tensor:
     return tokens.unflatten(-1, (heads, -1)).transpose(1, 2)
 
 
-@dataclass(frozen=True)
-class PanopticMap:
-    """The class, and for vehicles the instance, of every cell of the map; rows from the smallest y.
-
-    Attributes:
-        stuff: (classes, rows, columns) bool, in the order of STUFF_CLASSES; a cell may have several classes, such as
-            a pedestrian crossing on a road.
-        things: (rows, columns) int64, the thing query of the vehicle in a cell, -1 for no vehicle.
-    """
-
-    stuff: NDArray[np.bool_]
-    things: NDArray[np.int64]
-
-    def bev_map(self, grid: BevGrid) -> BevMap:
-        """The classes without instances, rows from the largest y. grid: gives the ranges that the map covers."""
-        return map_of_layers([*self.stuff, self.things >= 0], (*STUFF_CLASSES, THING_CLASS), grid)
-
-
 def map_of_layers(layers: Sequence[NDArray[np.bool_]], classes: Sequence[str], grid: BevGrid) -> BevMap:
     """The map of classes with the cells (rows, columns) each, rows from the smallest y."""
     bits, cells = class_bits(classes), np.zeros(layers[0].shape, dtype=np.uint8)
@@ -226,8 +208,10 @@ def map_of_layers(layers: Sequence[NDArray[np.bool_]], classes: Sequence[str], g
     return BevMap(cells[::-1].copy(), grid.x_range_m, grid.y_range_m, bits)
 
 
-def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: BevGrid) -> PanopticMap:
+def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: BevGrid) -> BevMap:
     """The masks of the last layer, for a batch of one, merged to one map, `map_scale` times as fine as the grid.
+
+    A cell may have several classes, such as a pedestrian crossing on a road.
 
     The probability of a query in a cell is its class probability times its mask's value (MaskFormer, Cheng et al.
     2021). Panoptic SegFormer instead takes whole masks above 0.5. Focal loss gives small vehicles mask values that
@@ -237,7 +221,8 @@ def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: B
     probabilities = masks * outputs.class_logits[-1, 0].detach().float().sigmoid()[..., None, None]
     count = len(STUFF_CLASSES)
     stuff = _upsampled(probabilities[:count], config.map_scale) > config.min_stuff
-    return PanopticMap(stuff.cpu().numpy(), assign_cells(probabilities[count:], config.min_thing, config.map_scale))
+    things = assign_cells(probabilities[count:], config.min_thing, config.map_scale)
+    return map_of_layers([*stuff.cpu().numpy(), things >= 0], (*STUFF_CLASSES, THING_CLASS), grid)
 
 
 def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[np.int64]:

@@ -75,8 +75,7 @@ class TemporalModel(nn.Module):
         """The map of the ground, or None."""
         if outputs.segmentation is None:
             return None
-        grid = self.config.bev_grid
-        return decode_map(outputs.segmentation, self.config.segmentation, grid).bev_map(grid)
+        return decode_map(outputs.segmentation, self.config.segmentation, self.config.bev_grid)
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         """The further results, of the types of `ModelConfig.results`."""

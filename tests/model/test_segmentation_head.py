@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from small_model import small_config, small_inputs, small_model
@@ -12,7 +11,6 @@ from small_model import small_config, small_inputs, small_model
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.segmentation import (
     MaskDecoderLayer,
-    PanopticMap,
     SegmentationConfig,
     SegmentationHead,
     SegmentationOutputs,
@@ -86,7 +84,7 @@ def test_a_probability_is_class_times_mask() -> None:
     masks, classes = torch.full((1, 1, 4, 1), 0.5).logit(), torch.tensor([0.9, 0.7, 0.7, 0.3]).logit()[None, None]
     outputs = SegmentationOutputs(masks, classes, torch.zeros(1, 1, 1, 4))
     one = decode_map(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))
-    assert (one.stuff.ravel().tolist(), one.things.tolist()) == ([True, False, False], [[-1]])
+    assert one.cells.tolist() == [[1]]  # the road alone: neither another class nor a vehicle
 
 
 def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:
@@ -96,17 +94,16 @@ def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:
     logits[0, 0, 2, 1] = 9.0  # a crossing on it
     logits[0, 0, 4, [1, 4]] = 9.0  # a vehicle on both rows
     outputs = SegmentationOutputs(logits, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
-    panoptic = decode_map(outputs, SegmentationConfig(map_scale=1), grid)
-    assert panoptic.things.tolist() == [[-1, 1, -1], [-1, 1, -1]]
-    bev_map = panoptic.bev_map(grid)
+    bev_map = decode_map(outputs, SegmentationConfig(map_scale=1), grid)
     assert bev_map.cells.tolist() == [[0, 8, 0], [1, 1 + 4 + 8, 1]]
     assert (bev_map.x_range_m, bev_map.y_range_m) == ((-3, 3), (-2, 2))
 
 
 def test_a_cell_may_have_several_classes() -> None:
-    stuff = np.array([[[True, True]], [[True, False]], [[False, False]]])
-    panoptic = PanopticMap(stuff, np.array([[4, 7]]))
-    assert panoptic.bev_map(BevGrid(1, 2)).cells.tolist() == [[1 + 2 + 8, 1 + 8]]
+    masks = torch.tensor([[9.0, 9.0], [9.0, -9.0], [-9.0, -9.0], [9.0, -9.0], [-9.0, 9.0]])[None, None]
+    outputs = SegmentationOutputs(masks, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
+    one = decode_map(outputs, SegmentationConfig(map_scale=1), BevGrid(1, 2))
+    assert one.cells.tolist() == [[1 + 2 + 8, 1 + 8]]
 
 
 def test_heads_without_detection_are_an_error() -> None:
