@@ -14,6 +14,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
+from bevcli.writing import output_errors
 
 OWN = ".bevcli"
 SUMMARY = "summary.json"
@@ -40,17 +41,14 @@ class RunFolder:
         out = self.path
         if out.exists() and not out.is_dir():
             raise OutputError(f"{out}: is a file (expected a folder to write to)")
-        with self._stack:  # unlocks the folder if this fails
-            try:
-                if out.exists() and not (self._force or self._resume or self._has_no_run()):
-                    raise OutputError(
-                        f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
-                        "interrupted run, or `out=DIR` for another folder"
-                    )
-                self._stack.enter_context(folder_lock(out))
-                self._names = set(self._read_written())
-            except OSError as error:
-                raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+        with self._stack, output_errors(out):  # unlocks the folder if this fails
+            if out.exists() and not (self._force or self._resume or self._has_no_run()):
+                raise OutputError(
+                    f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
+                    "interrupted run, or `out=DIR` for another folder"
+                )
+            self._stack.enter_context(folder_lock(out))
+            self._names = set(self._read_written())
             self._stack = self._stack.pop_all()
         return self
 
@@ -85,12 +83,10 @@ class RunFolder:
         """Remove the files that earlier runs wrote, and nothing else. Raises OutputError."""
         named = [path for name in self._names for path in (self.path / name, partial_path(self.path / name))]
         files = [path for path in named if self._holds(path)]
-        try:
-            for path in (*files, self.state_path, self.path / OWN / "written"):
+        for path in (*files, self.state_path, self.path / OWN / "written"):
+            with output_errors(path, "removed"):
                 if path.is_file() or path.is_symlink():
                     path.unlink()
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
         self._names = set()
 
     def _holds(self, path: Path) -> bool:
@@ -121,14 +117,12 @@ def folder_lock(out: Path) -> Iterator[None]:
     if (out / OWN).is_symlink():
         raise OutputError(f"{out / OWN}: is a link (expected a folder): remove it")
     with contextlib.ExitStack() as stack:
-        try:
+        with output_errors(out):
             (out / OWN).mkdir(parents=True, exist_ok=True)
             lock = stack.enter_context(_locked(out / OWN / "lock", out))
             stack.callback(_remove, lock.name)
             if sys.platform != "win32":
                 stack.callback(os.close, _locked_folder(out))
-        except OSError as error:
-            raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
         yield
 
 

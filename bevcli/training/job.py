@@ -27,6 +27,7 @@ from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.warm_start import WarmStart, warm_start
 from bevcli.weights.fetch import weights_file
+from bevcli.writing import output_errors
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,8 @@ def prepare_training(
     if options.weights is not None and not options.resume:
         started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
     if not options.resume:
-        make_folder(out)
+        with output_errors(out, "made"):
+            out.mkdir(parents=True, exist_ok=True)
     group = join_process_group(device)
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
@@ -268,11 +270,3 @@ def check_folder(out: Path, *, resume: bool) -> None:
         raise OutputError(
             f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
         )
-
-
-def make_folder(out: Path) -> None:
-    """Makes the output folder. Raises OutputError if this is not possible."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be made ({error.strerror})") from None
