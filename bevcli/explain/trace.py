@@ -18,7 +18,6 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
-from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, SceneAttention
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.sequences.selection import scenes_of
@@ -191,17 +190,10 @@ def _traced_step(
         layer_maps=tuple(outputs[layer][0] for layer in model.encoder.layers),
         aligned_history=None if history is None else history[0],
         first_reference_points=model.decoder.reference_points(position).sigmoid(),
-        visible=_visible_points(inputs, config),
+        visible=model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).visible[0],
         cell=cell,
         attentions=model.scene_attentions(outputs[model], (float(x), float(y))),
     )
-
-
-def _visible_points(inputs: ModelInputs, config: ModelConfig) -> Tensor:
-    """(N, Y·X, Z) bool, which pillar points each camera sees."""
-    points = torch.as_tensor(config.bev_grid.pillars(), dtype=torch.float32, device=inputs.images.device)
-    height, width = inputs.images.shape[-2:]
-    return project_pillars(inputs.image_from_bev, points.flatten(0, 1), (height, width), inputs.has_image).visible[0]
 
 
 @contextmanager
