@@ -16,7 +16,6 @@ from bevcli.model.vad.config import LossWeights
 from bevcli.model.vad.line_decoder import LineDecoderConfig, LineOutputs
 from bevcli.model.vad.line_loss import LineTargets, line_losses, line_targets
 from bevcli.model.vad.losses import (
-    Scene,
     boundary_loss,
     collision_loss,
     crosses,
@@ -162,6 +161,6 @@ def test_a_path_is_along_the_divider_beside_it() -> None:
 def test_the_loss_of_a_path_is_the_mean_over_known_steps() -> None:
     driven = np.array([[1.0, 2.0], [1.0, 5.0], [np.nan, np.nan]])
     truth = FrameTruth(Boxes3D.empty(), MapLines((), np.zeros(0, dtype=np.str_)), driven, "straight")
-    nothing = Scene(*(torch.zeros(0, 3, 2) for _ in range(3)))
+    nothing = [torch.zeros(0, 3, 2)] * 3
     offsets = torch.tensor([[1.0, 2.0], [0.5, 4.0], [9.0, 9.0]])
-    assert path_losses(offsets, truth, nothing).tolist() == pytest.approx([(0.5 + 1) / 2 / 3, 0, 0, 0])
+    assert path_losses(offsets, truth, *nothing).tolist() == pytest.approx([(0.5 + 1) / 2 / 3, 0, 0, 0])

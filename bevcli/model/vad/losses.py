@@ -4,7 +4,6 @@ The constraints know the scene from the model's own lines and futures, which the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -86,21 +85,6 @@ def best_modes(offsets: Tensor, true: Tensor, known: Tensor) -> Tensor:
     return summed.norm(dim=-1).argmin(-1)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The lines and vehicles around one planned path, bev frame, metres.
-
-    Attributes:
-        boundaries: (L, P, 2).
-        dividers: (D, P, 2).
-        vehicles: (V, T, 2) places of vehicles in their best futures.
-    """
-
-    boundaries: Tensor
-    dividers: Tensor
-    vehicles: Tensor
-
-
 def plan_losses(outputs: VADOutputs, truths: Sequence[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
     """The weighted scalar losses of the paths of the commands that were followed.
 
@@ -111,25 +95,28 @@ def plan_losses(outputs: VADOutputs, truths: Sequence[FrameTruth], config: VADCo
     for element, truth in enumerate(truths):
         if truth.command in commands:
             offsets = outputs.plan[element, commands.index(truth.command)]  # (T, 2)
-            totals = totals + path_losses(offsets, truth, scene_of(outputs, element, config)) / len(truths)
+            totals = totals + path_losses(offsets, truth, *scene_of(outputs, element, config)) / len(truths)
     shares = totals.new_tensor([weights.plan / len(commands), weights.boundary, weights.collision, weights.direction])
     names = ("plan", "plan boundaries", "plan collisions", "plan directions")
     return dict(zip(names, totals * shares, strict=True))
 
 
-def path_losses(offsets: Tensor, truth: FrameTruth, scene: Scene) -> Tensor:
-    """(4,) mean L1 distance of the movements, and the means of the constraints."""
+def path_losses(offsets: Tensor, truth: FrameTruth, boundaries: Tensor, dividers: Tensor, vehicles: Tensor) -> Tensor:
+    """(4,) mean L1 distance of the movements (T, 2), and the means of the constraints. The others: see `scene_of`."""
     driven = torch.tensor(truth.driven, dtype=torch.float32, device=offsets.device)
     true = torch.cat([driven.new_zeros(1, 2), driven]).diff(dim=0)
     known, path = true.isfinite().all(-1), offsets.cumsum(0)
     errors = (offsets - true.nan_to_num()).abs().mean(-1)
-    boundaries, collisions = boundary_loss(path, scene.boundaries), collision_loss(path, scene.vehicles).mean(-1)
-    return (torch.stack([errors, boundaries, collisions, direction_loss(path, scene.dividers)]) * known).mean(-1)
+    along, apart = direction_loss(path, dividers), collision_loss(path, vehicles).mean(-1)
+    return (torch.stack([errors, boundary_loss(path, boundaries), apart, along]) * known).mean(-1)
 
 
 @torch.no_grad()
-def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> Scene:
-    """The surroundings of a frame as the model sees them."""
+def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """The surroundings of a frame as the model sees them, bev frame, metres.
+
+    Boundaries (L, P, 2), dividers (D, P, 2), and places of vehicles in their best futures (V, T, 2).
+    """
     start = torch.tensor([config.bev_grid.x_range_m[0], config.bev_grid.y_range_m[0]], device=outputs.plan.device)
     lines = outputs.lines.points[-1, element] * _extent(config, start.device) + start  # (N, P, 2)
     scores, classes = outputs.lines.class_logits[-1, element].sigmoid(), config.line_decoder.classes
@@ -143,7 +130,7 @@ def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> Scene:
     modes = outputs.motion.mode_logits[element, seen].argmax(-1)
     offsets = outputs.motion.offsets[element, seen, modes]  # (V, T, 2)
     vehicles = outputs.box_codes[-1, element, seen, None, :2] + offsets.cumsum(1)
-    return Scene(sure(BOUNDARY), sure(DIVIDER), vehicles)
+    return sure(BOUNDARY), sure(DIVIDER), vehicles
 
 
 def _extent(config: VADConfig, device: torch.device) -> Tensor:
