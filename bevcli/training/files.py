@@ -11,7 +11,7 @@ import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import safetensors.torch
 import torch
@@ -93,29 +93,35 @@ def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
 
 
 class LearningCurve:
-    """A CSV file with a column `step` and one row a step.
+    """A CSV file with a column `step` and one row a step, and TensorBoard's curves of the same numbers.
 
     Attributes:
         path: the file.
         rows: its rows.
     """
 
-    def __init__(self, path: Path, done: int = 0) -> None:
+    def __init__(self, path: Path, done: int = 0, group: str = "", events: Any = None) -> None:
         """Opens the file of a resumed training, or starts a new one.
 
         done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
+        group: of the curves in TensorBoard, before their names. events: of `event_writer`; None for no such curves.
         Raises OutputError, and InputError for a damaged file.
         """
-        self.path = path
+        self.path, self._group, self._events = path, group, events
         self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []
         with whole_file(path) as unfinished:
             _write(unfinished, self.rows, "w")
 
     def add(self, step: int, numbers: Row) -> None:
-        """Appends a row and writes it to the file at once."""
+        """Appends a row and writes it to the files at once, finite numbers only for TensorBoard."""
         row = {"step": step, **numbers}
         _write(self.path, [row], "a", header=not self.rows)
         self.rows.append(row)
+        if self._events is not None:
+            for name, value in numbers.items():
+                if math.isfinite(value):
+                    self._events.add_scalar(f"{self._group}/{name}", value, step)
+            self._events.flush()
 
 
 def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
@@ -185,18 +191,11 @@ def require_tensorboard() -> None:
         raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
 
 
-class TensorBoardLog:
-    """Event files in a folder: `tensorboard --logdir FOLDER` draws them, also while the training runs."""
+def event_writer(folder: Path, done: int) -> Any:
+    """A writer of event files: `tensorboard --logdir FOLDER` draws them, also while the training runs.
 
-    def __init__(self, folder: Path, done: int) -> None:
-        """done: steps done. TensorBoard hides later ones, of an interrupted training."""
-        from torch.utils.tensorboard import SummaryWriter
+    done: steps done. TensorBoard hides later ones, of an interrupted training.
+    """
+    from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
-
-    def add(self, step: int, group: str, numbers: Mapping[str, float]) -> None:
-        """Write the finite numbers of a step as curves group/name, to the file at once."""
-        for name, value in numbers.items():
-            if math.isfinite(value):
-                self._writer.add_scalar(f"{group}/{name}", value, step)
-        self._writer.flush()
+    return SummaryWriter(str(folder), purge_step=done + 1 if done else None)

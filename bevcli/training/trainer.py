@@ -159,9 +159,9 @@ class Trainer:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
-            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done)
-            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done)
-        self._log = files.TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
+            events = files.event_writer(job.out / "tensorboard", self.done) if job.log else None
+            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done, "training", events)
+            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done, "validation", events)
 
     def run(
         self,
@@ -187,7 +187,6 @@ class Trainer:
             last, stopped = self.done == config.steps, stop()
             if job.group.leads:
                 self._loss_curve.add(self.done, row)
-                self._add_to_log("training", row)
                 if self.done % config.evaluate_every == 0 or last:
                     after_validation(self.done, self._validate())
                 if self.done % config.checkpoint_every == 0 or last or stopped:
@@ -278,15 +277,10 @@ class Trainer:
         runner = Runner(model, job.device, options)
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
-        self._add_to_log("validation", scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
         files.save_weights(job.out / "weights.safetensors", model, dtype)
         files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
-
-    def _add_to_log(self, group: str, row: Mapping[str, float]) -> None:
-        if self._log is not None:
-            self._log.add(self.done, group, row)
 
 
 def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:
