@@ -34,7 +34,6 @@ def validate(
     """
     from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
-    from bevcli.inference.runner import Runner, StepOptions
     from bevcli.synth.drives import count_frames
     from bevcli.synth.splits import scored_drives
     from bevcli.training.drive_checks import check_scored_drives
@@ -48,9 +47,7 @@ def validate(
     if loaded.choice is not None:
         loaded = in_engine_with_bar(loaded, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
-    tracker = loaded.tracker if options.tracking else None
-    asked = StepOptions(loaded.precision, run_options.temporal, tracker=tracker)
-    runner = Runner(loaded.prepared, loaded.device, asked)
+    runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
     with Progress(count_frames(drives), "frames", notes) as progress:
         scores = validate_model(
             runner,

@@ -21,6 +21,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.engine_choice import EngineChoice, engine_choice
 from bevcli.inference.options import AUTO, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
+from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, rig_notes
 from bevcli.model.config import ModelConfig
@@ -136,6 +137,11 @@ class Model:
             return self.network
         assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
+
+    def runner(self, *, track: bool, **asked: Any) -> Runner:
+        """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
+        options = StepOptions(self.precision, tracker=self.tracker if track else None, **asked)
+        return Runner(self.prepared, self.device, options)
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:

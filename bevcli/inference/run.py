@@ -7,7 +7,6 @@ from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, StepOptions
 
 
 def run(
@@ -46,15 +45,7 @@ def run(
             attention of an exported file is asked for.
     """
     model = in_engine(model, sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
-    asked = StepOptions(
-        model.precision,
-        temporal,
-        ask_attention=attention or bool(probes),
-        probes=tuple(probes),
-        commands=read_commands(command, model.config),
-        track=track,
-        tracker=model.tracker if track else None,
-    )
-    runner, places = Runner(model.prepared, model.device, asked), range(len(sequence.stamps))
-    steps = runner.run(sequence, places, Preprocessor(model.config, cameras))
+    asked = {"ask_attention": attention or bool(probes), "probes": tuple(probes)}
+    runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
+    steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config, cameras))
     return ((frame, prediction) for frame, prediction, _ in steps)

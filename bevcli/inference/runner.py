@@ -50,8 +50,7 @@ class StepOptions:
         ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
         commands: of the driver, for a model that plans.
-        track: whether boxes keep the identities that a model with history may give them.
-        tracker: gives identities to the boxes of other models; None for no tracker.
+        tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
     """
 
     precision: Precision | Literal["int8"] = "fp32"
@@ -59,7 +58,6 @@ class StepOptions:
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
     commands: Commands = ()
-    track: bool = True
     tracker: TrackerConfig | None = None
 
 
@@ -159,7 +157,7 @@ class Runner:
     @property
     def tracks(self) -> bool:
         """The boxes have identities, those of the model's own tracks."""
-        return self.options.track and self.options.temporal and self.config.has_tracks
+        return self.options.tracker is not None and self.options.temporal and self.config.has_tracks
 
     def _restarted(self, state: RunnerState[Any]) -> RunnerState[Any]:
         """The state before a frame without history: what the model keeps over scenes, and the tracks."""

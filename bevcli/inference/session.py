@@ -17,7 +17,7 @@ from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, RunnerState, StepOptions
+from bevcli.inference.runner import RunnerState
 
 ColorOrder = Literal["bgr", "rgb"]
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
@@ -86,9 +86,8 @@ class Session:
         self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
-        commands, tracker = read_commands(command, model.config), model.tracker if track else None
-        options = StepOptions(model.precision, temporal, commands=commands, track=track, tracker=tracker)
-        self._runner = Runner(model.prepared, model.device, options)
+        commands = read_commands(command, model.config)
+        self._runner = model.runner(track=track, temporal=temporal, commands=commands)
         self._prepare = self._runner.preparation(Preprocessor(model.config, cameras))
         self._state: RunnerState[Any] = RunnerState()
         self._poses = RecentPoses()

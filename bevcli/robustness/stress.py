@@ -17,7 +17,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.robustness.conditions import Condition, choose_conditions
 from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults, read_results
@@ -194,7 +194,7 @@ class _Test:
         """The predicted boxes and the ground truth of each frame that has any."""
         model = self.model
         if self.runner is None:
-            self.runner = Runner(model.prepared, model.device, StepOptions(model.precision, self.options.temporal))
+            self.runner = model.runner(track=False, temporal=self.options.temporal)
         steps = self.runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:

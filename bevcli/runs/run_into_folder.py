@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, RunnerState, StepOptions
+from bevcli.inference.runner import RunnerState
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.check_drive import CheckedDrive
@@ -22,6 +22,8 @@ from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.runs.state import START_ANEW, RunState, StateSaver, run_facts, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
+
+Steps = Iterator[tuple[Frame, Prediction, RunnerState[Any]]]  # of `Runner.run`
 
 
 def run_into_folder(
@@ -63,19 +65,11 @@ def run_into_folder(
     """
     options = RunOptions() if options is None else options
     model = in_engine(model, sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
-    asked = StepOptions(
-        model.precision,
-        options.temporal,
-        ask_attention=options.recording.shows_internals,
-        probes=tuple(options.recording.probes),
-        commands=read_commands(options.command, model.config),
-        track=options.track,
-        tracker=model.tracker if options.track else None,
-    )
+    commands, probes = read_commands(options.command, model.config), tuple(options.recording.probes)
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands)}
+        facts = run_facts(model, sequence, options) | {"commands": str(commands)}
         memory = model_class(model.config).memory_type
         state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
         if resume and state is None and folder.has_files():
@@ -90,9 +84,17 @@ def run_into_folder(
         summary = RunSummary(model, checked, options, state.counts)
         folder.add(out / SUMMARY)
         files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
-        began_at = state.frames
+        saver, began_at = StateSaver(folder.state_path, facts, files, summary), state.frames
+
+        def steps(before: RunnerState[Any]) -> Steps:
+            """The remaining frames; the model is prepared when the first of them is asked for."""
+            asked = {"ask_attention": options.recording.shows_internals, "probes": probes, "commands": commands}
+            runner = model.runner(track=options.track, temporal=options.temporal, **asked)
+            places = range(began_at, len(sequence.stamps))
+            yield from runner.run(sequence, places, Preprocessor(model.config, options.cameras), before)
+
         try:
-            _run_from(state, model, sequence, options, asked, folder, files, summary, after_frame, should_stop)
+            _write_steps(steps(state.runner), files, summary, saver, after_frame, should_stop)
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())
@@ -106,27 +108,16 @@ def run_into_folder(
     return summary
 
 
-def _run_from(
-    state: RunState[Any],
-    model: Model,
-    sequence: Sequence,
-    options: RunOptions,
-    asked: StepOptions,
-    folder: RunFolder,
+def _write_steps(
+    steps: Steps,
     files: RunFiles,
     summary: RunSummary,
+    saver: StateSaver,
     after_frame: Callable[[Frame, Prediction], None],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Run the frames after a state, write them, and save the state."""
-    saver = StateSaver(folder.state_path)
-    start, latest, is_whole = state.frames, state.runner, True
-
-    def save() -> None:
-        parts = files.state()
-        if parts is not None:
-            kept = RunnerState() if summary.is_complete else latest  # nothing comes after the last frame
-            saver.save(RunState(state.facts, parts, summary.counts, kept))
+    """Write frames as they are made, count them, and save the state."""
+    start, latest, is_whole = summary.frames, RunnerState[Any](), True
 
     def write(step: tuple[Frame, Prediction, RunnerState[Any]]) -> float:
         """The seconds that writing the frame took."""
@@ -138,17 +129,15 @@ def _run_from(
     with files:
         try:
             began = time.perf_counter()
-            runner, places = Runner(model.prepared, model.device, asked), range(start, len(sequence.stamps))
-            steps = runner.run(sequence, places, Preprocessor(model.config, options.cameras), latest)
             for (frame, prediction, after), recording_s in write_behind(write, steps):
                 now = time.perf_counter()
                 summary.add(frame, prediction, recording_s=recording_s, whole_s=now - began)
                 latest, is_whole, began = after, True, now
                 if saver.is_due(latest):
-                    save()
+                    saver.save(latest)
                 after_frame(frame, prediction)
                 if should_stop():
                     break
         finally:
             if is_whole and summary.frames not in (start, saver.saved_frames):
-                save()
+                saver.save(latest)

@@ -26,9 +26,9 @@ from bevcli.inference.runner import Memory, RunnerState
 from bevcli.inference.transfer import tensors_in
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.pth import read_safetensors
-from bevcli.runs.files import FilesState
+from bevcli.runs.files import FilesState, RunFiles
 from bevcli.runs.folder import RunFolder
-from bevcli.runs.summary import Counts
+from bevcli.runs.summary import Counts, RunSummary
 from bevcli.writing import write_whole
 
 FORMAT = "bevcli-state/5"
@@ -114,8 +114,8 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
 class StateSaver:
     """Saves the state of a run as often as SHARE of its time allows."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, facts: Mapping[str, str], files: RunFiles, summary: RunSummary) -> None:
+        self._path, self._facts, self._files, self._summary = path, facts, files, summary
         self._began = time.perf_counter()
         self._spent_s = 0.0
         self._longest_s: float | None = None
@@ -127,9 +127,13 @@ class StateSaver:
         next_s = assumed_s if self._longest_s is None else self._longest_s
         return self._spent_s + next_s <= SHARE * (time.perf_counter() - self._began)
 
-    def save(self, state: RunState[Any]) -> None:
-        """Save a state. Raises OutputError."""
-        began = time.perf_counter()
+    def save(self, runner: RunnerState[Any]) -> None:
+        """Save the state after the last frame, if the files can go on from there. Raises OutputError."""
+        parts, summary, began = self._files.state(), self._summary, time.perf_counter()
+        if parts is None:
+            return
+        kept = RunnerState() if summary.is_complete else runner  # nothing comes after the last frame
+        state = RunState(self._facts, parts, summary.counts, kept)
         save_state(self._path, state)
         took = time.perf_counter() - began
         self.saved_frames = state.frames

@@ -4,13 +4,18 @@ import torch
 
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.tracking import TrackerConfig
 
 CPU = torch.device("cpu")
 
 
 def run(model, sequence, places=None, state=None, **options):
-    """The predictions at these places, by default all, and the state after them. options: of `StepOptions`."""
-    runner = Runner(model, CPU, StepOptions(**options))
+    """The predictions at these places, by default all, and the state after them. options: of `StepOptions`.
+
+    The boxes of a model with tracks have its identities.
+    """
+    tracker = TrackerConfig() if model.config.has_tracks and options.get("temporal", True) else None
+    runner = Runner(model, CPU, StepOptions(**{"tracker": tracker, **options}))
     places = range(len(sequence.stamps)) if places is None else places
     predictions = []
     for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):

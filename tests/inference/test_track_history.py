@@ -179,7 +179,7 @@ def test_a_scene_that_begins_without_images_keeps_no_identities(model):
 
 
 def test_identities_go_on_after_a_frame_that_is_not_finite(model):
-    runner, preprocessor = Runner(model, CPU), Preprocessor(model.config)
+    runner, preprocessor = Runner(model, CPU, StepOptions(tracker=TrackerConfig())), Preprocessor(model.config)
     frames = [preprocessor(MemorySequence(3).load(place)) for place in range(3)]
     state, first = runner.step(None, frames[0])
     spoilt = frames[1].images.clone()
