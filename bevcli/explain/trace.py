@@ -177,7 +177,6 @@ def _traced_step(
         _, prediction = runner.step(state, prepared)
     inputs: ModelInputs = arguments[model][0][0].to(runner.device)
     history = arguments[model.encoder][1]["history"]
-    position, _ = model.decoder.query_embedding[: config.decoder.queries].chunk(2, dim=-1)
     return Trace(
         config=config,
         recent=(*recent, (prepared.frame, prediction)),
@@ -189,7 +188,7 @@ def _traced_step(
         position=model.bev_queries.position(),
         layer_maps=tuple(outputs[layer][0] for layer in model.encoder.layers),
         aligned_history=None if history is None else history[0],
-        first_reference_points=model.decoder.reference_points(position).sigmoid(),
+        first_reference_points=model.decoder.object_queries(batch=1).reference_points[0],
         visible=model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).visible[0],
         cell=cell,
         attentions=model.scene_attentions(outputs[model], (float(x), float(y))),

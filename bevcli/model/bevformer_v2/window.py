@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.step import PreparedFrame
 
 # Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
@@ -40,16 +40,14 @@ class FrameFeatures:
     Attributes:
         stamp: of the frame.
         pose: its world_from_ego.
-        tokens: (N, S, C) of its N images, in the dtype of the model's image features.
-        level_shapes: (height, width) of each feature level.
+        image_features: tokens of its N images.
         image_from_bev: (1, N, 4, 4) float64 on the CPU, from the frame's own bev metres to network pixels.
         has_image: (1, N) bool.
     """
 
     stamp: FrameStamp
     pose: Pose
-    tokens: Tensor
-    level_shapes: LevelShapes
+    image_features: FeatureMaps
     image_from_bev: Tensor
     has_image: Tensor
 
@@ -57,8 +55,7 @@ class FrameFeatures:
     def of(prepared: PreparedFrame, features: FeatureMaps) -> "FrameFeatures":
         """The features of a frame's images."""
         frame, projections = prepared.frame, prepared.image_from_bev
-        maps = (features.tokens, features.level_shapes)
-        return FrameFeatures(frame.stamp, frame.world_from_ego, *maps, projections, prepared.has_image)
+        return FrameFeatures(frame.stamp, frame.world_from_ego, features, projections, prepared.has_image)
 
     def seen_from(self, current: PreparedFrame) -> WindowFrame:
         """The frame in the window of the current one."""
@@ -67,9 +64,8 @@ class FrameFeatures:
             moved = other_bev_from_bev(current.frame.world_from_ego, self.pose, current.frame.rig.ego_from_bev)
             image_from_bev = image_from_bev @ torch.from_numpy(moved)
         height, width = current.images.shape[-2:]
-        features = FeatureMaps(self.tokens, self.level_shapes)
         # The projections stay on the CPU, as the model reads them.
-        return WindowFrame(features, image_from_bev.float(), self.has_image, (height, width))
+        return WindowFrame(self.image_features, image_from_bev.float(), self.has_image, (height, width))
 
 
 @dataclass(frozen=True)
