@@ -60,7 +60,7 @@ def test_the_same_pillar_points_are_visible_as_in_the_original(back: int) -> Non
 @pytest.mark.parametrize("prepared", [False, True])
 def test_t1_base_equals_the_original(prepared: bool) -> None:
     model = original.rule_model_v2("v2-t1-base")
-    ready = prepare_for_inference(model, torch.device("cpu")).network if prepared else model
+    ready = prepare_for_inference(model, torch.device("cpu")) if prepared else model
     assert isinstance(ready, BEVFormerV2)
     with torch.inference_mode():
         outputs = ready(original.window(FRAME, ready))
@@ -80,7 +80,7 @@ def test_every_stage_equals_the_originals(name: str) -> None:
     rows = facts["bev_row_stride"]
     inner_rows = facts.get("inner_row_stride", rows)
     plain = original.rule_model_v2(name)
-    model = prepare_for_inference(plain, torch.device("cpu")).network
+    model = prepare_for_inference(plain, torch.device("cpu"))
     assert isinstance(model, BEVFormerV2)
     necks, layers = record_stages(model)
     with torch.inference_mode():
