@@ -140,8 +140,7 @@ class Model:
 
     def runner(self, *, track: bool, **asked: Any) -> Runner:
         """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
-        options = StepOptions(self.precision, tracker=self.tracker if track else None, **asked)
-        return Runner(self.prepared, self.device, options)
+        return Runner(self.prepared, self.device, StepOptions(tracker=self.tracker if track else None, **asked))
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:

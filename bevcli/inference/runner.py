@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -45,7 +45,8 @@ class StepOptions:
     """Options of a step.
 
     Attributes:
-        precision: of a plain model, by autocast; a prepared model and an exported file have their own.
+        precision: of a plain model, by autocast; with "fp32", as for a prepared model, whose parts have precisions of
+            their own, autocast around the runner has no effect.
         temporal: whether history is used.
         ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
@@ -53,7 +54,7 @@ class StepOptions:
         tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
     """
 
-    precision: Precision | Literal["int8"] = "fp32"
+    precision: Precision = "fp32"
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
@@ -104,7 +105,9 @@ class Runner:
             return state, self._prediction(prepared, started_anew, skipped=True)
         probe = self._probe()
         with self.clock:
-            with self._autocast(), probe or contextlib.nullcontext():
+            precision = self.options.precision
+            autocast = torch.autocast(self.device.type, DTYPES[precision], enabled=precision != "fp32")
+            with autocast, probe or contextlib.nullcontext():
                 later = self._usable(prepared, upcoming)
                 outputs, memory = self.model.step(prepared, state.memory, later)
                 found, is_finite = read_back(outputs, prepared.images)
@@ -194,12 +197,6 @@ class Runner:
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
-
-    def _autocast(self) -> contextlib.AbstractContextManager[object]:
-        # For a plain model; a prepared one has a precision of its own and ignores it.
-        if self.options.precision in ("fp32", "int8"):
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, DTYPES[self.options.precision])
 
     def _prediction(self, prepared: PreparedFrame, started_anew: NewStart | None, **found: Any) -> Prediction:
         """The prediction for a frame. found: the fields that the model computed; by default it has no boxes."""

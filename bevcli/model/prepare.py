@@ -6,7 +6,6 @@ The plain model knows nothing of this. A prepared model is a copy whose parts ar
 import atexit
 import copy
 import threading
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -21,8 +20,7 @@ from bevcli.model.kernels.compiled import CompiledPool, load_compiled, sample_hi
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet
-from bevcli.model.step import ModelOutputs, PreparedFrame
-from bevcli.model.temporal_model import Memory, TemporalModel
+from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
 LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
@@ -76,29 +74,12 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
         loading.start()
         atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
-    add_to_class(network, WithoutAutocast)
     return network
 
 
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
     """Puts the methods of an addition before those of this one module, in place; its other parts stay as they are."""
     module.__class__ = type(type(module).__name__, (addition, type(module)), {})
-
-
-class WithoutAutocast(TemporalModel):
-    """Added to a prepared model, whose parts have precisions of their own: autocast around it has no effect."""
-
-    def forward(self, *inputs: Any) -> ModelOutputs:
-        """As the model's own `forward`."""
-        with torch.autocast(self.device.type, enabled=False):
-            outputs: ModelOutputs = super().forward(*inputs)
-        return outputs
-
-    def step(
-        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
-    ) -> tuple[ModelOutputs, Memory]:
-        with torch.autocast(self.device.type, enabled=False):
-            return super().step(prepared, memory, upcoming)
 
 
 def _check_finite(model: nn.Module) -> None:

@@ -13,6 +13,7 @@ from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.model.pillar_projection import project_pillars
+from bevcli.model.prepare import prepare_for_inference
 
 
 def assert_same(one, other):
@@ -35,6 +36,15 @@ def test_a_run_cut_in_two_equals_the_whole(mini_model):
     second, _ = run(mini_model, sequence, range(2, 4), state)
     for one, other in zip(whole, first + second, strict=True):
         assert_same(one, other)
+
+
+def test_autocast_around_a_run_has_no_effect(mini_model):
+    prepared = prepare_for_inference(mini_model, CPU)
+    expected, _ = run(prepared, MemorySequence(2))
+    with torch.autocast("cpu", torch.bfloat16):
+        found, _ = run(prepared, MemorySequence(2))
+    assert torch.equal(found[1].bev, expected[1].bev)
+    assert np.array_equal(found[1].boxes.centers, expected[1].boxes.centers)
 
 
 def test_a_new_scene_equals_a_fresh_start(mini_model):

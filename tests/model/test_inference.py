@@ -71,15 +71,6 @@ def test_a_batch_of_two_is_two_batches_of_one(model):
     torch.testing.assert_close(both.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
 
 
-def test_autocast_around_a_prepared_model_has_no_effect(model):
-    prepared = prepare_for_inference(model, CPU)
-    expected = two_steps(prepared)
-    with torch.autocast("cpu", torch.bfloat16):
-        found = two_steps(prepared)
-    assert torch.equal(found.bev, expected.bev)
-    assert torch.equal(found.box_codes, expected.box_codes)
-
-
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_half_precision_stays_near(model, precision):
     expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, precision))
