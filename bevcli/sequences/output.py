@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import load_form
@@ -17,7 +17,7 @@ from bevcli.writing import remove_parts, whole_folder, write_whole
 if TYPE_CHECKING:
     from bevcli.frame import CameraImage, Frame, Sequence
 
-GROUP = "bevcli.drive_writers"
+GROUP: Final = "bevcli.drive_writers"
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
