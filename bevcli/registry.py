@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal
 
-from bevcli.errors import BevcliError
+from bevcli.errors import BevcliError, InputError
 
 Group = Literal[
     "bevcli.models",
@@ -52,6 +52,13 @@ def load(group: Group, name: str) -> Any:
         return known[name].load()
     except Exception as error:  # whatever a package of somebody else does
         raise BevcliError(f"entry point {group}: {name} = {known[name].value} cannot be imported: {error}") from error
+
+
+def load_form(group: Group, form: str) -> Any:
+    """The format of files to write, as `load` gives it. form: its name, an option. Raises InputError."""
+    if form not in entries(group):
+        raise InputError(f"`form={form}`: unknown format (expected {', '.join(entries(group))})")
+    return load(group, form)
 
 
 def known_models() -> tuple[str, ...]:

@@ -153,7 +153,9 @@ class Worker:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)
         except BevcliError as error:
             return None, _with_final_paths(str(error), (path, drive.source), (aside, "its results"))
-        save_state(aside / MATCHES, DriveMatches.of(scores))
+        found = scores.detection
+        matches = DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
+        save_state(aside / MATCHES, matches)
         return scores, ""
 
     @contextlib.contextmanager

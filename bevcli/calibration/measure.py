@@ -109,7 +109,7 @@ def measure(
     unknowns = Unknowns.of(views, options)
     within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
-        x = solve(unknowns, [Term(within, scale)], x).x
+        x = solve(unknowns, [(within, scale)], x).x
     within = consistent(unknowns, within, x)
     progress()
     heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
@@ -137,7 +137,7 @@ def measure(
 def _terms(unknowns: Unknowns, points: PointMatches, road: RoadResiduals, x: Array, road_scale: float) -> list[Term]:
     """Both kinds of residuals, with the spread that they have at x (P,)."""
     scales = ((points, POINT_SCALE_PX), (road, road_scale))
-    return [Term(each, np.maximum(least, spread(unknowns, each, x))) for each, least in scales]
+    return [(each, np.maximum(least, spread(unknowns, each, x))) for each, least in scales]
 
 
 def consistent(unknowns: Unknowns, points: PointMatches, x: Array) -> PointMatches:

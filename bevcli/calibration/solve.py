@@ -22,14 +22,8 @@ DEVIATION = 1.4826  # standard deviation by the median of absolute values
 LEAST_CURVATURE = 0.1  # where most residuals are outliers
 SMALLEST_PX = 0.05  # a smaller spread of residuals is not believed
 FEWEST = 50  # residuals of a camera that tell their spread
-
-
-@dataclass(frozen=True)
-class Term:
-    """Residuals with their spread, pixels, one or (N,): Cauchy's loss treats those far beyond it as outliers."""
-
-    residuals: Residuals
-    scale: float | Array
+# Residuals with their spread, pixels, one or (N,): Cauchy's loss treats those far beyond it as outliers.
+Term = tuple[Residuals, float | Array]
 
 
 @dataclass(frozen=True)
@@ -100,8 +94,8 @@ def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
 
 def _cost(unknowns: Unknowns, terms: Items[Term], x: Array, prior: Array) -> float:
     cost = float((prior * x**2).sum())
-    for term in terms:
-        squares = (values(unknowns, term.residuals, x) ** 2).sum(-1) / term.scale**2
+    for residuals, scale in terms:
+        squares = (values(unknowns, residuals, x) ** 2).sum(-1) / scale**2
         cost += float(np.log1p(squares).sum())
     return cost
 
@@ -113,12 +107,12 @@ def _at(unknowns: Unknowns, terms: Items[Term], x: Array, *, curvature: bool = F
     """
     columns = unknowns.columns
     blocks, gradients = np.zeros((*columns.shape, columns.shape[1])), np.zeros(columns.shape)
-    for term in terms:
-        here, slopes = derivatives(unknowns, term.residuals, x)
-        squares = (here**2).sum(-1) / term.scale**2
-        weights = 1 / (1 + squares) / term.scale**2
+    for residuals, scale in terms:
+        here, slopes = derivatives(unknowns, residuals, x)
+        squares = (here**2).sum(-1) / scale**2
+        weights = 1 / (1 + squares) / scale**2
         factor = _curvature(squares) if curvature else 1.0
-        bounds = np.searchsorted(term.residuals.group, np.arange(len(columns) + 1))
+        bounds = np.searchsorted(residuals.group, np.arange(len(columns) + 1))
         for group, (start, end) in enumerate(pairwise(bounds)):
             part = slopes[start:end].reshape(-1, slopes.shape[-1])
             weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]

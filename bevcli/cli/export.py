@@ -8,6 +8,7 @@ from bevcli.evaluation.options import ExportOptions
 from bevcli.printing import say
 
 if TYPE_CHECKING:
+    from bevcli.evaluation.box_format import BoxFormat
     from bevcli.sequences.files.boxes_file import BoxesFile
 
 PANEL = "Score"
@@ -25,11 +26,11 @@ def export(
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    from bevcli.evaluation.box_format import box_format
+    from bevcli.registry import load_form
     from bevcli.sequences.files.boxes_file import above_score
     from bevcli.writing import check_output
 
-    chosen = box_format(options.form)
+    chosen: BoxFormat = load_form("bevcli.box_formats", options.form)
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
     target = options.out or file.parent / chosen.target
     check_output(target, file)

@@ -4,12 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from bevcli.errors import InputError
 from bevcli.evaluation.options import ExportOptions
-from bevcli.registry import entries, load
 from bevcli.sequences.files.boxes_file import BoxesFile
-
-GROUP = "bevcli.box_formats"
 
 
 @dataclass(frozen=True)
@@ -25,11 +21,3 @@ class BoxFormat:
 
     target: str
     write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
-
-
-def box_format(name: str) -> BoxFormat:
-    """The format of a name. Raises InputError for an unknown one."""
-    if name not in entries(GROUP):
-        raise InputError(f"`form={name}`: unknown format (expected {', '.join(entries(GROUP))})")
-    found: BoxFormat = load(GROUP, name)
-    return found

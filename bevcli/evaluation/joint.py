@@ -1,7 +1,5 @@
 """Joint scores of several drives, from the matching of each drive: as if all frames had been scored together."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,12 +28,6 @@ class DriveMatches:
     matches: tuple[ClassMatches, ...]
     unmeasured: tuple[str, ...]
     segmentation: SegmentationScores | None
-
-    @staticmethod
-    def of(scores: FrameScores) -> DriveMatches:
-        """The part of the scores of a drive."""
-        found = scores.detection
-        return DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
 
 
 def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> FrameScores:

@@ -45,10 +45,6 @@ class StressState:
     facts: dict[str, str]
     scores: tuple[ConditionScores, ...] = ()
 
-    def has(self, condition: Condition) -> bool:
-        """True if a condition is finished."""
-        return any((each.corruption, each.severity) == (condition.name, condition.severity) for each in self.scores)
-
 
 class _Stopped(Exception):
     """The caller has asked to stop."""
@@ -104,7 +100,8 @@ def stress(
             state = StressState(facts)
             save_state(folder.state_path, state)
         test = _Test(model, scenes, options, folder, after_frame, should_stop)
-        left = [condition for condition in conditions if not state.has(condition)]
+        finished = {(each.corruption, each.severity) for each in state.scores}
+        left = [condition for condition in conditions if (condition.name, condition.severity) not in finished]
         done = test.kept_frames(left) + (len(conditions) - len(left)) * sum(len(scene.stamps) for scene in scenes)
         if done:
             resumed(done)

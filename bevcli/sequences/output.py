@@ -7,17 +7,17 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from bevcli.errors import InputError, OutputError
-from bevcli.registry import entries, load
+from bevcli.registry import load_form
 from bevcli.sequences.options import WriteOptions
 from bevcli.writing import remove_parts, whole_folder, write_whole
 
 if TYPE_CHECKING:
     from bevcli.frame import CameraImage, Frame, Sequence
 
-GROUP = "bevcli.drive_writers"
+GROUP: Final = "bevcli.drive_writers"
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
@@ -106,9 +106,7 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     Raises InputError for an unknown format, an option of another format or a drive that the format cannot hold, and
     OutputError where the path cannot be written.
     """
-    if options.form not in entries(GROUP):
-        raise InputError(f"`form={options.form}`: unknown format (expected {', '.join(entries(GROUP))})")
-    chosen: OutputFormat = load(GROUP, options.form)
+    chosen: OutputFormat = load_form(GROUP, options.form)
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     opener = resolve_name(chosen.opener) if isinstance(chosen.opener, str) else chosen.opener

@@ -8,7 +8,7 @@ from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
 from bevcli.calibration.road import beside_way
-from bevcli.calibration.solve import Term, solve, spread
+from bevcli.calibration.solve import solve, spread
 from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
 from bevcli.calibration.views import DELAYS_S, View, Views
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
@@ -159,7 +159,7 @@ def test_the_spread_of_residuals_is_that_of_their_camera(drive):
 def test_a_drive_that_shows_no_road_keeps_what_is_stated(drive):
     views, unknowns = drive
     nothing = road_of(views, 0, ROAD[:0], beside_m=0.5)
-    solution = solve(unknowns, [Term(nothing, spread(unknowns, nothing, lowered(unknowns, 0)))], lowered(unknowns, 0))
+    solution = solve(unknowns, [(nothing, spread(unknowns, nothing, lowered(unknowns, 0)))], lowered(unknowns, 0))
     assert not solution.x.any()
     assert not solution.information.any()
 
