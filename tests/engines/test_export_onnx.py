@@ -40,11 +40,10 @@ ROOT = Path(__file__).parents[2]
 
 
 def deformable_model() -> BEVFormer:
-    """The small model of these tests with deformable convolutions and two layers in its decoder."""
+    """The small model of these tests with deformable convolutions, a third level and two layers in its decoder."""
     config = model_for_engines().config
-    return small_model(
-        encoder=config.encoder, decoder=replace(config.decoder, layers=2), image_tokens=config.image_tokens
-    )
+    tokens = replace(config.image_tokens, level_embeddings=3)
+    return small_model(encoder=config.encoder, decoder=replace(config.decoder, layers=2), image_tokens=tokens)
 
 
 @pytest.fixture(
