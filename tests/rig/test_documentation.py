@@ -43,7 +43,7 @@ def rig_codes(folder):
         ([*POSE_MISTAKES, ("xyzw", xyzw), ("rounded", rounded), ("both", both_rotations)], "ego_from_camera"),
         ([*LENS_MISTAKES, *LENS_WARNINGS, *FIELD_MISTAKES], None),
     ):
-        for mistake in {code: mistake for code, mistake in mistakes}.values():  # test_rig_checks.py has all of them
+        for mistake in dict(mistakes).values():  # one of each code; test_rig_checks.py has all of them
             document = copy_of("six")
             camera = document["cameras"]["CAM_FRONT_LEFT"]
             mistake(camera[entry] if entry else camera)
