@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 # Files that one worker runs, because they share what takes long: processes to fork from, an exported model, a rendered
-# drive, and syntax trees.
+# drive, syntax trees, and the shapes of the weights of all known models.
 GROUPS = {
     "processes": (
         *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
@@ -14,6 +14,7 @@ GROUPS = {
     ),
     "rendered": ("test_drive", "test_export", "test_random_rig", "test_rendered_lens"),
     "code": ("test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
+    "weights": ("test_checkpoints", "test_system_errors"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.
