@@ -28,6 +28,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow  # test_documents.py checks that commands and options are known
 def test_the_commands_run(folder: Path) -> None:
     lines = [line for block in blocks("sh") for line in block.splitlines() if line]
     assert len(lines) > 5
@@ -39,6 +40,7 @@ def test_the_commands_run(folder: Path) -> None:
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.slow  # test_python_documentation.py runs the same calls
 def test_the_python_example_writes_a_recording(folder: Path) -> None:
     [example] = blocks("python")
     with contextlib.chdir(folder):

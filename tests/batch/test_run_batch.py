@@ -39,22 +39,28 @@ def fleet(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def model(fleet):
+    """The model of the fleet, with random weights."""
+    return make_job(fleet / "out", fleet / "mini.toml").load_model()
+
+
 @pytest.fixture
-def batch(fleet, tmp_path):
+def batch(fleet, model, tmp_path):
     """Runs the fleet, or other drives, into tmp_path/out."""
 
     def run(texts=None, out=None, options=None, **arguments):
         job = make_job(tmp_path / "out" if out is None else out, fleet / "mini.toml", **(options or {}))
         drives, _ = find_drives(texts or [str(fleet / "drives/*")])
-        return run_batch(job, job.load_model(), drives, **arguments)
+        return run_batch(job, model, drives, **arguments)
 
     return run
 
 
-def run_alone(fleet, name, out):
+def run_alone(fleet, model, name, out):
     job = make_job(out, fleet / "mini.toml")
     drive = open_sequence(fleet / "drives" / name, job.source)
-    run_into_folder(job.load_model(), drive, out, job.run)
+    run_into_folder(model, drive, out, job.run)
 
 
 def times(out):
@@ -62,12 +68,12 @@ def times(out):
     return {path: path.stat().st_mtime_ns for part in ("drives", "failed") for path in (out / part).rglob("*")}
 
 
-def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, tmp_path):
+def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, model, tmp_path):
     summary = batch(options={"retries": 1})
     assert (summary.drives, summary.failed, summary.skipped, summary.stopped) == (4, 1, 0, False)
     results = results_of(tmp_path / "out")
     assert set(results) == {"d000", "d001", "d002"}
-    run_alone(fleet, "d001", tmp_path / "alone")
+    run_alone(fleet, model, "d001", tmp_path / "alone")
     for name in COMPARED:
         assert (results["d001"] / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     facts = json.loads((results["d001"] / "summary.json").read_text())
@@ -206,7 +212,7 @@ def test_metrics_of_drives_equal_eval_and_joint_ones_are_written(batch, fleet, t
     assert row["mean_ap"] == records["d001"]["scores"]["mean_ap"]
 
 
-def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, tmp_path, monkeypatch):
+def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, model, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     (tmp_path / "scratch").mkdir()
     memory = fsspec.filesystem("memory")
@@ -215,7 +221,7 @@ def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, tmp_pa
     try:
         summary = batch(["memory://fleet/*"], out="memory://results")
         assert [record["error"] for record in summary.records] == ["", ""]
-        run_alone(fleet, "d001", tmp_path / "alone")
+        run_alone(fleet, model, "d001", tmp_path / "alone")
         found = memory.glob("/results/drives/d001-*/predictions.json")
         assert memory.cat_file(found[0]) == (tmp_path / "alone/predictions.json").read_bytes()
         assert memory.exists("/results/batch.parquet")

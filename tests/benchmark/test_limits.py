@@ -23,6 +23,7 @@ def test_tiny_needs_slightly_more_operations_than_six_resnet50():
     assert 1.02 * backbone < operations_of_tiny() < 1.12 * backbone
 
 
+@pytest.mark.slow
 def test_one_more_hit_adds_its_samples_in_every_layer():
     config = load_config("tiny")
     more = count_operations(config, (401, *HITS[1:])) - operations_of_tiny()

@@ -58,7 +58,8 @@ def model_for_engines() -> BEVFormer:
         encoder=replace(small_config().encoder, layers=1),
         decoder=replace(small_config().decoder, layers=1, merge_duplicates=0.6, fade_duplicates=0.7),
         backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
-        image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
+        neck=FPNConfig(levels=2),
+        image_tokens=ImageTokensConfig(level_embeddings=2, calibration_embedding=True),
     )
 
 

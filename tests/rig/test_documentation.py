@@ -40,10 +40,10 @@ def rig_codes(folder):
     """Findings about rigs: healthy ones, and ones with a single mistake."""
     cases = [copy_of(name) for name in HEALTHY]
     for mistakes, entry in (
-        ([*POSE_MISTAKES, ("", xyzw), ("", rounded), ("", both_rotations)], "ego_from_camera"),
+        ([*POSE_MISTAKES, ("xyzw", xyzw), ("rounded", rounded), ("both", both_rotations)], "ego_from_camera"),
         ([*LENS_MISTAKES, *LENS_WARNINGS, *FIELD_MISTAKES], None),
     ):
-        for _, mistake in mistakes:
+        for mistake in dict(mistakes).values():  # one of each code; test_rig_checks.py has all of them
             document = copy_of("six")
             camera = document["cameras"]["CAM_FRONT_LEFT"]
             mistake(camera[entry] if entry else camera)

@@ -84,7 +84,7 @@ def assert_equals(out: Path, whole: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 3, 4))) for n in range(FRAMES + 1)]
+    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 3, 4, 5))) for n in range(FRAMES + 1)]
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finished):
     drive = Drive()

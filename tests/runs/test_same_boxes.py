@@ -15,15 +15,15 @@ from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 
-def world_boxes(model, path):
+def world_boxes(model, path, count):
     runner = Runner(model, torch.device("cpu"))
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, frames=slice(0, count))
     steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
     return [prediction.boxes_world for _, prediction, _ in steps]
 
 
-def assert_same_boxes(model, one, other):
-    for a, b in zip(world_boxes(model, one), world_boxes(model, other), strict=True):
+def assert_same_boxes(model, one, other, count=4):
+    for a, b in zip(world_boxes(model, one, count), world_boxes(model, other, count), strict=True):
         assert a.centers == pytest.approx(b.centers, abs=0.05)
         assert a.scores == pytest.approx(b.scores, abs=1e-4)
         assert a.classes.tolist() == b.classes.tolist()
@@ -38,16 +38,16 @@ def test_a_native_folder_and_six_lossless_videos(mini_model, shared, tmp_path):
     (tmp_path / "videos").mkdir()
     for name in ("calibration.json", "ego_motion.csv"):
         shutil.copyfile(drive / name, tmp_path / name)
-    table = (drive / "frames.csv").read_text()
+    table = "\n".join((drive / "frames.csv").read_text().splitlines()[:3])  # two frames
     for folder in (drive / "images").iterdir():
         video = f"videos/{folder.name}.mkv"
         writer = cv2.VideoWriter(str(tmp_path / video), cv2.VideoWriter_fourcc(*"FFV1"), 2, (1600, 900))
-        for number, image in enumerate(sorted(folder.iterdir())):
+        for number, image in enumerate(sorted(folder.iterdir())[:2]):
             writer.write(cv2.imread(str(image)))
             table = table.replace(f"images/{folder.name}/{image.name}", f"{video}#{number}")
         writer.release()
     (tmp_path / "frames.csv").write_text(table)
-    assert_same_boxes(mini_model, drive, tmp_path)
+    assert_same_boxes(mini_model, drive, tmp_path, count=2)
 
 
 def test_a_native_folder_and_an_mcap_file(mini_model, shared, tmp_path):

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.parsing.images import decode_image, size_of_image
+from bevcli.rig import drawings
 from bevcli.sequences.open import open_sequence
 
 
@@ -125,7 +126,9 @@ def test_images_outside_of_the_folder_need_allow_outside(drive, kind):
     assert "CAM_BACK" in open_sequence(drive, allow_outside=True).load(1).images
 
 
-def test_commands_take_allow_outside(drive, tmp_path):
+def test_commands_take_allow_outside(drive, tmp_path, monkeypatch):
+    for name in ("write_camera_sheet", "write_coverage_map"):  # their figures take most of the time
+        monkeypatch.setattr(drawings, name, lambda path, *content: path.touch())
     outside(drive, "dots")
     convert = ["convert", str(drive), str(tmp_path / "out")]
     debug = ["project-debug", str(drive), "--frame", "1", "--out", str(tmp_path / "debug")]

@@ -32,6 +32,7 @@ from bevcli.training.trainer import Trainer, alternated, make_optimizer, set_lea
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)
 )
+TWO_STEPS = replace(SHORT, steps=2)
 # With dropout, so that randomness in the model is tested too.
 NOISY = replace(CONFIG, encoder=replace(CONFIG.encoder, dropout=0.2))
 
@@ -70,6 +71,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     return whole
 
 
+@pytest.fixture(scope="module")
+def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """An uninterrupted training of two steps with one loader."""
+    one = trainer(tmp_path_factory.mktemp("two-steps"), settings=TWO_STEPS)
+    one.run()
+    return one
+
+
 def test_a_killed_and_resumed_training_equals_an_uninterrupted(whole: Trainer, tmp_path: Path) -> None:
     run_and_kill(trainer(tmp_path / "killed"), after=3)  # a step after the last checkpoint
     resumed = trainer(tmp_path / "killed", resume=True)
@@ -102,22 +111,19 @@ def test_a_signal_requests_a_stop(number: int, exit_code: int) -> None:
     assert signal.getsignal(number) is before
 
 
-def test_a_seed_reproduces_and_another_one_differs(tmp_path: Path) -> None:
-    settings = replace(SHORT, steps=2)
-    runs = [trainer(tmp_path / str(i), seed, settings=settings) for i, seed in enumerate((3, 3, 4))]
-    for one in runs:
-        one.run()
-    assert_same_weights(runs[0], runs[1])
-    assert_same_weights(runs[0], runs[2], same=False)
+def test_a_seed_reproduces_and_another_one_differs(two_steps: Trainer, tmp_path: Path) -> None:
+    again, other = (trainer(tmp_path / str(seed), seed, settings=TWO_STEPS) for seed in (0, 1))
+    again.run()
+    other.run()
+    assert_same_weights(two_steps, again)
+    assert_same_weights(two_steps, other, same=False)
 
 
-def test_the_number_of_loaders_changes_nothing(tmp_path: Path) -> None:
-    one, three = (
-        trainer(tmp_path / str(loaders), settings=replace(SHORT, steps=2, loaders=loaders)) for loaders in (1, 3)
-    )
-    one.run()
+def test_the_number_of_loaders_changes_nothing(two_steps: Trainer, tmp_path: Path) -> None:
+    assert TWO_STEPS.loaders != 3
+    three = trainer(tmp_path, settings=replace(TWO_STEPS, loaders=3))
     three.run()
-    assert_same_weights(one, three)
+    assert_same_weights(two_steps, three)
 
 
 def test_alternated_iterators_give_one_item_each_in_turn() -> None:
@@ -168,11 +174,9 @@ def parameters_without_gradient(trained: Trainer) -> list[str]:
     return [name for name, parameter in named if parameter.grad is None or not parameter.grad.any()]
 
 
-def test_every_parameter_receives_a_gradient_that_is_not_zero(tmp_path: Path) -> None:
+def test_every_parameter_receives_a_gradient_that_is_not_zero(two_steps: Trainer) -> None:
     # Two steps: residual branches end in a batch norm that starts at zero, so that the first gives them no gradient.
-    one = trainer(tmp_path, settings=replace(SHORT, steps=2))
-    one.run()
-    assert parameters_without_gradient(one) == []
+    assert parameters_without_gradient(two_steps) == []
 
 
 def test_frozen_stages_keep_their_weights(tmp_path: Path) -> None:

@@ -31,6 +31,15 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WITHOUT_A_GPU = "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def servers_end_soon():
+    """A server looks 50 times a second, instead of once, whether it is to end."""
+    serve = WebViewer.serve_forever
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(WebViewer, "serve_forever", lambda server, poll_interval: serve(server, poll_interval / 50))
+        yield
+
+
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory):
     recording = tmp_path_factory.mktemp("served") / "recording.rrd"
