@@ -14,7 +14,9 @@ from torch import Tensor, nn
 from bevcli.errors import WeightsError
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import DecoderLayer
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled, sample_hits
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
@@ -23,6 +25,7 @@ from bevcli.model.resnet import ResNet
 from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
+TOKENS_OF_A_BLOCK = 1024  # the sums of a block stay in the cache
 LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -62,6 +65,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
             module.attention.value_dtype = dtype
         if isinstance(module, SpatialCrossAttention) and device.type == "cpu":
             module.sample_hits = sample_hits
+        if isinstance(module, ImageTokens) and device.type == "cpu":
+            add_to_class(module, TokensInBlocks)
     _check_finite(network)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)
@@ -103,6 +108,27 @@ class RoundedAttention(nn.Module):
         """As `nn.MultiheadAttention.forward` without weights."""
         rounded = (tensor.to(torch.bfloat16) for tensor in (query, key, value))
         return self.attention(*rounded, need_weights=need_weights)[0].float(), None
+
+
+class TokensInBlocks(ImageTokens):
+    """Added to the image tokens on a CPU: the same sums, block by block, without a copy of all tokens after each."""
+
+    def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
+        """As `ImageTokens.forward`."""
+        images, channels = maps[0].shape[:2]
+        levels = [x.flatten(2).transpose(1, 2) for x in maps]
+        tokens = maps[0].new_empty(images, sum(x.shape[1] for x in levels), channels)
+        parts = tokens.split([x.shape[1] for x in levels], dim=1)
+        of_cameras = () if self.camera_embedding is None else self.camera_embedding[camera_index].view(-1, channels)
+        for level, part, embedding in zip(levels, parts, self.level_embedding, strict=False):
+            for image in range(images):
+                blocks = (x[image].split(TOKENS_OF_A_BLOCK) for x in (level, part))
+                for block, result in zip(*blocks, strict=True):
+                    block = block + embedding
+                    if len(of_cameras):
+                        block += of_cameras[image % len(of_cameras)]
+                    result.copy_(block)
+        return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
 
 
 class LastCall(nn.Module):

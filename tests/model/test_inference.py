@@ -11,9 +11,11 @@ from small_model import small_inputs, small_model
 from torch import nn
 
 from bevcli.benchmark.versions import textbook_version
+from bevcli.model import prepare
 from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.prepare import TokensInBlocks, add_to_class, prepare_for_inference
 from bevcli.model.step import ModelOutputs
 
 CPU = torch.device("cpu")
@@ -41,6 +43,21 @@ def test_outputs_are_the_models(model, version):
     torch.testing.assert_close(found.bev, expected.bev, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found.class_logits, expected.class_logits, atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(found.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("camera_index", [torch.tensor([1, 0]), torch.tensor([[0, 1], [1, 1]])])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_image_tokens_in_blocks_are_the_same(dtype, camera_index, monkeypatch):
+    monkeypatch.setattr(prepare, "TOKENS_OF_A_BLOCK", 7)
+    plain = ImageTokens(cameras=2, channels=8, config=ImageTokensConfig(level_embeddings=3))
+    blocks = copy.deepcopy(plain)
+    add_to_class(blocks, TokensInBlocks)
+    random = torch.Generator().manual_seed(0)
+    maps = [torch.randn(camera_index.numel(), 8, *size, generator=random).to(dtype) for size in ((5, 4), (2, 3))]
+    with torch.inference_mode():
+        found, expected = blocks(maps, camera_index), plain(maps, camera_index)
+    assert found.level_shapes == expected.level_shapes
+    assert torch.equal(found.tokens, expected.tokens)
 
 
 def test_a_changed_calibration_changes_the_cached_hits(model):
