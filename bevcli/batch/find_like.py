@@ -201,7 +201,7 @@ def _thumbnail(batch: Storage, result: str, frame: int, recording: Path | None) 
     """A frame of a recording, as base64 of a JPEG; "" where the recording cannot be read."""
     try:
         with batch.copied(f"{RESULTS}/{result}/{RECORDING}") as copy, open_recording(recording or copy) as file:
-            image = draw_frame_at(file.path, frame)
+            image = draw_frame_at(file, frame)
     except BevcliError:
         return ""
     if image is None:

@@ -26,7 +26,7 @@ from bevcli.evaluation.joint import DriveMatches
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.parsing.files import is_there
-from bevcli.rig.check_drive import CheckedDrive
+from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state

@@ -47,7 +47,7 @@ def _read(file: Path) -> "BoxesFile":
     from bevcli.viewer.export import read_recording
     from bevcli.viewer.recording_file import open_recording
 
-    with open_recording(file) as opened:
-        if opened.repaired:
+    with open_recording(file) as whole:
+        if whole != file:
             say(f"note: {file} is incomplete (its run was stopped or is still going)", err=True)
-        return read_recording(opened.path)
+        return read_recording(whole)

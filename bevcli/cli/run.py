@@ -47,7 +47,7 @@ def run(
         from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.inference.load import load_model
-        from bevcli.rig.check_drive import CheckedDrive
+        from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.runs.run_into_folder import run_into_folder
         from bevcli.sequences.open import open_sequence
 

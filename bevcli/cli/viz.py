@@ -27,12 +27,12 @@ def viz(
         raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
     recording = recording_in(recording)
     with open_recording(recording) as file:
-        if file.repaired:
+        if file != recording:
             say(f"note: {recording} is incomplete (its run was stopped or is still going)")
         if options.summary or options.screenshot or options.video or options.export:
-            _write(recording, file.path, options)
+            _write(recording, file, options)
         else:
-            _open(file.path, options)
+            _open(file, options)
 
 
 def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:

@@ -6,6 +6,7 @@ The plain model knows nothing of this. A prepared model is a copy whose parts ar
 import atexit
 import copy
 import threading
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch

@@ -5,7 +5,7 @@ Published weights expect nuScenes' LIDAR_TOP: x right, y forward, 1.84 m above t
 
 import numpy as np
 
-from bevcli.findings import Finding
+from bevcli.findings import Finding, rig_error
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.rig.pose_checks import reordered, units_per_metre
 
@@ -23,7 +23,7 @@ def check_bev_frame(ego_from_bev: Array) -> tuple[Finding, ...]:
     if unit != 1:
         found, expected = f"{np.linalg.norm(ego_from_bev[:3, 3]):.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
         message = f'the translation of "ego_from_bev" is in {"millimetres" if unit == 1000 else "centimetres"}'
-        return (_error("translation-unit", message, found, expected, f"divide the translation by {unit:g}"),)
+        return (rig_error("translation-unit", message, found, expected, f"divide the translation by {unit:g}"),)
     if _is_plausible(ego_from_bev):
         return _warnings(ego_from_bev)
     return (_mistake(ego_from_bev) or _defect(ego_from_bev),)
@@ -51,7 +51,9 @@ def _mistake(pose: Array) -> Finding | None:
     turned = rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     if _is_plausible(turned):
         message, advice = "has x forward", "rotate it by 90° about z, unless your weights were trained with x forward"
-        return _error("bev-x-forward", f'"ego_from_bev" {message}', "x forward, y left", "x right, y forward", advice)
+        return rig_error(
+            "bev-x-forward", f'"ego_from_bev" {message}', "x forward, y left", "x right, y forward", advice
+        )
     if _is_plausible(inverse(pose)):
         code, message, advice = "transform-inverted", "is bev_from_ego, the inverse", "invert it"
     elif _is_plausible(reordered(pose, 1)) or _is_plausible(reordered(pose, -1)):
@@ -60,23 +62,25 @@ def _mistake(pose: Array) -> Finding | None:
     else:
         return None
     found = f"tilt {_tilt_deg(pose):.0f}°, y {_heading_deg(pose):.0f}° from forward, height {pose[2, 3]:.2f} m"
-    return _error(code, f'"ego_from_bev" {message}', found, "x right, y forward, z up, z 1.84 m", advice)
+    return rig_error(code, f'"ego_from_bev" {message}', found, "x right, y forward, z up, z 1.84 m", advice)
 
 
 def _defect(pose: Array) -> Finding:
     """The implausible property of the frame, where no common mistake explains it."""
     if _tilt_deg(pose) > TILT_ERROR_DEG:
         advice = "z of the bev frame points up"
-        return _error("bev-tilted", '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.0f}°", "level within 15°", advice)
+        return rig_error(
+            "bev-tilted", '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.0f}°", "level within 15°", advice
+        )
     if abs(_heading_deg(pose)) > HEADING_DEG:
         message, found = 'y of "ego_from_bev" is not forward', f"y is {_heading_deg(pose):.0f}° to the left"
-        return _error("bev-axes", message, found, "x right, y forward", "rotate it about z")
+        return rig_error("bev-axes", message, found, "x right, y forward", "rotate it about z")
     if abs(pose[2, 3] - HEIGHT_M) > HEIGHT_ERROR_M:
         message, found = '"ego_from_bev" is not at the height that the weights expect', f"{pose[2, 3]:.2f} m"
         advice = "give its height above the ground; pillars extend from 4.5 m below this frame to 2.5 m above it"
-        return _error("bev-height", message, found, f"about {HEIGHT_M} m", advice)
+        return rig_error("bev-height", message, found, f"about {HEIGHT_M} m", advice)
     found, expected = f"{np.hypot(pose[0, 3], pose[1, 3]):.1f} m from the ego origin", f"at most {MAX_DISTANCE_M:g} m"
-    return _error("bev-far", '"ego_from_bev" is not on the vehicle', found, expected, "check its translation")
+    return rig_error("bev-far", '"ego_from_bev" is not on the vehicle', found, expected, "check its translation")
 
 
 def _warnings(pose: Array) -> tuple[Finding, ...]:
@@ -93,7 +97,3 @@ def _warnings(pose: Array) -> tuple[Finding, ...]:
         advice = "nothing for the demo model, which levels the frame itself"
         findings.append(Finding("bev-tilted", "info", None, message, found, expected, advice))
     return tuple(findings)
-
-
-def _error(code: str, message: str, found: str, expected: str, advice: str) -> Finding:
-    return Finding(code, "error", None, message, found, expected, advice)

@@ -1,4 +1,4 @@
-"""Checks of a sequence: ego-motion (units, jumps, axes) and the timestamps of the cameras' images."""
+"""Checks of a sequence: ego-motion (units, jumps, axes), times of the images, and the cheap checks before a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,10 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from bevcli.findings import Finding
-from bevcli.frame import FrameStamp
+from bevcli.findings import Finding, errors_of, rig_error
+from bevcli.frame import DerivedSequence, FrameStamp, Sequence as Drive
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
+from bevcli.rig.rig_report import rig_errors
 
 MAX_SPEED = 70.0  # m/s, 250 km/h
 MIN_MOVING_SPEED = 1.0  # m/s; at lower speeds the direction of motion is noise
@@ -22,6 +23,39 @@ JUMP_FACTOR = 5.0  # a step this much faster than the median is a jump
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
 OFFSET_ERROR_S = 0.5
 JITTER_WARNING_S = 0.05
+CHECKED_POSES = 5000  # before a run: of a longer drive, every second, third, … pose is checked
+
+
+class CheckedDrive(DerivedSequence):
+    """A drive that was checked once. source: see `input_errors`.
+
+    Attributes:
+        input_errors: one line for each mistake.
+    """
+
+    def __init__(self, drive: Drive, source: str = "SEQUENCE") -> None:
+        super().__init__(drive)
+        self.input_errors = input_errors(drive, source)
+
+
+def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
+    """One line for each mistake in a drive's rig and ego-motion; none where they are plausible.
+
+    These are the errors of `check_calibration` that need neither images nor the coverage of the BEV grid. source: the
+    drive's path, for the command that each line names.
+    """
+    findings = rig_errors(drive.rig)
+    motion = drive.ego_motion
+    if motion is not None and drive.stamps:
+        times, stamps = motion.timestamps_ns, drive.stamps
+        during = np.flatnonzero((times >= stamps[0].timestamp_ns) & (times <= stamps[-1].timestamp_ns))
+        checked = during[:: 1 + len(during) // CHECKED_POSES]
+        findings += errors_of(check_scenes(motion.of_rows(checked), stamps))
+    first = {(finding.code, finding.camera): finding for finding in reversed(findings)}  # scenes repeat a mistake
+    return tuple(
+        f"error in the input: {finding.line}; `bevcli project-debug {source}` says more"
+        for finding in reversed(first.values())
+    )
 
 
 @dataclass(frozen=True)
@@ -139,7 +173,7 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
          replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
     ):  # fmt: skip
         if _drive(undone).is_plausible():
-            return _error(code, message, _motion_text(drive), "level, driving forward", advice)
+            return rig_error(code, message, _motion_text(drive), "level, driving forward", advice)
     return None
 
 
@@ -147,7 +181,7 @@ def _direction(drive: _Drive) -> Finding | None:
     """A tilted ego frame, or driving sideways or backwards in most steps."""
     if drive.tilt_deg() > MAX_TILT_DEG:
         advice = "z of the ego frame and of the world frame point up: check the axes"
-        return _error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)
+        return rig_error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)
     headings = drive.headings_deg()
     if len(headings) == 0:
         return None
@@ -155,10 +189,10 @@ def _direction(drive: _Drive) -> Finding | None:
     back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean())
     if back >= MOST_STEPS:
         advice = "x of the ego frame is forward: rotate the poses by 180° about z, unless the whole drive is in reverse"
-        return _error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)
+        return rig_error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)
     if 1 - ahead - back >= MOST_STEPS:
         advice = "the ego frame is x forward, y left: rotate the poses into it"
-        return _error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)
+        return rig_error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)
     return None
 
 
@@ -181,11 +215,7 @@ def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
         return None
     found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(drive.speeds[moving]):.1f} m/s"
     message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
-    return _error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)
-
-
-def _error(code: str, message: str, found: str, expected: str, advice: str) -> Finding:
-    return Finding(code, "error", None, message, found, expected, advice)
+    return rig_error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)
 
 
 def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | None]) -> Finding | None:

@@ -16,7 +16,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
-from bevcli.rig.check_drive import CheckedDrive
+from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.files import RunFiles
 from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions

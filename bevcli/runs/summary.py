@@ -11,7 +11,7 @@ from bevcli._version import __version__
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.printing import duration
-from bevcli.rig.check_drive import CheckedDrive
+from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
 from bevcli.writing import write_whole
@@ -91,7 +91,7 @@ class RunSummary:
     Attributes:
         files: that the run wrote.
         counts: so far.
-        input_errors: of the drive, one line for each, see `bevcli.rig.check_drive`.
+        input_errors: of the drive, one line for each, see `bevcli.rig.sequence_checks`.
     """
 
     def __init__(self, model: Model, sequence: CheckedDrive, options: RunOptions, counts: Counts) -> None:

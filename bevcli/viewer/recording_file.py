@@ -7,7 +7,6 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
@@ -46,17 +45,9 @@ FILE_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")  # bytes; kind and length
 MESSAGE_KINDS = (1, 2, 3)  # facts of the recording, data, and the choice of a blueprint
 
 
-@dataclass(frozen=True)
-class RecordingFile:
-    """The file to read a recording from: the user's, or its repaired copy."""
-
-    path: Path
-    repaired: bool
-
-
 @contextmanager
-def open_recording(path: Path) -> Iterator[RecordingFile]:
-    """The recording at a path. If its last message is cut: a repaired copy, which is deleted when the context ends.
+def open_recording(path: Path) -> Iterator[Path]:
+    """The file of a recording. If its last message is cut: a repaired copy, which is deleted when the context ends.
 
     path: the recording, or the output folder of `bevcli run`.
     Raises InputError if the file is missing, is not a recording, was cut off before its first frame, or is damaged.
@@ -66,7 +57,7 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
         raise InputError(f"{path}: is not a regular file (expected no folder, pipe or device)")
     if _is_whole(path):
         _check(path, path)
-        yield RecordingFile(path, repaired=False)
+        yield path
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         copy = Path(folder) / path.name
@@ -74,7 +65,7 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         _check(copy, path)
-        yield RecordingFile(copy, repaired=True)
+        yield copy
 
 
 def recording_in(path: Path) -> Path:
@@ -186,9 +177,9 @@ def show(
     if not HAS_NOTEBOOK:
         raise BevcliError("the notebook viewer is not installed: pip install 'bevcli[notebook]'")
     viewer = Viewer(width=width, height=height, use_global_recording=False, theme="dark")
-    with open_recording(Path(recording)) as opened:
+    with open_recording(Path(recording)) as file:
         stream = rr.RecordingStream("bevcli")
         viewer.add_recording(stream)
-        stream.log_file_from_path(opened.path)
+        stream.log_file_from_path(file)
         stream.flush(timeout_sec=60.0)
     return viewer

@@ -91,7 +91,7 @@ def wait_for_frames(run: Run, out: Path, count: int) -> None:
 
 def frames_of_recording(path: Path) -> list[int]:
     with open_recording(path) as file:
-        return [frame.index for frame in RecordingReader(file.path).frames()]
+        return [frame.index for frame in RecordingReader(file).frames()]
 
 
 def assert_finished_frames_are_whole(out: Path, folder: Path) -> int:

@@ -94,7 +94,7 @@ def _recording(folder: Path) -> None:
     from bevcli.viewer.summary import summarise
 
     with open_recording(folder / "recording.rrd") as file:
-        summarise(folder / "recording.rrd", file.path).text()
+        summarise(folder / "recording.rrd", file).text()
 
 
 def _state(folder: Path) -> None:

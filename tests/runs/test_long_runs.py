@@ -78,8 +78,8 @@ def measured_run(mini_model, out: Path, frames: int, measured: range) -> list[Us
 
     run_into_folder(Model(mini_model), SmallDrive(frames), out, after_frame=measure)
     with open_recording(out / "recording.rrd") as file:
-        assert not file.repaired
-        indices = [frame.index for frame in RecordingReader(file.path).frames()]
+        assert file == out / "recording.rrd"
+        indices = [frame.index for frame in RecordingReader(file).frames()]
     assert indices == list(range(frames))
     return found
 

@@ -76,8 +76,8 @@ def whole(model, tmp_path_factory):
 def assert_equals(out: Path, whole: Path) -> None:
     assert contents(out) == contents(whole)
     with open_recording(out / "recording.rrd") as file:
-        assert not file.repaired
-        assert [frame.index for frame in RecordingReader(file.path).frames()] == list(range(FRAMES))
+        assert file == out / "recording.rrd"
+        assert [frame.index for frame in RecordingReader(file).frames()] == list(range(FRAMES))
     one, other = (json.loads((folder / "summary.json").read_text()) for folder in (out, whole))
     for key in ("frames", "boxes", "boxes_by_class", "tracks", "started_anew", "dropped_images"):
         assert one[key] == other[key]

@@ -29,7 +29,7 @@ def recording(tmp_path_factory):
 def test_a_complete_recording_is_read_from_its_own_file(recording, monkeypatch):
     monkeypatch.setattr(recording_file, "run_python", run_python)  # a process as the user's
     with open_recording(recording) as file:
-        assert (file.path, file.repaired) == (recording, False)
+        assert file == recording
 
 
 @pytest.mark.parametrize("share", [0.5, 0.75, 0.98])
@@ -38,9 +38,9 @@ def test_a_recording_cut_anywhere_keeps_its_first_frames(recording, tmp_path, sh
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(content[: int(share * len(content))])
     with open_recording(cut) as file:
-        assert file.repaired
-        frames = [frame.index for frame in RecordingReader(file.path).frames()]
-        copy = file.path
+        assert file != cut
+        frames = [frame.index for frame in RecordingReader(file).frames()]
+        copy = file
     assert frames == list(range(len(frames)))
     assert 1 <= len(frames) <= 3
     assert not copy.exists()
@@ -79,8 +79,8 @@ def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
     expected = list(RecordingReader(tmp_path / "whole.rrd").frames())
     for recording in (path, restored):
         with open_recording(recording) as file:
-            assert not file.repaired
-            assert_same_frames(file.path, expected)
+            assert file == recording
+            assert_same_frames(file, expected)
 
 
 def assert_same_frames(path, expected):
@@ -108,14 +108,14 @@ def test_a_long_recording_of_several_streams_is_one_recording(tmp_path, monkeypa
             copy.write_bytes(path.read_bytes())  # what a kill here leaves
     expected = list(RecordingReader(tmp_path / "whole.rrd").frames())
     with open_recording(path) as file:
-        assert not file.repaired
-        assert_same_frames(file.path, expected[:finished])
+        assert file == path
+        assert_same_frames(file, expected[:finished])
     with open_recording(tmp_path / "3.rrd") as file:
-        assert [frame.index for frame in RecordingReader(file.path).frames()] == [0, 1, 2, 3]
+        assert [frame.index for frame in RecordingReader(file).frames()] == [0, 1, 2, 3]
     path.write_bytes(path.read_bytes()[:-10])
     with open_recording(path) as file:
-        assert file.repaired
-        assert len(list(RecordingReader(file.path).frames())) == finished
+        assert file != path
+        assert len(list(RecordingReader(file).frames())) == finished
 
 
 def test_a_missing_file_and_a_folder_without_recording_fail(tmp_path):
@@ -137,7 +137,7 @@ def test_damaged_data_never_ends_the_process(recording, tmp_path, place):
     message = f"{damaged}: "
     try:
         with open_recording(damaged) as file:
-            assert list(RecordingReader(file.path).frames())
+            assert list(RecordingReader(file).frames())
     except InputError as error:
         message = str(error)
     assert message.startswith(f"{damaged}: ")

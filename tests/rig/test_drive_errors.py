@@ -10,7 +10,7 @@ from command_line import MINI_TOML, command
 
 from bevcli.findings import errors_of
 from bevcli.rig.check_calibration import check_calibration
-from bevcli.rig.check_drive import input_errors
+from bevcli.rig.sequence_checks import input_errors
 from bevcli.sequences.open import open_sequence
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
