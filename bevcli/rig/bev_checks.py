@@ -51,9 +51,8 @@ def _mistake(pose: Array) -> Finding | None:
     turned = rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     if _is_plausible(turned):
         message, advice = "has x forward", "rotate it by 90° about z, unless your weights were trained with x forward"
-        return rig_error(
-            "bev-x-forward", f'"ego_from_bev" {message}', "x forward, y left", "x right, y forward", advice
-        )
+        found, expected = "x forward, y left", "x right, y forward"
+        return rig_error("bev-x-forward", f'"ego_from_bev" {message}', found, expected, advice)
     if _is_plausible(inverse(pose)):
         code, message, advice = "transform-inverted", "is bev_from_ego, the inverse", "invert it"
     elif _is_plausible(reordered(pose, 1)) or _is_plausible(reordered(pose, -1)):
@@ -68,10 +67,8 @@ def _mistake(pose: Array) -> Finding | None:
 def _defect(pose: Array) -> Finding:
     """The implausible property of the frame, where no common mistake explains it."""
     if _tilt_deg(pose) > TILT_ERROR_DEG:
-        advice = "z of the bev frame points up"
-        return rig_error(
-            "bev-tilted", '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.0f}°", "level within 15°", advice
-        )
+        found, advice = f"{_tilt_deg(pose):.0f}°", "z of the bev frame points up"
+        return rig_error("bev-tilted", '"ego_from_bev" is tilted', found, "level within 15°", advice)
     if abs(_heading_deg(pose)) > HEADING_DEG:
         message, found = 'y of "ego_from_bev" is not forward', f"y is {_heading_deg(pose):.0f}° to the left"
         return rig_error("bev-axes", message, found, "x right, y forward", "rotate it about z")

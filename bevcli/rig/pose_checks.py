@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bevcli.findings import Finding
+from bevcli.findings import Finding, rig_error
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from bevcli.rig.mounting import mounting_of, seen_fov_deg
@@ -109,8 +109,8 @@ def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> 
     spread = max(turn_deg(float(np.degrees(np.angle(one))), turn) for one in turns)
     if abs(turn) < EGO_TURN_DEG[0] or spread > EGO_TURN_DEG[1]:
         return None
-    return Finding(
-        "ego-axes", "error", None, "all cameras are turned by the same angle from the directions in their names",
+    return rig_error(
+        "ego-axes", "all cameras are turned by the same angle from the directions in their names",
         f"turned by {turn:.0f}°", "0° ± 35°", "the ego frame is x forward, y left, z up: rotate the poses into it",
     )  # fmt: skip
 

@@ -146,7 +146,7 @@ def _units(drive: _Drive) -> Finding | None:
     advice = "give metres and nanoseconds; a speed that is wrong by 1000 or 1000000 shows which unit is wrong"
     found, expected = f"median {median:.0f} m/s", f"at most {MAX_SPEED:g} m/s"
     message = "the vehicle is impossibly fast in most steps: wrong unit of timestamps or translations"
-    return Finding("ego-units", "error", None, message, found, expected, advice)
+    return rig_error("ego-units", message, found, expected, advice)
 
 
 def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
@@ -158,7 +158,7 @@ def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
     found = f"{len(jumps)} of {len(speeds)} steps; {np.linalg.norm(drive.steps[first]):.1f} m in "
     found += f"{drive.seconds[first]:.2f} s at {int(ego_motion.timestamps_ns[first + 1])} ns"
     message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
-    return Finding("ego-jump", "error", None, message, found, f"at most {MAX_SPEED:g} m/s", advice)
+    return rig_error("ego-jump", message, found, f"at most {MAX_SPEED:g} m/s", advice)
 
 
 def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
