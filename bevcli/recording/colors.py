@@ -2,6 +2,7 @@
 
 import colorsys
 from collections.abc import Iterable, Mapping
+from functools import cache
 from itertools import cycle
 
 import cv2
@@ -70,7 +71,13 @@ def line_colors(classes: Iterable[str]) -> dict[str, Color]:
 
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
     """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
-    levels = np.arange(256, dtype=np.uint8)[:, None]
-    table = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
     indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(table[indices]).astype(np.uint8)
+    return _table(name)[indices]
+
+
+@cache
+def _table(name: str) -> NDArray[np.uint8]:
+    """(256, 3) RGB, the colours of one of OpenCV's colour maps."""
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
+    return np.ascontiguousarray(colors).astype(np.uint8)

@@ -1,6 +1,6 @@
 """Writes BEV maps into a recording: features as colours, segmentation, history weights, probed cells."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -135,9 +135,11 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
 
 def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
     """Writes a segmentation into the BEV view and onto the ground of the scene, in the colours of the map classes."""
-    colors = np.full((*segmentation.cells.shape, 3), BACKGROUND, dtype=np.uint8)
+    palette = np.full((256, 3), BACKGROUND, dtype=np.uint8)
+    contents = replace(segmentation, cells=np.arange(256, dtype=np.uint8))
     for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
-        colors[segmentation.layer(name)] = color
+        palette[contents.layer(name)] = color
+    colors = palette[segmentation.cells]
     stream.log(entities.BEV_SEGMENTATION, rr.Image(colors, draw_order=-5), _placed(colors, segmentation))
     stream.log(entities.SEGMENTATION_ON_GROUND, _on_ground(colors, segmentation, ego_from_bev, 255))
 

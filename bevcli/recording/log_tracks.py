@@ -30,14 +30,12 @@ class TrackHistory:
         times_ns: by track, the times of its positions.
         positions: by track, positions (3,) in the recording's world, the oldest first.
         shown: the entities that show a track now, sorted.
-        known: the entities that have their style.
     """
 
     scene: str = ""
     times_ns: dict[str, list[int]] = field(default_factory=dict)
     positions: dict[str, list[Array]] = field(default_factory=dict)
     shown: list[str] = field(default_factory=list)
-    known: list[str] = field(default_factory=list)
 
     def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
         """Adds the boxes of a frame, in the recording's world; forgets what is too old."""
@@ -87,12 +85,13 @@ def log_tracks(
         past = np.array(history.positions[name])  # (K, 3)
         trail = [past] if len(past) > 1 else []
         own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
-        if entity not in history.known:  # a message costs more bytes than its numbers: what stays is written once
-            history.known.append(entity)
-            style = rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH)
-            stream.log(entity, style, rr.AnyValues(track=name), static=True)
-        strips = line_strips([ahead[i], outlines[i], *trail], 3)
-        stream.log(entity, rr.LineStrips3D.from_fields(strips=strips))
+        strips = rr.LineStrips3D.from_fields(strips=line_strips([ahead[i], outlines[i], *trail], 3))
+        if entity in history.shown:
+            stream.log(entity, strips)
+        else:  # what stays is written once: its bytes are more than those of the points
+            stream.log(
+                entity, strips, rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH), rr.AnyValues(track=name)
+            )
         shown.add(entity)
         flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
         flat_colors += own_colors[:: 2 if trail else 3]
