@@ -80,4 +80,4 @@ def _table(name: str) -> NDArray[np.uint8]:
     """(256, 3) RGB, the colours of one of OpenCV's colour maps."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
     colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
-    return np.ascontiguousarray(colors).astype(np.uint8)
+    return np.ascontiguousarray(colors, dtype=np.uint8)

@@ -74,6 +74,8 @@ def log_tracks(
     """
     if boxes.instances is None:
         return
+    # Anew in each scene: the times of a scene may lie before those of the one before.
+    styled = history.shown if stamp.scene == history.scene else []
     history.add(boxes, stamp)
     ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
     shown: set[str] = set()
@@ -85,13 +87,11 @@ def log_tracks(
         past = np.array(history.positions[name])  # (K, 3)
         trail = [past] if len(past) > 1 else []
         own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
-        strips = rr.LineStrips3D.from_fields(strips=line_strips([ahead[i], outlines[i], *trail], 3))
-        if entity in history.shown:
-            stream.log(entity, strips)
-        else:  # what stays is written once: its bytes are more than those of the points
-            stream.log(
-                entity, strips, rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH), rr.AnyValues(track=name)
-            )
+        style: tuple[rr.AsComponents, ...] = ()
+        if entity not in styled:  # what stays is written once: its bytes are more than those of the points
+            style = rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH), rr.AnyValues(track=name)
+        strips = line_strips([ahead[i], outlines[i], *trail], 3)
+        stream.log(entity, rr.LineStrips3D.from_fields(strips=strips), *style)
         shown.add(entity)
         flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
         flat_colors += own_colors[:: 2 if trail else 3]

@@ -62,6 +62,13 @@ def test_the_past_ends_after_some_seconds_and_with_the_scene(tmp_path):
     assert len(strips(frames[24], CAR)[2]) == 5
 
 
+def test_a_track_comes_with_its_style_in_each_scene(tmp_path):
+    record_tracks(tmp_path / "r.rrd", 6, lambda place: ["7", "" if place == 2 else "8", ""], scenes="aaaabb")
+    column = "LineStrips3D:colors"
+    chunks = [chunk for chunk in RecordingReader(tmp_path / "r.rrd").chunks() if chunk.entity_path.endswith("_8")]
+    assert sum(column in str(chunk.to_record_batch().schema) for chunk in chunks) == 3  # frames 0, 3 and 4
+
+
 def test_a_track_without_a_box_is_cleared(tmp_path):
     frames = record_tracks(tmp_path / "r.rrd", 4, lambda place: ["7", "" if place in (1, 2) else "8", ""])
     assert [bool(strips(frame, PEDESTRIAN)) for frame in frames] == [True, False, False, True]
