@@ -73,8 +73,9 @@ class AttentionProbe:
         ):
             self._hooks.enter_context(module.register_forward_hook(see))
         # Without the fast way, which computes no sampling locations.
-        self._hooks.callback(setattr, spatial, "sample_hits", spatial.sample_hits)
-        spatial.sample_hits = None
+        for attention in (temporal.attention, spatial.attention):
+            self._hooks.callback(setattr, attention, "sample_hits", attention.sample_hits)
+            attention.sample_hits = None
         return self
 
     def __exit__(self, *_error: object) -> None:

@@ -14,6 +14,24 @@ LevelShapes = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
+class Hits:
+    """The M pairs of a value map and a query that samples it, ordered by map.
+
+    Attributes:
+        query: (M,) int64, index of the query in B·Q.
+        reference_points: (M, Z, 2) float32, x and y, 0 to 1 over the map; sample p lies around point p mod Z.
+        hits_per_map: G counts, of sum M.
+        prediction: (M,) int64, which of the predictions of its query belongs to the map: an index in the axis "maps" of
+            `DeformableAttention.predict`.
+    """
+
+    query: Tensor
+    reference_points: Tensor
+    hits_per_map: Sequence[int]
+    prediction: Tensor
+
+
+@dataclass(frozen=True)
 class FeatureMaps:
     """G multi-level feature maps as tokens.
 
@@ -27,7 +45,7 @@ class FeatureMaps:
 
     def scaled(self, scale: Tensor, shift: Tensor) -> "FeatureMaps":
         """The tokens times the scale plus the shift, in their dtype. scale, shift: (G, S, C) float32."""
-        return FeatureMaps((self.tokens * scale + shift).to(self.tokens.dtype), self.level_shapes)
+        return FeatureMaps(torch.addcmul(shift, self.tokens, scale).to(self.tokens.dtype), self.level_shapes)
 
 
 class DeformableAttention(nn.Module):
@@ -37,12 +55,15 @@ class DeformableAttention(nn.Module):
 
     Attributes:
         sampling: computes the weighted sums, without parameters; a faster module can take its place.
+        sample_hits: the weighted sums (M, C) float32 of hits, from the values, the level shapes, the hits, and offsets and
+            weights of all queries, without a table of the sampling locations. None: the locations are computed first.
         level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
         softmax: over the last axis; a faster function can take its place.
         value_dtype: data type of the value projection, where it is not that of the tokens.
     """
 
     value_dtype: torch.dtype | None = None
+    sample_hits: Callable[[Tensor, LevelShapes, Hits, Tensor, Tensor], Tensor] | None = None
     level_sizes: Callable[[LevelShapes, torch.device], Tensor]
     softmax: Callable[[Tensor], Tensor]
 

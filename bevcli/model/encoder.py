@@ -1,13 +1,13 @@
 """The BEV encoder: layers of temporal self-attention, spatial cross-attention and a feed-forward network."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, Hits, LevelShapes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
@@ -160,31 +160,26 @@ class TemporalSelfAttention(nn.Module):
     def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
         """The attended values (B, Y·X, C) for given offsets and weights of the samples; see `forward`."""
         batch, cells = offsets.shape[:2]
-        maps = bev_maps.shape[1]
-        reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-        locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
-        sampled = self.attention.sample(
-            bev_maps.flatten(0, 1),
-            self.level_shapes,
-            locations.movedim(3, 1).flatten(0, 2),
-            weights.movedim(3, 1).flatten(0, 2),
-            [2 * cells // maps] * (maps * batch),
-        )  # (B·2·Y·X, C)
-        mean = sampled.unflatten(0, (batch, 2, cells)).mean(1)
-        return self.dropout(self.attention.output_projection(mean))
+        maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
+        queries_per_map = [2 * cells // maps] * (maps * batch)
+        if self.attention.sample_hits is not None:
+            hits = temporal_hits(reference_points.expand(batch, -1, -1, -1), queries_per_map)
+            predicted = offsets.flatten(0, 1), weights.flatten(0, 1)
+            sampled = self.attention.sample_hits(self.attention.values(tokens), self.level_shapes, hits, *predicted)
+        else:
+            reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
+            locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+            by_map = (each.movedim(3, 1).flatten(0, 2) for each in (locations, weights))
+            sampled = self.attention.sample(tokens, self.level_shapes, *by_map, queries_per_map)
+        of_history, of_current = sampled.unflatten(0, (batch, 2, cells)).unbind(1)  # (B, Y·X, C) each
+        return self.dropout(self.attention.output_projection((of_history + of_current) / 2))
 
 
 class SpatialCrossAttention(nn.Module):
     """Deformable attention of BEV queries to the cameras that see their pillars (paper, section 3.3).
 
     Samples lie around the projected points of a pillar. The results of the cameras that see a cell are averaged.
-
-    Attributes:
-        sample_hits: samples the values of all hits at once; see `kernels.compiled.sample_hits`. None to compute the
-            sampling locations first.
     """
-
-    sample_hits: Callable[[Tensor, LevelShapes, PillarHits, Tensor, Tensor], Tensor] | None = None
 
     def __init__(self, channels: int, heads: int, points: int, levels: int, dropout: float) -> None:
         super().__init__()
@@ -205,15 +200,25 @@ class SpatialCrossAttention(nn.Module):
     def _sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
         """The weighted sums (M, C) of the hits."""
         # A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
-        offsets, weights = (part[:, :, 0] for part in self.attention.predict(query.flatten(0, 1)))  # (B·Y·X, heads, …)
+        predicted = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, …) each
         tokens, level_shapes = image_features.tokens, image_features.level_shapes
-        if self.sample_hits is not None:
-            return self.sample_hits(self.attention.values(tokens), level_shapes, hits, offsets, weights)
+        if self.attention.sample_hits is not None:
+            found = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
+            return self.attention.sample_hits(self.attention.values(tokens), level_shapes, found, *predicted)
+        offsets, weights = (part[:, :, 0] for part in predicted)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = offsets.index_select(0, hits.cell), weights.index_select(0, hits.cell)
         locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
         return self.attention.sample(tokens, level_shapes, locations, weights, hits.hits_per_camera)
+
+
+def temporal_hits(reference_points: Tensor, queries_per_map: Sequence[int]) -> Hits:
+    """The hits of the BEV cells in the history and the current map. reference_points: (B, 2, Y·X, 2)."""
+    batch, maps, cells, _ = reference_points.shape
+    query = torch.arange(batch * cells).view(batch, 1, cells).expand(-1, maps, -1).flatten()
+    prediction = torch.arange(maps)[None, :, None].expand(batch, -1, cells).flatten()
+    return Hits(query, reference_points.reshape(-1, 1, 2), queries_per_map, prediction)
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

@@ -19,7 +19,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
-from bevcli.model.kernels.compiled import CompiledPool, load_compiled, sample_hits
+from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet
@@ -64,8 +64,6 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         if isinstance(module, rounded):
             module.attention.value_projection.to(dtype)
             module.attention.value_dtype = dtype
-        if isinstance(module, SpatialCrossAttention) and device.type == "cpu":
-            module.sample_hits = sample_hits
         if isinstance(module, ImageTokens) and device.type == "cpu":
             add_to_class(module, TokensInBlocks)
     _check_finite(network)

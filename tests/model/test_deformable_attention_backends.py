@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from bevcli.benchmark.versions import PaddedSampling
-from bevcli.model.deformable_attention import GridSampling, level_sizes, sampling_locations
+from bevcli.model.deformable_attention import GridSampling, Hits, level_sizes, sampling_locations
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
-from bevcli.model.pillar_projection import PillarHits
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
 PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()
@@ -43,10 +42,12 @@ def test_hits_are_sampled_to_the_bit_as_by_their_locations(depth):
     random = torch.Generator().manual_seed(0)
     points, count = torch.rand(sum(counts), 2, 2, generator=random), sum(counts)
     cells = torch.randperm(count, generator=random)
-    hits = PillarHits(cells, points, counts, torch.ones(count))
+    hits = Hits(cells, points, counts, torch.randint(2, (count,), generator=random))
+    weights = torch.stack([weights, weights.flip(0)], dim=2)  # two predictions, each for its own map
     offsets = 3 * torch.randn(*weights.shape, 2, generator=random)
-    locations = sampling_locations(points[:, None, None], offsets[cells], level_sizes(shapes, offsets.device))
-    expected = COMPILED(values, shapes, locations, weights[cells], counts)
+    found = [each[cells, :, hits.prediction] for each in (offsets, weights)]
+    locations = sampling_locations(points[:, None, None], found[0], level_sizes(shapes, offsets.device))
+    expected = COMPILED(values, shapes, locations, found[1], counts)
     assert torch.equal(sample_hits(values, shapes, hits, offsets, weights), expected)
 
 

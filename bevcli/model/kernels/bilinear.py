@@ -142,27 +142,33 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def sample_hits(values, level_shapes, points, offsets, weights, cell, map_of_hit, out, begin, end) -> None:  # type: ignore[no-untyped-def]
-    """As `sample_maps` for hits begin to end - 1, whose samples lie around the points of a pillar.
+def sample_hits(values, level_shapes, points, offsets, weights, query, prediction, map_of_hit, out, begin, end) -> None:  # type: ignore[no-untyped-def]
+    """As `sample_maps` for hits begin to end - 1, whose samples lie around reference points.
 
-    points: (M, Z, 2) float32, x and y, 0 to 1; sample p lies around point p mod Z. offsets: (Y·X, heads, L, P, 2)
-    float32, in cells of a level. weights: (Y·X, heads, L, P) float32. cell, map_of_hit: (M,) int64.
+    points: (M, Z, 2) float32, x and y, 0 to 1; sample p lies around point p mod Z. offsets: (B·Q, heads, maps, L, P, 2)
+    float32, in cells of a level. weights: (B·Q, heads, maps, L, P) float32. query, prediction (an index in the axis
+    "maps"), map_of_hit: (M,) int64.
     """
-    heads, levels, count = weights.shape[1:]
-    flat_offsets, flat_weights = offsets.reshape(len(offsets), -1, 2), weights.reshape(len(weights), -1)
-    maps, samples, half = _maps_of_samples(level_shapes, heads, count), levels * count, np.float32(0.5)
+    heads, predictions, levels, count = weights.shape[1:]
+    samples, half, heights = levels * count, np.float32(0.5), points.shape[1]
+    flat_offsets = offsets.reshape(len(offsets), heads, predictions, samples, 2)
+    flat_weights = weights.reshape(len(weights), heads, predictions, samples)
+    maps = _maps_of_samples(level_shapes, heads, count)
     places, cells, shares = _room_for(heads * samples)
-    heights = points.shape[1]
+    weights_of_samples = np.empty(heads * samples, np.float32)
     for hit in range(begin, end):
-        row = cell[hit]
-        for first in range(0, heads * samples, heights):
-            for height in range(heights):
-                sample = first + height
-                x = points[hit, height, 0] + flat_offsets[row, sample, 0] / maps[0, sample]
-                y = points[hit, height, 1] + flat_offsets[row, sample, 1] / maps[1, sample]
-                places[0, sample] = x * maps[0, sample] - half
-                places[1, sample] = y * maps[1, sample] - half
-        _find_corners(places, flat_weights[row], maps, cells, shares)
+        for head in range(heads):
+            moved = flat_offsets[query[hit], head, prediction[hit]]
+            weighted = flat_weights[query[hit], head, prediction[hit]]
+            for first in range(0, samples, heights):
+                for height in range(heights):
+                    read, sample = first + height, head * samples + first + height
+                    x = points[hit, height, 0] + moved[read, 0] / maps[0, sample]
+                    y = points[hit, height, 1] + moved[read, 1] / maps[1, sample]
+                    places[0, sample] = x * maps[0, sample] - half
+                    places[1, sample] = y * maps[1, sample] - half
+                    weights_of_samples[sample] = weighted[read]
+        _find_corners(places, weights_of_samples, maps, cells, shares)
         _sum_heads(values, map_of_hit[hit], cells, shares, samples, out, hit)
 
 

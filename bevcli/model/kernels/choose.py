@@ -10,7 +10,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.temporal_model import TemporalModel
 
 KEPT_TABLES = 32  # of level sizes, for images of several sizes
@@ -31,7 +31,7 @@ def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: boo
             if not gradients:
                 module.level_sizes = kept_sizes
             if not gradients and device.type == "cpu":
-                module.softmax = softmax_of_few
+                module.softmax, module.sample_hits = softmax_of_few, sample_hits
 
 
 def fastest_sampling(device: torch.device, *, gradients: bool = False) -> nn.Module:

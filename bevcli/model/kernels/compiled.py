@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.deformable_attention import Hits, LevelShapes
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
-from bevcli.model.pillar_projection import PillarHits
 
 # More ranges than threads: where another process delays one thread, the others take over its ranges.
 RANGES_PER_THREAD = 8
@@ -42,25 +41,23 @@ class CompiledSampling(nn.Module):
         return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
 
 
-def sample_hits(
-    values: Tensor, level_shapes: LevelShapes, hits: PillarHits, offsets: Tensor, weights: Tensor
-) -> Tensor:
+def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: Tensor, weights: Tensor) -> Tensor:
     """The weighted sums (M, C) float32 of the M hits, without a table of their sampling locations. No gradients.
 
     Args:
         values: (G, S, heads, C / heads), see `GridSampling`.
         level_shapes: (height, width) of each level.
-        hits: the pairs of a map and a cell.
-        offsets: (B·Y·X, heads, L, P, 2) float32, in cells of a level, from the points of a cell's pillar.
-        weights: (B·Y·X, heads, L, P).
+        hits: the pairs of a map and a query.
+        offsets: (B·Q, heads, maps, L, P, 2) float32, in cells of a level, from the reference points.
+        weights: (B·Q, heads, maps, L, P).
     """
     from bevcli.model.kernels.bilinear import sample_hits as compiled  # loads the compiler
 
-    map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_camera)
-    out = torch.empty(len(hits.cell), *values.shape[2:])
-    arrays = (hits.reference_points, offsets, weights)
-    read = (as_array(values), np.asarray(level_shapes, dtype=np.int64), *map(as_array, arrays), hits.cell.numpy())
-    in_threads(partial(compiled, *read, map_of_hit, out.numpy()), len(out), _range_of(weights))
+    map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_map)
+    out = torch.empty(len(hits.query), *values.shape[2:])
+    read = (as_array(values), np.asarray(level_shapes, dtype=np.int64))
+    of_hits = (*map(as_array, (hits.reference_points, offsets, weights)), hits.query.numpy(), hits.prediction.numpy())
+    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), _range_of(weights[:, :, 0]))
     return out.flatten(1)
 
 
@@ -185,10 +182,10 @@ def load_compiled(dtype: torch.dtype, loaded: threading.Event) -> None:
     with contextlib.suppress(Exception):
         sampling, pool = CompiledSampling(), CompiledPool(nn.MaxPool2d(3, stride=2, padding=1), loaded)
         place = torch.zeros(1, 1, 1, 1, 2)
-        hit = PillarHits(torch.zeros(1, dtype=torch.int64), place[0, 0], (1,), torch.ones(1))
+        hit = Hits(torch.zeros(1, dtype=torch.int64), place[0, 0], (1,), torch.zeros(1, dtype=torch.int64))
         for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
             sampling(values, [(1, 1)], place, place[..., 0], [1])
-            sample_hits(values, ((1, 1),), hit, place, place[..., 0])
+            sample_hits(values, ((1, 1),), hit, place[None], place[None, ..., 0])
         pool.pooled(torch.zeros(1, 1, 1, 1, dtype=dtype))
         loaded.set()
 
