@@ -55,8 +55,8 @@ class DeformableAttention(nn.Module):
 
     Attributes:
         sampling: computes the weighted sums, without parameters; a faster module can take its place.
-        sample_hits: the weighted sums (M, C) float32 of hits, from the values, the level shapes, the hits, and offsets and
-            weights of all queries, without a table of the sampling locations. None: the locations are computed first.
+        sample_hits: the weighted sums (M, C) float32 of hits, from the values, the level shapes, the hits, and what
+            `predict` returns, without tables of locations and weights. None: locations and weights are computed first.
         level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
         softmax: over the last axis; a faster function can take its place.
         value_dtype: data type of the value projection, where it is not that of the tokens.
@@ -93,18 +93,20 @@ class DeformableAttention(nn.Module):
         self._initialize()
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets and weights of the samples of queries (..., query_channels).
+        """Offsets and logits of the weights of the samples of queries (..., query_channels).
 
-        Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; weights
-        (..., heads, maps, L, P) sum up to 1 over levels and points for each head and map.
+        Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
+        (..., heads, maps, L, P), see `weights`.
         """
         return self.as_samples(self.sampling_offsets(query), self.attention_weights(query))
 
     def as_samples(self, offsets: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets (..., heads · maps · L · P · 2) and logits (..., heads · maps · L · P) in the form of `predict`."""
-        heads, maps, levels, points = self.shape
-        weights = self.softmax(logits.unflatten(-1, (heads, maps, levels * points)))
-        return offsets.float().unflatten(-1, (*self.shape, 2)), weights.unflatten(-1, (levels, points))
+        return offsets.float().unflatten(-1, (*self.shape, 2)), logits.unflatten(-1, self.shape)
+
+    def weights(self, logits: Tensor) -> Tensor:
+        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
+        return self.softmax(logits.flatten(-2)).view_as(logits)
 
     def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
         """Reference points plus predicted offsets; see `sampling_locations`."""
@@ -128,8 +130,8 @@ class DeformableAttention(nn.Module):
         self, query: Tensor, reference_points: Tensor, level_shapes: LevelShapes
     ) -> tuple[Tensor, Tensor]:
         """Locations (B, Q, heads, L, P, 2) and weights (B, Q, heads, L, P) of `attend`."""
-        offsets, weights = (predicted[:, :, :, 0] for predicted in self.predict(query))
-        return self.locations(reference_points[:, :, None, None, None], offsets, level_shapes), weights
+        offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
+        return self.locations(reference_points[:, :, None, None, None], offsets, level_shapes), self.weights(logits)
 
     def sample(
         self,

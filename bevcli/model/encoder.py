@@ -154,22 +154,22 @@ class TemporalSelfAttention(nn.Module):
             bev_maps: (B, 2, Y·X, C), history first; (B, 1, Y·X, C) where both are the same map.
             reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
         """
-        offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
-        return self.sample(bev_maps, reference_points, offsets, weights)
+        offsets, logits = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
+        return self.sample(bev_maps, reference_points, offsets, logits)
 
-    def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
-        """The attended values (B, Y·X, C) for given offsets and weights of the samples; see `forward`."""
+    def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, logits: Tensor) -> Tensor:
+        """The attended values (B, Y·X, C) for given offsets and logits of the samples; see `forward`."""
         batch, cells = offsets.shape[:2]
         maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
         queries_per_map = [2 * cells // maps] * (maps * batch)
         if self.attention.sample_hits is not None:
             hits = temporal_hits(reference_points.expand(batch, -1, -1, -1), queries_per_map)
-            predicted = offsets.flatten(0, 1), weights.flatten(0, 1)
+            predicted = offsets.flatten(0, 1), logits.flatten(0, 1)
             sampled = self.attention.sample_hits(self.attention.values(tokens), self.level_shapes, hits, *predicted)
         else:
             reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
             locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
-            by_map = (each.movedim(3, 1).flatten(0, 2) for each in (locations, weights))
+            by_map = (each.movedim(3, 1).flatten(0, 2) for each in (locations, self.attention.weights(logits)))
             sampled = self.attention.sample(tokens, self.level_shapes, *by_map, queries_per_map)
         of_history, of_current = sampled.unflatten(0, (batch, 2, cells)).unbind(1)  # (B, Y·X, C) each
         return self.dropout(self.attention.output_projection((of_history + of_current) / 2))
@@ -199,16 +199,16 @@ class SpatialCrossAttention(nn.Module):
 
     def _sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
         """The weighted sums (M, C) of the hits."""
-        # A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
+        # A cell has the same offsets and logits in every camera, so they are predicted once for each cell.
         predicted = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, …) each
         tokens, level_shapes = image_features.tokens, image_features.level_shapes
         if self.attention.sample_hits is not None:
             found = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
             return self.attention.sample_hits(self.attention.values(tokens), level_shapes, found, *predicted)
-        offsets, weights = (part[:, :, 0] for part in predicted)
+        offsets, logits = (part[:, :, 0] for part in predicted)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
-        offsets, weights = offsets.index_select(0, hits.cell), weights.index_select(0, hits.cell)
+        offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.weights(logits)))
         locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
         return self.attention.sample(tokens, level_shapes, locations, weights, hits.hits_per_camera)
 

@@ -36,19 +36,19 @@ def test_sampling_modules_equal_the_plain_one(sampling, depth):
 
 
 @pytest.mark.parametrize("depth", [8, 33])
-def test_hits_are_sampled_to_the_bit_as_by_their_locations(depth):
-    """Another order of roundings moved a logit of v2-t8 beyond the tolerance of its reference numbers."""
-    values, shapes, _, weights, counts = case(depth)
+def test_hits_are_sampled_as_by_their_locations_and_weights(depth):
+    values, shapes, _, logits, counts = case(depth)
     random = torch.Generator().manual_seed(0)
     points, count = torch.rand(sum(counts), 2, 2, generator=random), sum(counts)
     cells = torch.randperm(count, generator=random)
     hits = Hits(cells, points, counts, torch.randint(2, (count,), generator=random))
-    weights = torch.stack([weights, weights.flip(0)], dim=2)  # two predictions, each for its own map
-    offsets = 3 * torch.randn(*weights.shape, 2, generator=random)
+    logits = 50 * torch.stack([logits, logits.flip(0)], dim=2)  # two predictions, each for its own map
+    offsets = 3 * torch.randn(*logits.shape, 2, generator=random)
+    weights = logits.flatten(-2).softmax(-1).view_as(logits)
     found = [each[cells, :, hits.prediction] for each in (offsets, weights)]
     locations = sampling_locations(points[:, None, None], found[0], level_sizes(shapes, offsets.device))
     expected = COMPILED(values, shapes, locations, found[1], counts)
-    assert torch.equal(sample_hits(values, shapes, hits, offsets, weights), expected)
+    torch.testing.assert_close(sample_hits(values, shapes, hits, offsets, logits), expected)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -15,6 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from bevcli.jit import njit
+from bevcli.model.kernels.softmax import softmax_of_groups
 
 BFLOAT16_BITS = 16
 
@@ -142,24 +143,24 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def sample_hits(values, level_shapes, points, offsets, weights, query, prediction, map_of_hit, out, begin, end) -> None:  # type: ignore[no-untyped-def]
+def sample_hits(values, level_shapes, points, offsets, logits, query, prediction, map_of_hit, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """As `sample_maps` for hits begin to end - 1, whose samples lie around reference points.
 
     points: (M, Z, 2) float32, x and y, 0 to 1; sample p lies around point p mod Z. offsets: (B·Q, heads, maps, L, P, 2)
-    float32, in cells of a level. weights: (B·Q, heads, maps, L, P) float32. query, prediction (an index in the axis
-    "maps"), map_of_hit: (M,) int64.
+    float32, in cells of a level. logits: (B·Q, heads, maps, L, P) float32; the weights are their softmax over levels
+    and points. query, prediction (an index in the axis "maps"), map_of_hit: (M,) int64.
     """
-    heads, predictions, levels, count = weights.shape[1:]
+    heads, predictions, levels, count = logits.shape[1:]
     samples, half, heights = levels * count, np.float32(0.5), points.shape[1]
     flat_offsets = offsets.reshape(len(offsets), heads, predictions, samples, 2)
-    flat_weights = weights.reshape(len(weights), heads, predictions, samples)
+    flat_logits = logits.reshape(len(logits), heads, predictions, samples)
     maps = _maps_of_samples(level_shapes, heads, count)
     places, cells, shares = _room_for(heads * samples)
-    weights_of_samples = np.empty(heads * samples, np.float32)
+    weights, powers = np.empty(heads * samples, np.float32), np.empty(heads * samples, np.int32)
     for hit in range(begin, end):
         for head in range(heads):
             moved = flat_offsets[query[hit], head, prediction[hit]]
-            weighted = flat_weights[query[hit], head, prediction[hit]]
+            found = flat_logits[query[hit], head, prediction[hit]]
             for first in range(0, samples, heights):
                 for height in range(heights):
                     read, sample = first + height, head * samples + first + height
@@ -167,8 +168,9 @@ def sample_hits(values, level_shapes, points, offsets, weights, query, predictio
                     y = points[hit, height, 1] + moved[read, 1] / maps[1, sample]
                     places[0, sample] = x * maps[0, sample] - half
                     places[1, sample] = y * maps[1, sample] - half
-                    weights_of_samples[sample] = weighted[read]
-        _find_corners(places, weights_of_samples, maps, cells, shares)
+                    weights[sample] = found[read]
+        softmax_of_groups(weights, samples, powers)
+        _find_corners(places, weights, maps, cells, shares)
         _sum_heads(values, map_of_hit[hit], cells, shares, samples, out, hit)
 
 

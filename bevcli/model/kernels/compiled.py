@@ -41,23 +41,23 @@ class CompiledSampling(nn.Module):
         return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
 
 
-def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: Tensor, weights: Tensor) -> Tensor:
-    """The weighted sums (M, C) float32 of the M hits, without a table of their sampling locations. No gradients.
+def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: Tensor, logits: Tensor) -> Tensor:
+    """The weighted sums (M, C) float32 of the M hits, without tables of their locations and weights. No gradients.
 
     Args:
         values: (G, S, heads, C / heads), see `GridSampling`.
         level_shapes: (height, width) of each level.
         hits: the pairs of a map and a query.
         offsets: (B·Q, heads, maps, L, P, 2) float32, in cells of a level, from the reference points.
-        weights: (B·Q, heads, maps, L, P).
+        logits: (B·Q, heads, maps, L, P), of the weights.
     """
     from bevcli.model.kernels.bilinear import sample_hits as compiled  # loads the compiler
 
     map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_map)
     out = torch.empty(len(hits.query), *values.shape[2:])
     read = (as_array(values), np.asarray(level_shapes, dtype=np.int64))
-    of_hits = (*map(as_array, (hits.reference_points, offsets, weights)), hits.query.numpy(), hits.prediction.numpy())
-    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), _range_of(weights[:, :, 0]))
+    of_hits = (*map(as_array, (hits.reference_points, offsets, logits)), hits.query.numpy(), hits.prediction.numpy())
+    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), _range_of(logits[:, :, 0]))
     return out.flatten(1)
 
 

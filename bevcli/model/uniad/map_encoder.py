@@ -33,14 +33,14 @@ class FlatListAttention(DeformableAttention):
         """
         (heads, _, predicted, points), (levels, queries) = self.shape, (len(level_shapes), query.shape[1])
         read = -(-queries * levels // predicted)  # the queries whose offsets and weights are used
-        offsets, weights = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
+        offsets, logits = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
         offsets, reference = offsets[:, :, :, 0], reference_points[:, :read, None, None, None]
         if reference_points.shape[-1] == 2:
             locations = self.locations(reference, offsets, level_shapes)
         else:
             locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
         locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))  # (B, Q or more, heads, L, P, 2)
-        weights = weights.flatten(1, 4).unflatten(1, (-1, heads, levels))
+        weights = self.weights(logits).flatten(1, 4).unflatten(1, (-1, heads, levels))
         return locations[:, :queries], weights[:, :queries]
 
 
