@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -52,3 +53,15 @@ def test_vads_lines_futures_and_paths_are_counted():
     own_attention = 2 * 2 * tokens * tokens * channels  # products of queries and keys, and of weights and values
     backbone = 6 * RESNET50_OPERATIONS * (384 * 640) / 224**2
     assert backbone + own_attention < found < 1.5 * backbone
+
+
+def test_the_segmentation_head_is_counted():
+    """Its products with every BEV cell: five projections, and two layers of attention and of masks."""
+    config = load_config("demo")
+    cells, channels, head = config.bev_grid.rows * config.bev_grid.columns, config.channels, config.segmentation
+    queries = head.thing_queries + 3
+    projections = (2 * head.mask_layers + head.location_layers) * 2 * cells * channels**2
+    masks = head.mask_layers * 3 * 2 * queries * cells * channels
+    without = count_operations(replace(config, heads=("detection",)), HITS)
+    added = count_operations(config, HITS) - without
+    assert projections + masks < added < 1.1 * (projections + masks)

@@ -81,6 +81,8 @@ class BEVFormer(Network):
         query, position = self.bev_queries(torch.empty(1, 18)), self.bev_queries.position()
         bev: Tensor = self.encoder(query, position, features, hits, torch.empty_like(query), torch.empty(1, 2))
         self.decoder(bev, self.detection_head)
+        if self.segmentation_head is not None:
+            self.segmentation_head(bev, position)
         return bev
 
     @classmethod
