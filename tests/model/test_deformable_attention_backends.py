@@ -49,6 +49,9 @@ def test_hits_are_sampled_as_by_their_locations_and_weights(depth):
     locations = sampling_locations(points[:, None, None], found[0], level_sizes(shapes, offsets.device))
     expected = COMPILED(values, shapes, locations, found[1], counts)
     torch.testing.assert_close(sample_hits(values, shapes, hits, offsets, logits), expected)
+    logits[cells[3], :, hits.prediction[3]] = torch.nan
+    is_damaged = sample_hits(values, shapes, hits, offsets, logits).isnan().any(1)
+    assert is_damaged.nonzero().flatten().tolist() == [3]
 
 
 @pytest.mark.parametrize("threads", [1, 2])

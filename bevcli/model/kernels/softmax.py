@@ -1,4 +1,4 @@
-"""A compiled softmax over a few elements, for the weights of deformable attention: a part of the loops of `bilinear`."""
+"""The softmax of a few numbers inside the compiled loops of `bilinear`: the weights of deformable attention."""
 
 import numpy as np
 
