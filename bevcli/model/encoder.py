@@ -169,8 +169,9 @@ class TemporalSelfAttention(nn.Module):
         else:
             reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
             locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
-            by_map = (each.movedim(3, 1).flatten(0, 2) for each in (locations, self.attention.weights(logits)))
-            sampled = self.attention.sample(tokens, self.level_shapes, *by_map, queries_per_map)
+            locations = locations.movedim(3, 1).flatten(0, 2)
+            weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
+            sampled = self.attention.sample(tokens, self.level_shapes, locations, weights, queries_per_map)
         of_history, of_current = sampled.unflatten(0, (batch, 2, cells)).unbind(1)  # (B, Y·X, C) each
         return self.dropout(self.attention.output_projection((of_history + of_current) / 2))
 
