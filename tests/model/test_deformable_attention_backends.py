@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,6 +10,7 @@ from bevcli.benchmark.versions import PaddedSampling
 from bevcli.model.deformable_attention import GridSampling, Hits, level_sizes, sampling_locations
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
+from bevcli.model.kernels.softmax import softmax_of_groups
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
 PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()
@@ -118,3 +120,13 @@ def test_the_gpu_equals_the_cpu(dtype):
 def test_the_softmax_of_few_elements_equals_that_of_pytorch(elements):
     logits = 200 * torch.randn(50, 3, elements, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(softmax_of_few(logits), logits.softmax(-1))
+
+
+@pytest.mark.parametrize("count", [4, 6, 8, 32])
+def test_the_compiled_softmax_equals_that_of_pytorch(count):
+    logits = 50 * torch.randn(3 * count, generator=torch.Generator().manual_seed(0))
+    logits[0], logits[count] = torch.nan, torch.inf
+    found = logits.numpy().copy()
+    softmax_of_groups(found, count, np.empty(len(found), np.int32))
+    expected = logits.view(3, count).softmax(-1).flatten()
+    torch.testing.assert_close(torch.from_numpy(found), expected, equal_nan=True)

@@ -17,11 +17,13 @@ def softmax_of_groups(numbers, count, powers):  # type: ignore[no-untyped-def]
 
     powers: (K,) int32, room for intermediate results.
     """
-    # With a constant count, several groups are computed at once.
+    # The loops over a constant count need no branches. These are the counts of the published models.
     if count == 4:
         _subtract_largest(numbers, 4)
     elif count == 8:
         _subtract_largest(numbers, 8)
+    elif count == 32:
+        _subtract_largest(numbers, 32)
     else:
         _subtract_largest(numbers, count)
     _exponentials(numbers, powers)
@@ -29,6 +31,8 @@ def softmax_of_groups(numbers, count, powers):  # type: ignore[no-untyped-def]
         _divide_by_sums(numbers, 4)
     elif count == 8:
         _divide_by_sums(numbers, 8)
+    elif count == 32:
+        _divide_by_sums(numbers, 32)
     else:
         _divide_by_sums(numbers, count)
 
