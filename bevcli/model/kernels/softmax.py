@@ -19,22 +19,21 @@ def softmax_of_groups(numbers, count, powers):  # type: ignore[no-untyped-def]
     """
     # The loops over a constant count need no branches. These are the counts of the published models.
     if count == 4:
-        _subtract_largest(numbers, 4)
+        _softmax(numbers, 4, powers)
     elif count == 8:
-        _subtract_largest(numbers, 8)
+        _softmax(numbers, 8, powers)
     elif count == 32:
-        _subtract_largest(numbers, 32)
+        _softmax(numbers, 32, powers)
     else:
-        _subtract_largest(numbers, count)
+        _softmax(numbers, count, powers)
+
+
+@njit(nogil=True, inline="always")
+def _softmax(numbers, count, powers):  # type: ignore[no-untyped-def]
+    """As `softmax_of_groups`."""
+    _subtract_largest(numbers, count)
     _exponentials(numbers, powers)
-    if count == 4:
-        _divide_by_sums(numbers, 4)
-    elif count == 8:
-        _divide_by_sums(numbers, 8)
-    elif count == 32:
-        _divide_by_sums(numbers, 32)
-    else:
-        _divide_by_sums(numbers, count)
+    _divide_by_sums(numbers, count)
 
 
 @njit(nogil=True, fastmath={"contract", "reassoc", "nsz"}, inline="always")
@@ -48,7 +47,7 @@ def _subtract_largest(numbers, count):  # type: ignore[no-untyped-def]
             numbers[i] -= largest
 
 
-@njit(nogil=True, fastmath={"contract"}, inline="always")
+@njit(nogil=True, fastmath={"contract"}, inline="never")
 def _exponentials(numbers, powers):  # type: ignore[no-untyped-def]
     """Replaces numbers by their exponentials: a power of 2 times that of a small rest, by its Taylor series."""
     half, one = np.float32(0.5), np.float32(1)
