@@ -222,7 +222,7 @@ def prepare_training(
     check_training_seeds(data.rendered or ())
     if data.split is not None and options.held_out is not None:
         raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
-    rigs = config.rigs if config.rigs.random_share > 0 else None
+    rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     own = None if data.split is None and config.held_out == 0 else evaluated
     notes = check_training_drives(data, drives, own, config.clips, model_config)
