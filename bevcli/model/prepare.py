@@ -7,12 +7,14 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
+from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
@@ -51,9 +53,11 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     choose_kernels(network, device)
     dtype = DTYPES[precision]
     for part in network.image_parts:
-        part.to(dtype)
-    for part in network.image_parts[:1]:
-        part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
+        alone = isinstance(part, Backbone) and part.by_image and device.type == "cpu"
+        own = torch.float32 if alone else dtype
+        part.to(own).register_forward_pre_hook(partial(_cast, own))
+        if alone:
+            add_to_class(part, ImageByImage)
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
     for name, module in list(network.named_modules()):
@@ -84,6 +88,20 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
     """Puts the methods of an addition before those of this one module, in place; its other parts stay as they are."""
     module.__class__ = type(type(module).__name__, (addition, type(module)), {})
+
+
+def _cast(dtype: torch.dtype, part: nn.Module, inputs: tuple[Tensor | Sequence[Tensor]]) -> tuple[Any]:
+    """The images, or the maps, that enter a part, in its dtype."""
+    return (inputs[0].to(dtype) if isinstance(inputs[0], Tensor) else [x.to(dtype) for x in inputs[0]],)
+
+
+class ImageByImage(nn.Module):
+    """Added to a backbone that runs on one image at a time."""
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """As `Backbone.forward`."""
+        each = [super(ImageByImage, self).forward(image) for image in images.split(1)]
+        return [torch.cat(maps) for maps in zip(*each, strict=True)]
 
 
 def _check_finite(model: nn.Module) -> None:
