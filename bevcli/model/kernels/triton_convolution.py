@@ -16,7 +16,11 @@ from torch import Tensor
 
 from bevcli.model.kernels.triton_bilinear import corner_of
 
-POSITIONS_PER_PROGRAM = 32  # of the kernels that read or write the columns
+# Positions, channels, taps and outputs that a program takes, or takes at a time; its warps and stages.
+COLUMN_TILES = {"BLOCK": 16, "BLOCK_CHANNELS": 128, "TAPS": 9}
+GRADIENT_TILES = {"BLOCK": 16, "BLOCK_CHANNELS": 64, "TAPS": 1}
+CONVOLUTION_TILES = {"BLOCK": 64, "BLOCK_CHANNELS": 64, "BLOCK_OUTPUTS": 256, "num_warps": 8, "num_stages": 1}
+FIRST_WITH_MATRIX_UNITS = (8, 0)  # compute capability, of those that Triton uses
 COLUMN_BYTES = 512 << 20  # of the columns that exist at a time
 
 
@@ -39,9 +43,9 @@ class _Convolution(torch.autograd.Function):
         out = x.new_empty(shape)
         # Triton launches on the current GPU, which need not be that of the tensors.
         with torch.cuda.device(x.device):
-            if x.dtype == torch.float32:
+            if x.dtype == torch.float32 or not _has_matrix_units(x.device):
                 _by_columns(x, predicted, weight, bias, stride, out)
-            elif out.numel():
+            else:
                 _in_one_kernel(x, predicted, weight, bias, stride, out)
         return out.permute(0, 3, 1, 2)  # (B, O, H', W')
 
@@ -57,14 +61,18 @@ class _Convolution(torch.autograd.Function):
             for part in _parts(x, predicted):
                 of_part = gradient[part].flatten(0, 2)  # (positions, O)
                 weight_gradient += of_part.T @ _columns(x[part], predicted[part], context.stride)
-                _add_gradients(
-                    x[part], predicted[part], of_part @ rows, context.stride, x_gradient[part], predicted_gradient[part]
-                )
+                tensors = (x[part], predicted[part], of_part @ rows, x_gradient[part], predicted_gradient[part])
+                _launch(_add_gradients, *tensors, stride=context.stride, **GRADIENT_TILES)
         weight_gradient = weight_gradient.view(len(weight), 3, 3, -1).permute(0, 3, 1, 2)
         bias_gradient = gradient.sum((0, 1, 2), dtype=torch.float32)
         learned = (x_gradient, predicted_gradient, weight_gradient, bias_gradient)
         dtypes = (x.dtype, predicted.dtype, weight.dtype, weight.dtype)
         return *(each.to(dtype) for each, dtype in zip(learned, dtypes, strict=True)), None
+
+
+def _has_matrix_units(device: torch.device) -> bool:
+    """Whether Triton multiplies halves on the matrix units of the GPU."""
+    return torch.cuda.get_device_capability(device) >= FIRST_WITH_MATRIX_UNITS
 
 
 def _channels_last(x: Tensor) -> Tensor:
@@ -92,64 +100,37 @@ def _by_columns(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stri
 
 def _columns(x: Tensor, predicted: Tensor, stride: int) -> Tensor:
     """The samples of all taps times their masks: (positions, 9 · C)."""
-    positions, channels = predicted[:, 0].numel(), x.shape[1]
-    columns = x.new_empty(positions, 9 * channels)
-    if positions:
-        grid = (triton.cdiv(positions, POSITIONS_PER_PROGRAM), 9)
-        _write_columns[grid](x, predicted, columns, positions, *_sizes(x, predicted), **constants(channels, stride))
+    columns = x.new_empty(predicted[:, 0].numel(), 9 * x.shape[1])
+    _launch(_write_columns, x, predicted, columns, stride=stride, **COLUMN_TILES)
     return columns
 
 
-def _add_gradients(
-    x: Tensor, predicted: Tensor, columns_gradient: Tensor, stride: int, x_gradient: Tensor, predicted_gradient: Tensor
-) -> None:
-    """Adds to x_gradient, and writes predicted_gradient; both are float32 and channels last."""
+def _launch(kernel: Any, x: Tensor, predicted: Tensor, *others: Tensor, stride: int, **tiles: int) -> None:
+    """Starts a program for each block of positions, group of taps and block of outputs that the tiles ask for."""
     positions = predicted[:, 0].numel()
     if positions:
-        grid = (triton.cdiv(positions, POSITIONS_PER_PROGRAM), 9)
-        tensors = (x, predicted, columns_gradient, x_gradient, predicted_gradient)
-        _add_gradients_of_columns[grid](*tensors, positions, *_sizes(x, predicted), **constants(x.shape[1], stride))
+        chosen = constants(x.shape[1], stride, **tiles)
+        rest = 9 // chosen["TAPS"] if "TAPS" in chosen else triton.cdiv(chosen["OUTPUTS"], chosen["BLOCK_OUTPUTS"])
+        grid = (triton.cdiv(positions, chosen["BLOCK"]) * rest,)
+        kernel[grid](x, predicted, *others, positions, *x.shape[2:], *predicted.shape[2:], **chosen)
 
 
-def _in_one_kernel(
-    x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stride: int, out: Tensor, **tiles: Any
-) -> None:
-    """Writes the result to out (B, H', W', O); the samples stay on the chip. tiles: other than those of `tiles_of`."""
-    positions, outputs, channels = predicted[:, 0].numel(), len(weight), x.shape[1]
-    chosen = {**tiles_of(channels, outputs), **tiles}
-    grid = (triton.cdiv(positions, chosen["BLOCK"]) * triton.cdiv(outputs, chosen["BLOCK_OUTPUTS"]),)
-    sizes = _sizes(x, predicted)
-    _convolve[grid](
-        x,
-        predicted,
-        _rows(weight),
-        bias,
-        out,
-        positions,
-        *sizes,
-        CHANNELS=channels,
-        OUTPUTS=outputs,
-        STRIDE=stride,
-        **chosen,
-    )
+def _in_one_kernel(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stride: int, out: Tensor) -> None:
+    """Writes the result to out (B, H', W', O); the samples stay on the chip."""
+    _launch(_convolve, x, predicted, _rows(weight), bias, out, stride=stride, **output_tiles(len(weight)))
 
 
-def _sizes(x: Tensor, predicted: Tensor) -> tuple[int, int, int, int]:
-    return (*x.shape[2:], *predicted.shape[2:])  # type: ignore[return-value]
+def constants(channels: int, stride: int, **tiles: int) -> dict[str, int]:
+    """The arguments that a kernel is compiled for: `COLUMN_TILES`, `GRADIENT_TILES` or `output_tiles`."""
+    # A matrix unit multiplies tiles of at least 16.
+    block = min(max(triton.next_power_of_2(channels), 16), tiles["BLOCK_CHANNELS"])
+    return {"CHANNELS": channels, "STRIDE": stride, **tiles, "BLOCK_CHANNELS": block}
 
 
-def constants(channels: int, stride: int) -> dict[str, int]:
-    """The arguments that the kernels of the columns are compiled for."""
-    block = min(triton.next_power_of_2(channels), 128)
-    return {"CHANNELS": channels, "STRIDE": stride, "BLOCK": POSITIONS_PER_PROGRAM, "BLOCK_CHANNELS": block}
-
-
-def tiles_of(channels: int, outputs: int) -> dict[str, int]:
-    """The tiles of the one kernel. A matrix unit multiplies tiles of at least 16."""
-    block_channels = min(max(triton.next_power_of_2(channels), 16), 64)
-    block_outputs = min(max(triton.next_power_of_2(outputs), 16), 256)
-    tiles = {"BLOCK": 64, "BLOCK_CHANNELS": block_channels, "BLOCK_OUTPUTS": block_outputs}
-    return {**tiles, "num_warps": 8, "num_stages": 2}
+def output_tiles(outputs: int) -> dict[str, int]:
+    """The tiles of the kernel that convolves."""
+    block = min(max(triton.next_power_of_2(outputs), 16), CONVOLUTION_TILES["BLOCK_OUTPUTS"])
+    return {"OUTPUTS": outputs, **CONVOLUTION_TILES, "BLOCK_OUTPUTS": block}
 
 
 @triton.jit
@@ -245,22 +226,25 @@ def _write_columns(  # type: ignore[no-untyped-def]
     STRIDE: tl.constexpr,
     BLOCK: tl.constexpr,
     BLOCK_CHANNELS: tl.constexpr,
+    TAPS: tl.constexpr,
 ):
-    """One program writes the samples of one tap at BLOCK positions to columns (positions, 9, C)."""
-    position = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    tap = tl.program_id(1)
+    """One program writes the samples of TAPS taps at BLOCK positions to columns (positions, 9, C)."""
+    groups: tl.constexpr = 9 // TAPS
+    position = tl.program_id(0) // groups * BLOCK + tl.arange(0, BLOCK)
     exists = position < positions
-    first_cell, y, x, mask = _tap(predicted, position, exists, tap, height, width, out_height, out_width, STRIDE)
-    target = columns + (position.to(tl.int64) * 9 + tap)[:, None] * CHANNELS
-    for first in range(0, CHANNELS, BLOCK_CHANNELS):
-        channel = first + tl.arange(0, BLOCK_CHANNELS)
-        sampled = _sampled(values, first_cell, y, x, mask, exists, channel, height, width, CHANNELS, BLOCK_CHANNELS)
-        written = exists[:, None] & (channel < CHANNELS)[None, :]
-        tl.store(target + channel[None, :], sampled.to(columns.dtype.element_ty), written)
+    for index in range(TAPS):
+        tap = tl.program_id(0) % groups * TAPS + index
+        first_cell, y, x, mask = _tap(predicted, position, exists, tap, height, width, out_height, out_width, STRIDE)
+        target = columns + (position.to(tl.int64) * 9 + tap)[:, None] * CHANNELS
+        for first in range(0, CHANNELS, BLOCK_CHANNELS):
+            channel = first + tl.arange(0, BLOCK_CHANNELS)
+            sampled = _sampled(values, first_cell, y, x, mask, exists, channel, height, width, CHANNELS, BLOCK_CHANNELS)
+            written = exists[:, None] & (channel < CHANNELS)[None, :]
+            tl.store(target + channel[None, :], sampled.to(columns.dtype.element_ty), written)
 
 
 @triton.jit
-def _add_gradients_of_columns(  # type: ignore[no-untyped-def]
+def _add_gradients(  # type: ignore[no-untyped-def]
     values,
     predicted,
     columns_gradient,
@@ -275,34 +259,39 @@ def _add_gradients_of_columns(  # type: ignore[no-untyped-def]
     STRIDE: tl.constexpr,
     BLOCK: tl.constexpr,
     BLOCK_CHANNELS: tl.constexpr,
+    TAPS: tl.constexpr,
 ):
-    """One program takes one tap at BLOCK positions: adds to values_gradient, writes predicted_gradient, both float32.
+    """One program takes TAPS taps at BLOCK positions: adds to values_gradient, writes predicted_gradient, both float32.
 
     columns_gradient: (positions, 9, C). The gradients are laid out as what they are the gradients of.
     """
-    position = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    tap = tl.program_id(1)
+    groups: tl.constexpr = 9 // TAPS
+    position = tl.program_id(0) // groups * BLOCK + tl.arange(0, BLOCK)
     exists = position < positions
-    first_cell, y, x, mask = _tap(predicted, position, exists, tap, height, width, out_height, out_width, STRIDE)
-    of_y = tl.zeros((BLOCK,), tl.float32)
-    of_x = tl.zeros((BLOCK,), tl.float32)
-    of_mask = tl.zeros((BLOCK,), tl.float32)
-    source = columns_gradient + (position.to(tl.int64) * 9 + tap)[:, None] * CHANNELS
-    for first in range(0, CHANNELS, BLOCK_CHANNELS):
-        channel = first + tl.arange(0, BLOCK_CHANNELS)
-        has_channel = channel < CHANNELS
-        gradient = tl.load(source + channel[None, :], exists[:, None] & has_channel[None, :], 0.0).to(tl.float32)
-        for corner in tl.static_range(4):
-            cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
-            place = cell[:, None] * CHANNELS + channel[None, :]
-            read = inside[:, None] & has_channel[None, :]
-            value = tl.load(values + place, read, 0.0).to(tl.float32)
-            tl.atomic_add(values_gradient + place, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed")
-            product = tl.sum(value * gradient, 1)
-            of_mask += of_rows * of_columns * product
-            of_y += (corner // 2 * 2 - 1) * of_columns * product
-            of_x += (corner % 2 * 2 - 1) * of_rows * product
-    address = predicted_gradient + position.to(tl.int64) * 27
-    tl.store(address + 2 * tap, of_y * mask, exists)
-    tl.store(address + 2 * tap + 1, of_x * mask, exists)
-    tl.store(address + 18 + tap, of_mask * mask * (1.0 - mask), exists)
+    for index in range(TAPS):
+        tap = tl.program_id(0) % groups * TAPS + index
+        first_cell, y, x, mask = _tap(predicted, position, exists, tap, height, width, out_height, out_width, STRIDE)
+        of_y = tl.zeros((BLOCK,), tl.float32)
+        of_x = tl.zeros((BLOCK,), tl.float32)
+        of_mask = tl.zeros((BLOCK,), tl.float32)
+        source = columns_gradient + (position.to(tl.int64) * 9 + tap)[:, None] * CHANNELS
+        for first in range(0, CHANNELS, BLOCK_CHANNELS):
+            channel = first + tl.arange(0, BLOCK_CHANNELS)
+            has_channel = channel < CHANNELS
+            gradient = tl.load(source + channel[None, :], exists[:, None] & has_channel[None, :], 0.0).to(tl.float32)
+            for corner in tl.static_range(4):
+                cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
+                place = cell[:, None] * CHANNELS + channel[None, :]
+                read = inside[:, None] & has_channel[None, :]
+                value = tl.load(values + place, read, 0.0).to(tl.float32)
+                tl.atomic_add(
+                    values_gradient + place, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed"
+                )
+                product = tl.sum(value * gradient, 1)
+                of_mask += of_rows * of_columns * product
+                of_y += (corner // 2 * 2 - 1) * of_columns * product
+                of_x += (corner % 2 * 2 - 1) * of_rows * product
+        address = predicted_gradient + position.to(tl.int64) * 27
+        tl.store(address + 2 * tap, of_y * mask, exists)
+        tl.store(address + 2 * tap + 1, of_x * mask, exists)
+        tl.store(address + 18 + tap, of_mask * mask * (1.0 - mask), exists)
