@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
+from bevcli.recording.components import Components, components, ui_points
 
 NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
@@ -91,12 +92,13 @@ LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 # Of the image's width and height, for a view that is a third of the screen wide.
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
-UNSEEN = rr.Radius.ui_points(0.01)  # of a point that shows only its label
+UNSEEN = ui_points(0.01)  # of a point that shows only its label
 
 
-def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> rr.Points2D:
+def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> Components:
     """Texts at places (L, 2), in the units of their view. options: of `rr.Points2D`."""
-    return rr.Points2D(places, labels=texts, radii=UNSEEN, show_labels=True, **options)
+    positions = np.asarray(places)
+    return components(rr.Points2D, positions=positions, labels=texts, radii=UNSEEN, show_labels=True, **options)
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:

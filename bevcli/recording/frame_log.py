@@ -15,6 +15,7 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.components import any_values, components
 from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import CameraImages, PosedCamera
@@ -83,7 +84,8 @@ class FrameLog:
         self._log_results(prediction, cameras)
         if self._kept.world_from_ego is None:
             log_static.log_curve_names(self._stream, prediction.stage_seconds, self._recorded.classes)
-        self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
+        seconds = np.array(list(prediction.stage_seconds.values()))
+        self._stream.log(entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
         self._log_frame_events(frame, prediction)
         if self._options.shows_internals:
             self._log_internals(frame, prediction, cameras)
@@ -110,7 +112,7 @@ class FrameLog:
         self._stream.log(
             entities.EGO,
             log_cameras.transform(pose),
-            rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
+            any_values(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
         if self._recorded.drive.has_ego_motion:
             log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
@@ -120,8 +122,10 @@ class FrameLog:
             log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
             poses = (before, frame.world_from_ego)
-            piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
-            self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
+            piece = np.array([[self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]])
+            self._stream.log(
+                entities.TRAJECTORY, components(rr.LineStrips3D, strips=piece, colors=EGO_COLOR, radii=0.06)
+            )
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
@@ -166,8 +170,8 @@ class FrameLog:
         colors, texts = log_boxes.box_colors(shown, names), box_labels(shown)
         for posed in cameras:
             log_cameras.log_boxes_in_image(stream, posed, in_world, colors, texts)
-        counts = [float((shown.classes == name).sum()) for name in names]
-        stream.log(entities.BOX_CURVES, rr.Scalars(counts))
+        counts = np.array([(shown.classes == name).sum() for name in names])
+        stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
     def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
         """Writes lines of the map, futures and planned paths of a model that has further results."""

@@ -13,7 +13,8 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
 from bevcli.recording.box_lines import cut_to_image
 from bevcli.recording.colors import EGO_COLOR, Color, line_colors
-from bevcli.recording.log_boxes import box_colors, line_strips
+from bevcli.recording.components import components, line_strips, ui_points
+from bevcli.recording.log_boxes import box_colors
 from bevcli.recording.log_cameras import PosedCamera
 
 FUTURES = "futures"
@@ -127,12 +128,15 @@ def log_ground_lines(
     stream: rr.RecordingStream, lines: GroundLines, world_from_bev: Array, cameras: Sequence[PosedCamera]
 ) -> None:
     """Writes lines in the recording's world; without any, those of the frame before are cleared."""
-    colors, radii = list(lines.colors) or None, rr.Radius.ui_points(lines.width)
+    colors = np.array(lines.colors, np.uint8) if len(lines.colors) else None
+    radii = ui_points(lines.width)
     in_space = line_strips([strip + ABOVE_GROUND for strip in lines.strips], 3)
-    stream.log(f"{entities.WORLD}/{lines.kind}", rr.LineStrips3D(in_space, colors=colors, radii=radii))
+    solid = components(rr.LineStrips3D, strips=in_space, colors=colors, radii=radii)
+    stream.log(f"{entities.WORLD}/{lines.kind}", solid)
     bev_from_world = inverse(world_from_bev)
     flat = line_strips([apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in lines.strips], 2)
-    stream.log(f"{entities.BEV}/{lines.kind}", rr.LineStrips2D(flat, colors=colors, radii=radii, draw_order=24))
+    from_above = components(rr.LineStrips2D, strips=flat, colors=colors, radii=radii, draw_order=24)
+    stream.log(f"{entities.BEV}/{lines.kind}", from_above)
     for posed in cameras:
         _log_in_image(stream, lines, posed)
 
@@ -143,7 +147,6 @@ def _log_in_image(stream: rr.RecordingStream, lines: GroundLines, posed: PosedCa
     ends = apply(posed.camera_from_world, np.concatenate([np.zeros((0, 2, 3)), *pieces]))
     found = cut_to_image(ends, owners, posed.camera)
     colors = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4)[found.owners]
-    strips = rr.LineStrips2D(
-        found.segments.astype(np.float32), colors=colors, radii=rr.Radius.ui_points(lines.width), draw_order=15
-    )
+    radii = ui_points(lines.width)
+    strips = components(rr.LineStrips2D, strips=found.segments, colors=colors, radii=radii, draw_order=15)
     stream.log(entities.overlay(posed.name, lines.kind), strips)

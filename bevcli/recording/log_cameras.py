@@ -14,10 +14,11 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
 from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_image
 from bevcli.recording.colors import colormap
+from bevcli.recording.components import Components, blob, components, ui_points
 from bevcli.recording.video_images import Av1Encoder
 
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
-POINT = rr.Radius.ui_points(2.0)
+POINT = ui_points(2.0)
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,10 @@ class PosedCamera:
         return inverse(self.world_from_camera)
 
 
-def transform(parent_from_entity: Array) -> rr.Transform3D:
+def transform(parent_from_entity: Array) -> Components:
     """The pose (4, 4) of an entity in its parent, for a recording."""
-    return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
+    columns = parent_from_entity[:3, :3].T
+    return components(rr.Transform3D, translation=parent_from_entity[:3, 3], mat3x3=columns)
 
 
 class CameraImages:
@@ -78,12 +80,12 @@ class CameraImages:
             encoder.close()
 
 
-def _encoded(image: CameraImage) -> rr.EncodedImage:
+def _encoded(image: CameraImage) -> Components:
     contents, media_type = image.encoded, image.media_type
     if contents is None or media_type is None:
         _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         contents, media_type = data.tobytes(), "image/jpeg"
-    return rr.EncodedImage(contents=contents, media_type=media_type)
+    return components(rr.EncodedImage, blob=blob(contents), media_type=media_type)
 
 
 def log_boxes_in_image(
@@ -109,9 +111,9 @@ def log_ground_truth_in_image(
     stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
 
 
-def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> rr.LineStrips2D:
-    segments, radii = lines.segments.astype(np.float32), rr.Radius.ui_points(width)
-    return rr.LineStrips2D(segments, colors=colors[lines.owners], radii=radii, draw_order=draw_order)
+def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:
+    own, radii = colors[lines.owners], ui_points(width)
+    return components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=radii, draw_order=draw_order)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
@@ -121,7 +123,7 @@ def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world
     """
     pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
     hits = posed.camera.contains(pixels, depth)
-    points = rr.Points2D(pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
+    points = components(rr.Points2D, positions=pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
     stream.log(entities.overlay(posed.name, "pillars"), points)
 
 
