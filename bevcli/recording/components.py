@@ -36,7 +36,7 @@ class _Component(rr.DescribedComponentBatch):
 def components(archetype: type[Any], **fields: Any) -> Components:
     """The components of an archetype. fields: by the names of `archetype.from_fields`; None leaves one out.
 
-    A field is an Arrow array of the component's type, an array of numbers ((N, 3) or (N, 4) uint8 for colours), a list
+    A field is an Arrow array of the component's type, an array of numbers (colours as `packed` takes or returns), a list
     of texts, or whatever rerun takes. A value that can be hashed is converted once.
     """
     found: Components = []
@@ -112,7 +112,7 @@ _constant = lru_cache(maxsize=CONSTANTS)(_by_rerun)
 
 def _numbers(value: NDArray[Any], kind: pa.DataType) -> pa.Array:
     if pa.types.is_uint32(kind) and value.dtype == np.uint8:
-        return pa.array(_packed(value))
+        return pa.array(packed(value))
     if pa.types.is_list(kind):  # strips (N, points, 2 or 3)
         offsets = np.arange(len(value) + 1, dtype=np.int32) * np.int32(value.shape[1])
         return _lists(value.reshape(-1, value.shape[2]), offsets, kind)
@@ -132,7 +132,7 @@ def _vectors(value: NDArray[Any], kind: pa.DataType) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(numbers), type=kind)
 
 
-def _packed(colors: NDArray[np.uint8]) -> NDArray[np.uint32]:
+def packed(colors: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """Colours (N, 3 or 4) -> (N,), red in the highest byte, then green, blue and opacity."""
     if colors.shape[-1] == 3:
         opaque = np.full((len(colors), 4), 255, np.uint8)

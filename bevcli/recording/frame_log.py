@@ -15,7 +15,7 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.components import any_values, components
+from bevcli.recording.components import any_values, components, packed
 from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import CameraImages, PosedCamera
@@ -168,8 +168,7 @@ class FrameLog:
             in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
         colors, texts = log_boxes.box_colors(shown, names), box_labels(shown)
-        for posed in cameras:
-            log_cameras.log_boxes_in_image(stream, posed, in_world, colors, texts)
+        log_cameras.log_boxes_in_images(stream, cameras, in_world, colors, texts)
         counts = np.array([(shown.classes == name).sum() for name in names])
         stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
@@ -193,8 +192,7 @@ class FrameLog:
         colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
         log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
-        for posed in cameras:
-            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
+        log_cameras.log_ground_truth_in_images(self._stream, cameras, in_world, colors)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in WARNINGS:
@@ -232,7 +230,7 @@ class FrameLog:
         if self._pillars is None:
             self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
             log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
-        colors = log_static.pillar_colors(prediction.grid, len(self._pillars))
+        colors = packed(log_static.pillar_colors(prediction.grid, len(self._pillars)))
         points = apply(self._world_from_bev(prediction), self._pillars.reshape(-1, 3))
         for posed in cameras:
             if posed.name in frame.images:

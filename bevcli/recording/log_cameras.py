@@ -12,7 +12,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_image
+from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_images
 from bevcli.recording.colors import colormap
 from bevcli.recording.components import Components, blob, components, ui_points
 from bevcli.recording.video_images import Av1Encoder
@@ -88,27 +88,30 @@ def _encoded(image: CameraImage) -> Components:
     return components(rr.EncodedImage, blob=blob(contents), media_type=media_type)
 
 
-def log_boxes_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, colors: np.ndarray, texts: list[str]
+def log_boxes_in_images(
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], boxes: Boxes3D, colors: np.ndarray, texts: list[str]
 ) -> None:
-    """Draws predicted boxes (in the recording's world) into the image: lines and labels.
+    """Draws predicted boxes (in the recording's world) into the images: lines and labels.
 
     colors: (N, 3) uint8. texts: the label of each box.
     """
-    name = posed.name
-    lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
-    stream.log(entities.overlay(name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-    places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
-    labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-    stream.log(entities.overlay(name, "boxes/labels"), labels)
+    for posed, lines in zip(cameras, _lines_of(boxes, cameras), strict=True):
+        stream.log(entities.overlay(posed.name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
+        places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
+        labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
+        stream.log(entities.overlay(posed.name, "boxes/labels"), labels)
 
 
-def log_ground_truth_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, colors: np.ndarray
+def log_ground_truth_in_images(
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], truth: Boxes3D, colors: np.ndarray
 ) -> None:
-    """Draws ground-truth boxes (in the recording's world) into the image. colors: (M, 3) uint8."""
-    lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
-    stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
+    """Draws ground-truth boxes (in the recording's world) into the images. colors: (M, 3) uint8."""
+    for posed, lines in zip(cameras, _lines_of(truth, cameras), strict=True):
+        stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
+
+
+def _lines_of(boxes: Boxes3D, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
+    return lines_in_images(boxes, [one.camera for one in cameras], [one.camera_from_world for one in cameras])
 
 
 def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:
@@ -119,7 +122,7 @@ def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
     """Draws the projections of 3D reference points into the image, where they are inside of it.
 
-    points_world: (K, 3) in the recording's world, metres. colors: (K, 3) uint8 RGB.
+    points_world: (K, 3) in the recording's world, metres. colors: (K,) of `packed`.
     """
     pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
     hits = posed.camera.contains(pixels, depth)

@@ -80,7 +80,7 @@ def log_tracks(
     history.add(boxes, stamp)
     ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
     shown: set[str] = set()
-    flat, flat_colors = [], []
+    drawn, flat_colors = [], []
     for i, name in enumerate(track_names(boxes)):
         if not name:
             continue
@@ -95,10 +95,12 @@ def log_tracks(
         strips = line_strips([ahead[i], outlines[i], *trail], 3)
         stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)
         shown.add(entity)
-        flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
+        drawn += [ahead[i], *trail]
         flat_colors += own_colors[:: 2 if trail else 3]
     of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
-    trails = components(rr.LineStrips2D, strips=line_strips(flat, 2), colors=of_strips, radii=THIN, draw_order=25)
+    flat = apply(bev_from_world, np.concatenate([np.zeros((0, 3)), *drawn]))[:, :2] * (1, -1)
+    strips = line_strips(np.split(flat, np.cumsum([len(strip) for strip in drawn])[:-1]) if drawn else (), 2)
+    trails = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
     stream.log(entities.BEV_TRACKS, trails)
     for entity in set(history.shown) - shown:
         stream.log(entity, rr.Clear(recursive=False))
