@@ -36,8 +36,8 @@ class _Component(rr.DescribedComponentBatch):
 def components(archetype: type[Any], **fields: Any) -> Components:
     """The components of an archetype. fields: by the names of `archetype.from_fields`; None leaves one out.
 
-    A field is an Arrow array of the component's type, an array of numbers (colours as `packed` takes or returns), a list
-    of texts, or whatever rerun takes. A value that can be hashed is converted once.
+    A field is an Arrow array of the component's type, an array of numbers (colours as `packed` takes or returns them),
+    a list of texts, or whatever rerun takes. A value that can be hashed is converted once.
     """
     found: Components = []
     for name, value in fields.items():

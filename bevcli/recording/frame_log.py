@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
@@ -52,7 +53,8 @@ class FrameLog:
         self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
-        self._pillars: Array | None = None
+        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # positions (cells, Z, 3), and packed colours
+        self._object_classes = recorded.model.config.object_classes
         self._images = CameraImages(stream, as_video=self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
         self._bev_images = BevImages(self._options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
@@ -161,7 +163,7 @@ class FrameLog:
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
-        log_class_meshes(stream, in_world, self._recorded.model.config.object_classes)
+        log_class_meshes(stream, in_world, self._object_classes)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
         log_tracks(stream, self._kept.tracks, in_world, frame.stamp, inverse(world_from_bev), names)
         if self._geo_origin is not None:
@@ -228,10 +230,11 @@ class FrameLog:
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
-            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
-        colors = packed(log_static.pillar_colors(prediction.grid, len(self._pillars)))
-        points = apply(self._world_from_bev(prediction), self._pillars.reshape(-1, 3))
+            drawn = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
+            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, drawn)
+            self._pillars = drawn, packed(log_static.pillar_colors(prediction.grid, len(drawn)))
+        pillars, colors = self._pillars
+        points = apply(self._world_from_bev(prediction), pillars.reshape(-1, 3))
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)

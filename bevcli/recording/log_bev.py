@@ -141,7 +141,7 @@ def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_
     contents = replace(segmentation, cells=np.arange(256, dtype=np.uint8))
     for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
         palette[contents.layer(name)] = color
-    painted = _Painted(palette[segmentation.cells])
+    painted = _Painted(palette.take(segmentation.cells, axis=0))
     stream.log(entities.BEV_SEGMENTATION, painted.flat(segmentation, draw_order=-5))
     stream.log(entities.SEGMENTATION_ON_GROUND, painted.on_ground(segmentation, ego_from_bev, 255))
 

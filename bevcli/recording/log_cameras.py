@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ class PosedCamera:
         """The camera's name."""
         return self.camera.name
 
-    @property
+    @cached_property
     def camera_from_world(self) -> Array:
         """(4, 4) from the recording's world."""
         return inverse(self.world_from_camera)
