@@ -70,9 +70,25 @@ def randomised(images: Tensor, config: RandomisationConfig, image: ImageConfig, 
     x = images.flatten(0, -4)  # (M, 3, H, W)
     y = _blurred(_recolored(_convolved(x, config, generator), config, image, generator), config, generator)
     y = _noisy(y, config, image, generator)
+    return (y * _inside(x)).view_as(images)
+
+
+def renormalised(images: Tensor, image: ImageConfig, other: ImageConfig) -> Tensor:
+    """Images (..., 3, H, W), normalised as one model takes them, as another model takes them. Padding stays zero."""
+    x = images.flatten(0, -4)
+    std, mean, other_std, other_mean = (
+        upload(torch.tensor(values)[:, None, None], x.device)
+        for values in (image.std, image.mean, other.std, other.mean)
+    )
+    y = x * std + mean
+    y = y if image.color_order == other.color_order else y.flip(1)
+    return ((y - other_mean) / other_std * _inside(x)).view_as(images)
+
+
+def _inside(x: Tensor) -> Tensor:
+    """(M, 1, H, W) bool: the rows and columns of images (M, 3, H, W) that are no padding; none where one is missing."""
     shown = x.ne(0)
-    inside = shown.any(dim=3, keepdim=True).any(1, keepdim=True) & shown.any(dim=2, keepdim=True).any(1, keepdim=True)
-    return (y * inside).view_as(images)
+    return shown.any(dim=3, keepdim=True).any(1, keepdim=True) & shown.any(dim=2, keepdim=True).any(1, keepdim=True)
 
 
 def randomised_inputs(

@@ -23,7 +23,7 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs
 from bevcli.training import files
-from bevcli.training.frame_losses import FrameLosses, Teacher
+from bevcli.training.frame_losses import FrameLosses, Lesson, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.training.randomisation import randomised_inputs
 from bevcli.training.samples import Batch, draw_clips, load_batch
@@ -155,7 +155,7 @@ class Trainer:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
-        self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
+        self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self._frozen: FrozenStages | None = None
         if job.config.frozen_stages:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
@@ -212,7 +212,7 @@ class Trainer:
         job, config = self.job, self.job.config
         random = np.random.default_rng(self._seeds(step))
         model, augmentation, learn_all = job.model.config, config.augmentation, self._learn_all
-        batches, plain = [], self._teacher is not None
+        batches, plain = [], self._teacher is not None and not config.distillation_loss.feature_weight
         for _ in range(config.clips.in_turn):
             clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
             batch = load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all, plain=plain)
@@ -245,12 +245,13 @@ class Trainer:
         batch = replace(batch, inputs=randomised_inputs(batch.inputs, *random))
         outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
         learned = len(batch.targets)
-        maps: Iterator[Tensor | None] = repeat(None)
-        if self._teacher is not None and batch.plain is not None:
-            maps = islice(self._teacher.bev_maps(batch.plain), len(batch.inputs) - learned, None)
+        lessons: Iterator[Lesson | None] = repeat(None)
+        if self._teacher is not None:
+            shown = batch if batch.plain is None else batch.plain
+            lessons = islice(self._teacher.lessons(shown), len(batch.inputs) - learned, None)
         for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                output, taught = next(outputs), next(maps)
+                output, taught = next(outputs), next(lessons)
             yield self._losses(inputs, output, targets, taught)
 
     def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
