@@ -33,7 +33,7 @@ class TritonSampling(nn.Module):
     ) -> Tensor:
         """Arguments and result as for `GridSampling`."""
         sums = _WeightedSums.apply(values, locations, weights, level_shapes, tuple(queries_per_map))
-        return sums.flatten(1)  # type: ignore[no-any-return]
+        return sums.flatten(1)
 
 
 class _WeightedSums(torch.autograd.Function):
