@@ -23,6 +23,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+from bevcli.model.deformable_convolution import predicted_deformable_convolution
+
 CPU = torch.device("cpu")
 # Functions that read numbers back, to answer with a Python value or to find out a shape.
 READING = {
@@ -189,8 +191,9 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     monkeypatch.setattr("bevcli.inference.stage_clock.StageClock.read", lambda clock: {})
     if device.device.type == "cuda":
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention
+        from bevcli.model.kernels import triton_attention, triton_convolution
 
+        monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
         launch = {"__getitem__": lambda kernel, grid: sample}
         monkeypatch.setattr(triton_attention, "_sample", type("Kernel", (), launch)())
         monkeypatch.setattr(torch.cuda, "device", lambda which: contextlib.nullcontext(device.check(which)))
