@@ -3,8 +3,9 @@
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice, repeat
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice, product, repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.inference.background import read_ahead
 from bevcli.inference.cpu_settings import trim_memory
 from bevcli.inference.load import choose_precision
 from bevcli.inference.runner import Runner, StepOptions
@@ -24,7 +24,8 @@ from bevcli.model.step import ModelOutputs
 from bevcli.training import files
 from bevcli.training.frame_losses import FrameLosses, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
-from bevcli.training.samples import Batch, draw_clips, load_batch
+from bevcli.training.loading import BatchMaker, loaded_batches
+from bevcli.training.samples import Batch
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -136,6 +137,8 @@ class Trainer:
         trained: all modules that are trained: the model and the auxiliary heads.
         optimizer: of their parameters.
         done: the number of steps done.
+        maker: makes the batches.
+        waited_s: time for which the training had to wait for batches, seconds.
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
@@ -148,12 +151,17 @@ class Trainer:
         self._average: dict[str, Tensor] | None = None
         if job.config.optimizer.average > 0:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
-        self.done = 0
+        self.done, self.waited_s = 0, 0.0
         if resume:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
+        self.maker = BatchMaker(
+            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None,
+            in_bytes=job.device.type == "cuda",
+        )  # fmt: skip
         self._frozen: FrozenStages | None = None
         if job.config.frozen_stages and job.config.freeze_batch_norm:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
@@ -179,9 +187,23 @@ class Trainer:
             after_update: called after each update of the weights, with the loss.
         """
         job, config = self.job, self.job.config
-        remaining = range(self.done, config.steps)
-        for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
-            row = self._step(batches, after_update)
+        remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
+        places = product(remaining, range(config.clips.in_turn))
+        with contextlib.closing(loaded_batches(self.maker, places, job.loaders, pin=gpu)) as batches:
+            self._run(batches, after_step, after_validation, stop, after_update)
+        job.model.eval()
+
+    def _run(
+        self,
+        batches: Iterator[Batch],
+        after_step: Callable[[], None],
+        after_validation: Callable[[int, Validation], None],
+        stop: Callable[[], bool],
+        after_update: Callable[[float], None],
+    ) -> None:
+        job, config = self.job, self.job.config
+        while self.done < config.steps:
+            row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
             trim_memory()
             self.done += 1
             last, stopped = self.done == config.steps, stop()
@@ -194,30 +216,22 @@ class Trainer:
                 after_step()
             if stopped:
                 break
-        job.model.eval()
+
+    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """The same batches, with the time spent waiting for them added to `waited_s`."""
+        for _ in repeat(None):
+            begun = time.perf_counter()
+            batch = next(batches, None)
+            self.waited_s += time.perf_counter() - begun
+            if batch is None:
+                return
+            yield batch
 
     @property
     def _learn_all(self) -> bool:
         return self.job.config.clips.learn == "all"
 
-    def _seeds(self, step: int) -> list[int]:
-        """The seeds of a step's random draws; different for each process of a group."""
-        rank = self.job.group.rank
-        return [self.job.seed, step, rank] if rank else [self.job.seed, step]
-
-    def _load(self, step: int) -> list[Batch]:
-        """The batches of a step: `clips.in_turn` of them."""
-        job, config = self.job, self.job.config
-        random = np.random.default_rng(self._seeds(step))
-        model, augmentation, learn_all = job.model.config, config.augmentation, self._learn_all
-        batches, plain = [], self._teacher is not None
-        for _ in range(config.clips.in_turn):
-            clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
-            batch = load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all, plain=plain)
-            batches.append(batch)
-        return batches
-
-    def _step(self, batches: list[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
+    def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
         """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
         job, config = self.job, self.job.config
         rate = config.optimizer.learning_rate_at(self.done, config.steps)
@@ -225,16 +239,20 @@ class Trainer:
         gpus = [job.device] if job.device.type == "cuda" else []
         frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
-            torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
-            clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
+            seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
+            torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
             rows = []
-            for losses in alternated(clips):
+            for losses in alternated(self._clip_losses(self._uploaded(batch)) for batch in batches):
                 rows.append(self._update(losses))
                 after_update(rows[-1]["loss"])
         job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
+
+    def _uploaded(self, batch: Batch) -> Batch:
+        """The batch on the device, with its images normalised."""
+        return batch.to(self.job.device).normalised(self.job.model.config.image)
 
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
@@ -283,15 +301,16 @@ class Trainer:
         return scores
 
 
-def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:
+def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
     """The first item of each iterator, then the second of each, and so on until all are exhausted."""
-    remaining = list(iterators)
+    remaining: Iterable[Iterator[T]] = iterators
     while remaining:
-        for iterator in tuple(remaining):
-            try:
-                yield next(iterator)
-            except StopIteration:
-                remaining.remove(iterator)
+        going = []
+        for iterator in remaining:
+            for item in islice(iterator, 1):
+                yield item
+                going.append(iterator)
+        remaining = going
 
 
 def computes_in_bfloat16(device: torch.device) -> bool:
