@@ -21,14 +21,14 @@ from bevcli.geometry.transforms import Pose, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, model_inputs
-from bevcli.model.upload import pinned
+from bevcli.model.upload import pinned, upload
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
-from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
+from bevcli.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
 from bevcli.training.frame_truth import frame_truth
 from bevcli.training.pixels import images_as_bytes, images_from_bytes
-from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
+from bevcli.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
 
@@ -144,24 +144,25 @@ class Targets:
     Attributes:
         detection: B, the boxes inside the BEV grid.
         perspective: B, all boxes, for the perspective loss.
-        segmentation: B, or empty if the model has no segmentation head.
+        segmentation: B, or None if the model has no segmentation head.
         truths: B, for heads of the model's own, on the CPU; empty if it has none.
     """
 
-    detection: tuple[DetectionTargets, ...]
-    perspective: tuple[DetectionTargets, ...]
-    segmentation: tuple[SegmentationTargets, ...]
+    detection: PaddedTargets
+    perspective: PaddedTargets
+    segmentation: PaddedMasks | None
     truths: tuple[FrameTruth, ...] = ()
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
         parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
-        return replace(self, **{name: tuple(_moved(one, device) for one in part) for name, part in parts.items()})
+        return replace(self, **{name: None if x is None else _moved(x, device) for name, x in parts.items()})
 
 
 def _moved(targets: Any, device: torch.device) -> Any:
-    """A copy of a dataclass of tensors, or None, on a device."""
-    return replace(targets, **{name: None if x is None else x.to(device) for name, x in vars(targets).items()})
+    """A copy of a dataclass of tensors on a device."""
+    tensors = {name: x for name, x in vars(targets).items() if isinstance(x, Tensor)}
+    return replace(targets, **{name: upload(x, device) for name, x in tensors.items()})
 
 
 @dataclass(frozen=True)
@@ -250,17 +251,17 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
 def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: ModelConfig) -> Targets:
     """places: the drive and the place in it of each frame."""
     boxes = [ground_truth_boxes(frame) for frame in frames]
-    detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
-    perspective = tuple(box_targets(of_frame, config.classes) for of_frame in boxes)
+    detection = padded([detection_targets(of_frame, config) for of_frame in boxes])
+    perspective = padded([box_targets(of_frame, config.classes) for of_frame in boxes])
     truths: tuple[FrameTruth, ...] = ()
     if config.results:
         truths = tuple(frame_truth(frame, *place, config) for frame, place in zip(frames, places, strict=True))
     if "segmentation" not in config.heads:
-        return Targets(detection, perspective, (), truths)
+        return Targets(detection, perspective, None, truths)
     maps = [frame.ground_truth_map for frame in frames]
     grid, classes = config.bev_grid, config.object_classes
-    segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
-    return Targets(detection, perspective, tuple(segmentation), truths)
+    segmentation = [segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True)]
+    return Targets(detection, perspective, padded_masks(segmentation), truths)
 
 
 def _prepared(clips: Iterable[list[Frame]], config: ModelConfig, in_bytes: bool) -> list[tuple[PreparedFrame, ...]]:

@@ -1,9 +1,12 @@
 """The training loop: clips in; updates of the weights, checkpoints and learning curves out."""
 
+from __future__ import annotations
+
 import contextlib
 import copy
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice, product, repeat
 from typing import Any, TypeVar
@@ -108,7 +111,20 @@ def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerCon
     in_backbone = {id(parameter) for parameter in backbone.parameters()}
     others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
     groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
-    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
+    # On a GPU, fused: one kernel instead of hundreds.
+    fused = next(trained.parameters()).device.type == "cuda" or None
+    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=fused)
+
+
+@contextlib.contextmanager
+def rounded_products(rounds: bool) -> Iterator[None]:
+    """Inside, a CUDA GPU rounds the factors of float32 products to TF32 if it is to: several times as fast."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if rounds else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
@@ -120,11 +136,29 @@ def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
 @torch.no_grad()
 def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
     """Moves a running average of a state dict towards it, in place; integers are copied."""
-    for key, value in state.items():
-        if value.is_floating_point():
-            average[key].lerp_(value, 1 - decay)
-        else:
-            average[key].copy_(value)
+    moved = [key for key, value in state.items() if value.is_floating_point()]
+    torch._foreach_lerp_([average[key] for key in moved], [state[key] for key in moved], 1 - decay)
+    for key in state.keys() - set(moved):
+        average[key].copy_(state[key])
+
+
+class _Update:
+    """The numbers of an update, on their way from the device."""
+
+    def __init__(self, numbers: Mapping[str, Tensor]) -> None:
+        self._names = tuple(numbers)
+        values = torch.stack([value.detach() for value in numbers.values()])
+        self._values = values.to("cpu", non_blocking=True)
+        self._arrived: torch.cuda.Event | None = None
+        if values.device.type == "cuda":
+            self._arrived = torch.cuda.Event()
+            self._arrived.record()
+
+    def read(self) -> dict[str, float]:
+        """The numbers by name. Waits for a GPU to finish this update, but none after it."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return dict(zip(self._names, self._values.tolist(), strict=True))
 
 
 class Trainer:
@@ -189,7 +223,8 @@ class Trainer:
         job, config = self.job, self.job.config
         remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
         places = product(remaining, range(config.clips.in_turn))
-        with contextlib.closing(loaded_batches(self.maker, places, job.loaders, pin=gpu)) as batches:
+        loaded = loaded_batches(self.maker, places, job.loaders, pin=gpu)
+        with contextlib.closing(loaded) as batches, rounded_products(gpu):
             self._run(batches, after_step, after_validation, stop, after_update)
         job.model.eval()
 
@@ -242,8 +277,9 @@ class Trainer:
             seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
             torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
             rows = []
-            for losses in alternated(self._clip_losses(self._uploaded(batch)) for batch in batches):
-                rows.append(self._update(losses))
+            learned = alternated(self._clip_losses(self._uploaded(batch)) for batch in batches)
+            for update in delayed(map(self._update, learned), 1 if gpus else 0):
+                rows.append(self._read(update))
                 after_update(rows[-1]["loss"])
         job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
@@ -267,22 +303,27 @@ class Trainer:
                 output, taught = next(outputs), next(maps)
             yield self._losses(inputs, output, targets, taught)
 
-    def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
+    def _update(self, losses: dict[str, Tensor]) -> _Update:
         """One update of the weights."""
         total = torch.stack(list(losses.values())).sum()
-        if not math.isfinite(total.item()):
-            raise BevcliError(
-                f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and `resume` "
-                f"from the last checkpoint in {self.job.out}"
-            )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.job.group.average_gradients(self.trained)
-        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm).item()
+        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
         if self._average is not None:
             update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
-        return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
+        return _Update({"loss": total, **losses, "gradient norm": norm})
+
+    def _read(self, update: _Update) -> dict[str, float]:
+        """The numbers of an update. Raises BevcliError if the loss is not finite."""
+        row = update.read()
+        if not math.isfinite(row["loss"]):
+            raise BevcliError(
+                f"step {self.done + 1}: the loss is {row['loss']}; lower the learning rate, and `resume` "
+                f"from the last checkpoint in {self.job.out}"
+            )
+        return row
 
     def _validate(self) -> Validation:
         """Scores the model, writes its weights and the learning curves."""
@@ -299,6 +340,16 @@ class Trainer:
         files.save_weights(job.out / "weights.safetensors", model, dtype)
         files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
+
+
+def delayed(items: Iterable[T], places: int) -> Iterator[T]:
+    """The items, each when so many later ones have been made."""
+    waiting = deque[T]()
+    for item in items:
+        waiting.append(item)
+        if len(waiting) > places:
+            yield waiting.popleft()
+    yield from waiting
 
 
 def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
