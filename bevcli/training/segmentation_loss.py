@@ -198,8 +198,8 @@ def segmentation_loss(
 
     class_targets = torch.zeros_like(outputs.class_logits)  # (M, B, Q)
     class_targets[..., :first] = assigned[:, :first]
-    of_things = assigned[:, first:].expand(layers, -1, -1)
-    class_targets.scatter_add_(-1, queries.expand(layers, -1, -1), of_things)
+    of_things = assigned[:, first:]
+    class_targets.scatter_add_(-1, *(x.expand(layers, -1, -1) for x in (queries, of_things)))
     class_losses = focal_loss(outputs.class_logits, class_targets)
     of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
     classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
