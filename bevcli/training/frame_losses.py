@@ -26,11 +26,13 @@ from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.training.detection_loss import (
+    AnyTargets,
     DetectionLossConfig,
-    DetectionTargets,
+    PaddedTargets,
     assigned_loss,
     detection_loss,
     layer_matches,
+    padded,
 )
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.randomisation import renormalised
@@ -79,32 +81,28 @@ class DenseHead(nn.Module):
 
 
 def dense_loss(
-    head: DenseHead,
-    bev: Tensor,
-    targets: Sequence[DetectionTargets],
-    config: DenseLossConfig,
-    detection: DetectionLossConfig,
+    head: DenseHead, bev: Tensor, targets: AnyTargets, config: DenseLossConfig, detection: DetectionLossConfig
 ) -> dict[str, Tensor]:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
     bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
     """
+    truth = padded(targets)
     logits, codes = head(bev)
-    positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
-    classes, boxes = config.weight * assigned_loss(logits, codes, targets, positives, detection)
+    objects = _objects_in_reach(head.centers, truth, config.reach_m)
+    classes, boxes = config.weight * assigned_loss(logits, codes, truth, objects, detection)
     return {"cell classes": classes, "cell boxes": boxes}
 
 
-def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
-    """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
+def _objects_in_reach(cells: Tensor, truth: PaddedTargets, reach_m: float) -> Tensor:
+    """(B, Y·X) int64 the nearest object of each cell that is within reach of it, -1 for none.
 
-    cells: (Y·X, 2) cell centres, metres. objects: (G, 2) object centres, metres.
+    cells: (Y·X, 2) centres, metres.
     """
-    if not len(objects):
-        return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
-    distance, nearest = torch.cdist(cells, objects).min(dim=1)
-    positive = (distance <= reach_m).nonzero()[:, 0]
-    return positive, nearest[positive]
+    # Not by a product of matrices, which a GPU may round.
+    distances = torch.cdist(cells, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
+    distance, nearest = distances.where(truth.exists[:, None], torch.inf).min(dim=-1)
+    return nearest.where(distance <= reach_m, -1)
 
 
 @dataclass(frozen=True)
@@ -289,6 +287,6 @@ class FrameLosses:
         if targets.truths:
             matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)
-        if outputs.segmentation is not None:
+        if outputs.segmentation is not None and targets.segmentation is not None:
             losses |= segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
         return losses

@@ -144,7 +144,8 @@ class TrainingConfig(LossConfigs):
         freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
         frozen_stages: the backbone's stem and its first stages, so many, keep their weights and the statistics of their
             batch norms; 0 trains all of it.
-        loaders: threads that read batches ahead, one step's batches each. Use several if a GPU waits for data.
+        loaders: processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all
+            cores but two.
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
         augmentation: image augmentation.
@@ -158,7 +159,7 @@ class TrainingConfig(LossConfigs):
     checkpoint_every: int = 250
     freeze_batch_norm: bool = False
     frozen_stages: int = 0
-    loaders: int = 1
+    loaders: int = 0
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
@@ -166,12 +167,13 @@ class TrainingConfig(LossConfigs):
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
-            raise ValueError(
-                "steps, evaluate_every, checkpoint_every and loaders must be positive, held_out not negative"
-            )
-        if self.frozen_stages < 0:
-            raise ValueError("frozen_stages must not be negative")
+        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1:
+            raise ValueError("steps, evaluate_every and checkpoint_every must be positive")
+        if min(self.held_out, self.loaders, self.frozen_stages) < 0:
+            raise ValueError("held_out, loaders and frozen_stages must not be negative")
+
+
+CORES_OF_TRAINING = 2  # that make no batches, with a GPU
 
 
 @dataclass(frozen=True)
@@ -203,6 +205,14 @@ class TrainingJob:
     notes: tuple[str, ...] = ()
     log: Log | None = None
     warm_starts: tuple[WarmStart, ...] = ()
+
+    @property
+    def loaders(self) -> int:
+        """The number of processes that make batches, 1 for a thread of this process."""
+        if self.config.loaders or self.device.type == "cpu":
+            return self.config.loaders or 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - CORES_OF_TRAINING)
 
 
 def prepare_training(

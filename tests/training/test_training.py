@@ -149,7 +149,7 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
         return Trainer(job, resume=resume)
 
     whole = with_all_options(tmp_path / "whole")
-    assert [len(batch.inputs) for batch in whole._load(0)] == [2, 2]
+    assert [len(whole.maker(0, place).inputs) for place in range(2)] == [2, 2]
     whole.run()
     assert parameters_without_gradient(whole) == []
     # These keys are part of the checkpoint format.
