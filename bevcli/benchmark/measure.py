@@ -132,12 +132,13 @@ def _time_run(
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
-    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> None:
-        made.append(time.perf_counter())  # recording begins as soon as the model has made the step
+    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
+        made.append(time.perf_counter())  # recording begins as soon as the model has made the step, or late
         recording.log(*step[:2])
-
-    for step, _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
         fast.state = step[2]
+        return True
+
+    write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state))
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 
