@@ -97,21 +97,23 @@ def sample_plainly(values, shapes, locations, weights, ends, out, queries, maps,
     ],
 )
 def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, monkeypatch):
-    """The cells that each camera sees are counted anew when its projection changes; BEVFormerV2 projects every frame
-    of its window. The CPU reads these counts and the results, and waits for nothing else. Only the tracks of a UniAD
-    are chosen on the CPU, which reads them several times a frame."""
+    """The device part of the last step is a replay of a CUDA graph, in whose capture nothing may wait. Only the tracks
+    of a UniAD are chosen on the CPU, which reads them several times a frame."""
     config = small_version(name)
     model, prepared = made_up_model(config), frames(config)
     expected = run(model, CPU, prepared, [])
     with simulated(device_name, monkeypatch, sample_plainly) as device:
-        found = run(prepare_for_inference(model, device.device), device.device, prepared, device.waits)
+        fast = prepare_for_inference(model, device.device)
+        found = run(fast, device.device, prepared, device.waits)
+    for name in fast.device_parts if device_name == "cuda:1" else ():
+        part = getattr(fast, name)
+        assert part.failure is None
+        assert any(part.graphs.values())
     for ours, theirs in zip(expected, found, strict=True):
         np.testing.assert_allclose(theirs.centers, ours.centers, atol=1e-3)
         np.testing.assert_allclose(theirs.scores, ours.scores, atol=1e-4)
-    window = getattr(config, "frames", (0,))
-    projections = sum(0 <= FRAMES - 1 + offset < FRAMES for offset in window)
     if device_name == "cuda:1" and not isinstance(config, UniADConfig):
-        assert device.waits == ["tolist"] * projections + ["results"]
+        assert device.waits == ["synchronize"]
 
 
 def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
@@ -119,7 +121,7 @@ def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
     model, prepared = made_up_model(config), frames(config, same_projection=True)
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
         run(prepare_for_inference(model, device.device, "bf16"), device.device, prepared, device.waits)
-    assert device.waits == ["results"]
+    assert device.waits == ["synchronize"]
 
 
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
