@@ -225,6 +225,28 @@ class Event:
         return 0.0
 
 
+class Kernel:
+    """A Triton kernel whose launch calls a plain function with the same arguments."""
+
+    def __init__(self, device: SimulatedDevice, plain: Callable[..., None]) -> None:
+        self.device, self.plain = device, plain
+
+    def __getitem__(self, _grid: tuple[int, ...]) -> Callable[..., None]:
+        return self.launch
+
+    def launch(self, *args: Any, **constants: Any) -> None:
+        self.plain(*args, **constants)
+        self.device.record(self.plain, args, constants, None)
+
+
+def add_and_relu(values, bias, shortcut, elements, channels, HAS_SHORTCUT, **constants):  # type: ignore[no-untyped-def]
+    """The numbers of the kernel of this name, from PyTorch's own operations."""
+    assert elements == values.held.numel()
+    assert values.held.shape[1] == channels
+    total = values.held.float() + bias.held.float()[:, None, None]
+    values.held.copy_((total + shortcut.held.float() if HAS_SHORTCUT else total).relu())
+
+
 def provide_triton(monkeypatch: Any) -> None:
     """Puts the parts of Triton that surround a kernel in the place of a Triton that is not installed."""
     if find_spec("triton") is not None:
@@ -256,14 +278,13 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention
+        from bevcli.model.kernels import triton_attention, triton_bottleneck
 
-        def launch(*args: Any, **constants: Any) -> None:
-            sample(*args, **constants)
-            device.record(sample, args, constants, None)
-
-        kernel = {"__getitem__": lambda kernel, grid: launch}
-        monkeypatch.setattr(triton_attention, "_sample", type("Kernel", (), kernel)())
+        for module, name, plain in (
+            (triton_attention, "_sample", sample),
+            (triton_bottleneck, "_add_and_relu", add_and_relu),
+        ):
+            monkeypatch.setattr(module, name, Kernel(device, plain))
     with device:
         yield device
 

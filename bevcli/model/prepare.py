@@ -7,6 +7,7 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import Any, Literal
 
 import torch
@@ -23,7 +24,7 @@ from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.pillar_projection import PaddedPillars, Pillars
-from bevcli.model.resnet import ResNet
+from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
@@ -55,6 +56,12 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
+    if device.type == "cuda" and find_spec("triton"):
+        from bevcli.model.kernels.triton_bottleneck import FusedBottleneck  # only where Triton is installed
+
+        for module in network.modules():
+            if isinstance(module, Bottleneck):
+                add_to_class(module, FusedBottleneck)
     dtype = DTYPES[precision]
     for part in network.image_parts:
         part.to(dtype)
