@@ -11,7 +11,6 @@ from bevcli.model.upload import upload
 
 # Metres. A point nearer than this, or behind the camera, is not visible and is projected as if it lay at this depth.
 MIN_DEPTH = 1e-5
-PLACES = 128  # numbers of padded hits are multiples of this
 OUTSIDE = -1e4  # x and y of points that lie outside every image, whatever their offsets: samples there are zero
 
 
@@ -89,38 +88,6 @@ class Pillars(nn.Module):
     def project(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarProjection:
         """The pillars in every camera; arguments as for `project_pillars`."""
         return project_pillars(image_from_bev, self.points, image_size, has_image)
-
-
-class PaddedPillars(Pillars):
-    """Added to the pillars on a GPU: the CPU finds the hits, so that nobody asks the GPU how many there are.
-
-    They are padded to sizes that a rig keeps, for tensors of the same shapes in every frame.
-
-    Attributes:
-        points_on_cpu: the points, on the CPU.
-    """
-
-    points_on_cpu: Tensor
-    _sizes: dict[tuple[int, tuple[int, int]], tuple[int, ...]]
-
-    def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
-        """As `Pillars.forward`; the hits are on the device."""
-        hits = find_hits(project_pillars(image_from_bev, self.points_on_cpu, image_size, has_image))
-        kept = self.__dict__.setdefault("_sizes", {})
-        key = len(hits.hits_per_camera), image_size
-        before = kept.get(key, (0,) * key[0])
-        if any(count > size for count, size in zip(hits.hits_per_camera, before, strict=True)):
-            roomy = (min(len(self.points), _roomy(count)) for count in hits.hits_per_camera)
-            kept[key] = tuple(map(max, roomy, before))
-        padded, device = hits.padded(kept.get(key, before)), self.points.device
-        tensors = (upload(x, device) for x in (padded.cell, padded.reference_points, padded.cameras_per_cell))
-        cell, reference_points, cameras_per_cell = tensors
-        return PillarHits(cell, reference_points, padded.hits_per_camera, cameras_per_cell)
-
-
-def _roomy(count: int) -> int:
-    """A number of places for about `count` hits: the projections of a rig differ a little from frame to frame."""
-    return -(-count * 9 // 8 // PLACES) * PLACES
 
 
 def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,8 @@ from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
-from bevcli.model.pillar_projection import PaddedPillars, Pillars
+from bevcli.model.kernels.padded_pillars import PaddedPillars
+from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel
 
@@ -52,7 +53,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     for module in network.modules() if device.type != "cpu" else ():
         if isinstance(module, Pillars):
             add_to_class(module, PaddedPillars)
-            module.points_on_cpu = module.points
+            vars(module).update(points_on_cpu=module.points, sizes={})
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)

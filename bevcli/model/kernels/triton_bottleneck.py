@@ -31,8 +31,7 @@ def convolution_with_relu(convolution: nn.Module, x: Tensor, shortcut: Tensor | 
     """ReLU of the convolution of x plus the shortcut, which has the shape of the result."""
     if not isinstance(convolution, nn.Conv2d) or convolution.bias is None:
         return F.relu(convolution(x) if shortcut is None else convolution(x) + shortcut)
-    sizes = convolution.stride, convolution.padding, convolution.dilation, convolution.groups
-    y = F.conv2d(x, convolution.weight, None, *sizes)
+    y = convolution._conv_forward(x, convolution.weight, None)
     parts = [y] if shortcut is None else [y, shortcut]
     if y.numel() > MOST_ELEMENTS or not all(part.is_contiguous(memory_format=torch.channels_last) for part in parts):
         y = y + convolution.bias[:, None, None]
