@@ -14,6 +14,7 @@ from bevcli.model.tensors import exchanged, tensors_in
 
 KEPT_GRAPHS = 8  # of one function: for other numbers and sizes of images, with and without history
 Function = Callable[..., Any]
+_SETTING = threading.RLock()  # the precision of products is a setting of the process
 
 
 class CudaGraph:
@@ -73,14 +74,14 @@ class Captured:
 
     def __call__(self, *arguments: Any) -> Any:
         """As the method itself. Arguments may be nested tuples and frozen dataclasses; tensors must not change."""
-        with torch.inference_mode(), rounded_products(self._rounds):
-            if self.failure is not None or self._count_hooks() != self._own_hooks:
+        with torch.inference_mode():
+            if self.failure is None and self._count_hooks() == self._own_hooks:
+                with self._lock:
+                    graph = self._graph_for(arguments)
+                    if graph is not None:
+                        return graph.replay(arguments)
+            with rounded_products(self._rounds):
                 return self._function(*arguments)
-            with self._lock:
-                graph = self._graph_for(arguments)
-                if graph is not None:
-                    return graph.replay(arguments)
-            return self._function(*arguments)
 
     def _graph_for(self, arguments: tuple[Any, ...]) -> CudaGraph | None:
         """The graph for arguments of these shapes; None where they come for the first time or cannot be captured."""
@@ -99,7 +100,8 @@ class Captured:
         try:
             if self._pool is None:
                 self._pool = torch.cuda.graph_pool_handle()
-            return CudaGraph(self._function, arguments, self._device, self._pool)
+            with rounded_products(self._rounds):
+                return CudaGraph(self._function, arguments, self._device, self._pool)
         except Exception as error:  # whatever a driver, a library or a kernel raises: the model runs without a graph
             self.failure = error
             self.graphs.clear()
@@ -119,9 +121,10 @@ def rounded_products(enabled: bool) -> Iterator[None]:
         return
     setting = torch.backends.cuda.matmul
     name, value = ("fp32_precision", "tf32") if hasattr(setting, "fp32_precision") else ("allow_tf32", True)
-    before = getattr(setting, name)
-    setattr(setting, name, value)
-    try:
-        yield
-    finally:
-        setattr(setting, name, before)
+    with _SETTING:
+        before = getattr(setting, name)
+        setattr(setting, name, value)
+        try:
+            yield
+        finally:
+            setattr(setting, name, before)
