@@ -7,20 +7,21 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
-from importlib.util import find_spec
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
+from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
@@ -57,7 +58,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
-    if device.type == "cuda" and find_spec("triton"):
+    if has_triton(device):
         from bevcli.model.kernels.triton_bottleneck import FusedBottleneck  # only where Triton is installed
 
         for module in network.modules():
@@ -65,9 +66,11 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
                 add_to_class(module, FusedBottleneck)
     dtype = DTYPES[precision]
     for part in network.image_parts:
-        part.to(dtype)
-    for part in network.image_parts[:1]:
-        part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
+        alone = isinstance(part, Backbone) and part.by_image and device.type == "cpu"
+        own = torch.float32 if alone else dtype
+        part.to(own).register_forward_pre_hook(partial(_cast, own))
+        if alone:
+            add_to_class(part, ImageByImage)
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     rounds_attention = rounds or (precision != "fp32" and device.type == "cuda")
     rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
@@ -108,6 +111,20 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
     """Puts the methods of an addition before those of this one module, in place; its other parts stay as they are."""
     module.__class__ = type(type(module).__name__, (addition, type(module)), {})
+
+
+def _cast(dtype: torch.dtype, part: nn.Module, inputs: tuple[Tensor | Sequence[Tensor]]) -> tuple[Any]:
+    """The images, or the maps, that enter a part, in its dtype."""
+    return (inputs[0].to(dtype) if isinstance(inputs[0], Tensor) else [x.to(dtype) for x in inputs[0]],)
+
+
+class ImageByImage(nn.Module):
+    """Added to a backbone that runs on one image at a time."""
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """As `Backbone.forward`."""
+        each = [super(ImageByImage, self).forward(image) for image in images.split(1)]
+        return [torch.cat(maps) for maps in zip(*each, strict=True)]
 
 
 def _check_finite(model: nn.Module) -> None:

@@ -113,8 +113,8 @@ class RenderedDrives(FolderDrives):
         grid = self._config.bev_grid
         half_extent = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
         drive = RenderedDrive(
-            seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn.rig, assets=self._assets,
-            supersampling=drawn.supersampling, map_half_extent_m=half_extent, camera_delays_s=drawn.delays_s,
+            seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn, assets=self._assets,
+            supersampling=drawn.supersampling, map_half_extent_m=half_extent,
         )  # fmt: skip
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)

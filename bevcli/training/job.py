@@ -19,6 +19,7 @@ from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.synth.splits import split_of, training_drives, write_split
 from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.backbone_weights import start_backbone
 from bevcli.training.changes import with_changes
 from bevcli.training.drive_checks import check_training_drives
 from bevcli.training.files import require_tensorboard
@@ -50,10 +51,11 @@ class ProcessGroup:
     def average_gradients(self, trained: nn.Module) -> None:
         """Replaces each gradient by its mean over the processes; a missing gradient counts as zero."""
         if self.size > 1:
-            for parameter in trained.parameters():
+            learned = [parameter for parameter in trained.parameters() if parameter.requires_grad]
+            for parameter in learned:
                 if parameter.grad is None:
                     parameter.grad = torch.zeros_like(parameter)
-            self._average([parameter.grad for parameter in trained.parameters() if parameter.grad is not None])
+            self._average([parameter.grad for parameter in learned if parameter.grad is not None])
 
     def average_statistics(self, trained: nn.Module) -> None:
         """Replaces the running statistics of batch norms (all float buffers) by their mean over the processes."""
@@ -140,7 +142,8 @@ class TrainingConfig(LossConfigs):
         evaluate_every: steps between evaluations.
         checkpoint_every: steps between checkpoints.
         freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
-        frozen_stages: the backbone's stem and its first stages, so many, keep their weights; 0 trains all of it.
+        frozen_stages: the backbone's stem and its first stages, so many, keep their weights and the statistics of their
+            batch norms; 0 trains all of it.
         loaders: threads that read batches ahead, one step's batches each. Use several if a GPU waits for data.
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
@@ -186,7 +189,7 @@ class TrainingJob:
         group: the processes that train together.
         notes: about the drives, for the user.
         log: where the learning curves are written, besides the CSV files; None for nowhere.
-        warm_start: what the training starts from; None for random weights, or if it is resumed.
+        warm_starts: what the training starts from; empty for random weights, or if it is resumed.
     """
 
     model: Network
@@ -199,7 +202,7 @@ class TrainingJob:
     group: ProcessGroup = field(default_factory=ProcessGroup)
     notes: tuple[str, ...] = ()
     log: Log | None = None
-    warm_start: WarmStart | None = None
+    warm_starts: tuple[WarmStart, ...] = ()
 
 
 def prepare_training(
@@ -222,20 +225,23 @@ def prepare_training(
     check_training_seeds(data.rendered or ())
     if data.split is not None and options.held_out is not None:
         raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
-    rigs = config.rigs if config.rigs.random_share > 0 else None
+    rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     own = None if data.split is None and config.held_out == 0 else evaluated
     notes = check_training_drives(data, drives, own, config.clips, model_config)
     if data.rendered is not None and not (out / "drives").exists():
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
-    if config.freeze_batch_norm and options.weights is None and not options.resume:
+    if config.freeze_batch_norm and not (options.weights or options.backbone_weights or options.resume):
         notes += (
             "the model starts from random weights, but its file keeps the statistics of batch norms: pass `weights` or "
             '`changes={"freeze_batch_norm": "false"}`',
         )
-    model, started = build_network(model_config), None
+    model, started = build_network(model_config), []
     if options.weights is not None and not options.resume:
-        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
+        started += [warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)]
+    if options.backbone_weights is not None and not options.resume:
+        backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
+        started, notes = [*started, backbone], (*notes, *about)
     if not options.resume:
         with output_errors(out, "made"):
             out.mkdir(parents=True, exist_ok=True)
@@ -243,7 +249,8 @@ def prepare_training(
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
         write_split(out / "split.toml", split)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, started)
+    starts = tuple(started)
+    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, starts)
 
 
 def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:

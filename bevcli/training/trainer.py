@@ -4,6 +4,7 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice, repeat
 from typing import Any, TypeVar
 
@@ -16,14 +17,15 @@ from bevcli.inference.background import read_ahead
 from bevcli.inference.cpu_settings import trim_memory
 from bevcli.inference.load import choose_precision
 from bevcli.inference.runner import Runner, StepOptions
+from bevcli.model.backbone import Backbone
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
-from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
 from bevcli.training import files
 from bevcli.training.frame_losses import FrameLosses, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
+from bevcli.training.randomisation import randomised_inputs
 from bevcli.training.samples import Batch, draw_clips, load_batch
 from bevcli.training.validation import Validation, validate
 
@@ -37,10 +39,10 @@ class FrozenStages:
     whose feature maps fit into the caches.
     """
 
-    def __init__(self, backbone: ResNet, stages: int, dtype: torch.dtype) -> None:
-        """stages: how many, from the first. dtype: of the computation and its results."""
+    def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
+        """stages: how many, from the first. dtype: of the computation and its results, where the backbone has both."""
         self._device = backbone.conv1.weight.device
-        self._dtype = dtype
+        self._dtype = dtype = torch.float32 if backbone.by_image and self._device.type == "cpu" else dtype
         part = copy.deepcopy(backbone)
         part.stages = nn.ModuleList(part.stages[:stages])
         part.output_stages = tuple(range(1, len(part.stages) + 1))
@@ -52,7 +54,7 @@ class FrozenStages:
         self._part = part
 
     @contextlib.contextmanager
-    def used_by(self, backbone: ResNet) -> Iterator[None]:
+    def used_by(self, backbone: Backbone) -> Iterator[None]:
         """Inside, the backbone takes the maps of its first stages from here."""
         backbone.frozen_maps = self._maps
         try:
@@ -155,7 +157,7 @@ class Trainer:
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
         self._frozen: FrozenStages | None = None
-        if job.config.frozen_stages and job.config.freeze_batch_norm:
+        if job.config.frozen_stages:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
@@ -239,6 +241,8 @@ class Trainer:
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
         job, config = self.job, self.job.config
+        random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
+        batch = replace(batch, inputs=randomised_inputs(batch.inputs, *random))
         outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
         learned = len(batch.targets)
         maps: Iterator[Tensor | None] = repeat(None)
