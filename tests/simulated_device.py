@@ -23,6 +23,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+from bevcli.model.deformable_convolution import predicted_deformable_convolution
+
 CPU = torch.device("cpu")
 # Functions that read numbers back, to answer with a Python value or to find out a shape.
 READING = {
@@ -278,8 +280,9 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention, triton_bottleneck
+        from bevcli.model.kernels import triton_attention, triton_bottleneck, triton_convolution
 
+        monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
         for module, name, plain in (
             (triton_attention, "_sample", sample),
             (triton_bottleneck, "_add_and_relu", add_and_relu),

@@ -71,7 +71,7 @@ def compile_convolution(generation: int, channels: int, outputs: int, stride: in
     if dtype != "fp32" and generation >= 10 * convolution.FIRST_WITH_MATRIX_UNITS[0]:
         kernels[convolution._convolve] = convolution.output_tiles(outputs)
     return [
-        compile_kernel(kernel, generation, types, convolution.constants(channels, stride, **tiles))
+        compile_kernel(kernel, generation, types, convolution.constants(channels, stride, tiles))
         for kernel, tiles in kernels.items()
     ]
 

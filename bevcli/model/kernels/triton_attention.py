@@ -32,7 +32,7 @@ class TritonSampling(nn.Module):
     ) -> Tensor:
         """Arguments and result as for `GridSampling`."""
         sums = _WeightedSums.apply(values, locations, weights, level_shapes, tuple(queries_per_map))
-        return sums.flatten(1)  # type: ignore[no-any-return]
+        return sums.flatten(1)
 
 
 class _WeightedSums(torch.autograd.Function):
@@ -53,26 +53,38 @@ class _WeightedSums(torch.autograd.Function):
         ends = _table(tuple(accumulate(queries_per_map)), values.device)
         context.tables = (_table(level_shapes, values.device), ends)
         out = values.new_empty(len(locations), *values.shape[2:], dtype=torch.float32)
-        _launch(_sample, *read, *context.tables, out)
+        _launch(_sample, *read, context.tables, out)
         return out
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         read = context.saved_tensors
         results = (torch.zeros_like(read[0], dtype=torch.float32), *map(torch.empty_like, read[1:]))
-        _launch(_sample_backward, *read, *context.tables, gradients[0].contiguous(), *results)
+        _launch(_sample_backward, *read, context.tables, gradients[0].contiguous(), *results)
         learned = (result.to(dtype) for result, dtype in zip(results, context.dtypes, strict=True))
         return *learned, None, None
 
 
-def _launch(kernel: Any, values: Tensor, locations: Tensor, weights: Tensor, *others: Tensor) -> None:
+def _launch(
+    kernel: Any, values: Tensor, locations: Tensor, weights: Tensor, tables: tuple[Tensor, Tensor], *others: Tensor
+) -> None:
     maps, cells, heads, depth = values.shape
     queries, _, levels, points, _ = locations.shape
+    shapes, ends = tables
     if queries:
         # Triton launches on the current GPU, which need not be that of the tensors.
         with torch.cuda.device(values.device):
             kernel[(triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)](
-                values, locations, weights, *others, queries, maps, cells, **constants(heads, depth, levels, points)
+                values,
+                shapes,
+                locations,
+                weights,
+                ends,
+                *others,
+                queries,
+                maps,
+                cells,
+                **constants(heads, depth, levels, points),
             )
 
 
@@ -95,9 +107,9 @@ def constants(heads: int, depth: int, levels: int, points: int) -> dict[str, int
 @triton.jit
 def _sample(  # type: ignore[no-untyped-def]
     values,
+    shapes,
     locations,
     weights,
-    shapes,
     ends,
     out,
     queries,
@@ -141,9 +153,9 @@ def _sample(  # type: ignore[no-untyped-def]
 @triton.jit
 def _sample_backward(  # type: ignore[no-untyped-def]
     values,
+    shapes,
     locations,
     weights,
-    shapes,
     ends,
     out_gradient,
     values_gradient,

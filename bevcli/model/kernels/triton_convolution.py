@@ -6,7 +6,7 @@ is laid out channels last, so that a sample reads successive channels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ def deformable_convolution(x: Tensor, predicted: Tensor, weight: Tensor, bias: T
     Arguments and result as there; the result is channels last.
     """
     bias = weight.new_zeros(len(weight)) if bias is None else bias
-    return _Convolution.apply(x, predicted, weight.to(x.dtype), bias.to(x.dtype), stride)  # type: ignore[no-any-return]
+    return _Convolution.apply(x, predicted, weight.to(x.dtype), bias.to(x.dtype), stride)
 
 
 class _Convolution(torch.autograd.Function):
@@ -62,7 +62,7 @@ class _Convolution(torch.autograd.Function):
                 of_part = gradient[part].flatten(0, 2)  # (positions, O)
                 weight_gradient += of_part.T @ _columns(x[part], predicted[part], context.stride)
                 tensors = (x[part], predicted[part], of_part @ rows, x_gradient[part], predicted_gradient[part])
-                _launch(_add_gradients, *tensors, stride=context.stride, **GRADIENT_TILES)
+                _launch(_add_gradients, tensors, context.stride, GRADIENT_TILES)
         weight_gradient = weight_gradient.view(len(weight), 3, 3, -1).permute(0, 3, 1, 2)
         bias_gradient = gradient.sum((0, 1, 2), dtype=torch.float32)
         learned = (x_gradient, predicted_gradient, weight_gradient, bias_gradient)
@@ -101,26 +101,30 @@ def _by_columns(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stri
 def _columns(x: Tensor, predicted: Tensor, stride: int) -> Tensor:
     """The samples of all taps times their masks: (positions, 9 · C)."""
     columns = x.new_empty(predicted[:, 0].numel(), 9 * x.shape[1])
-    _launch(_write_columns, x, predicted, columns, stride=stride, **COLUMN_TILES)
+    _launch(_write_columns, (x, predicted, columns), stride, COLUMN_TILES)
     return columns
 
 
-def _launch(kernel: Any, x: Tensor, predicted: Tensor, *others: Tensor, stride: int, **tiles: int) -> None:
-    """Starts a program for each block of positions, group of taps and block of outputs that the tiles ask for."""
+def _launch(kernel: Any, tensors: Sequence[Tensor], stride: int, tiles: Mapping[str, int]) -> None:
+    """Starts a program for each block of positions, and each group of taps or block of outputs.
+
+    tensors: x, what is predicted, and the others that the kernel takes. tiles: as for `constants`.
+    """
+    x, predicted = tensors[:2]
     positions = predicted[:, 0].numel()
     if positions:
-        chosen = constants(x.shape[1], stride, **tiles)
+        chosen = constants(x.shape[1], stride, tiles)
         rest = 9 // chosen["TAPS"] if "TAPS" in chosen else triton.cdiv(chosen["OUTPUTS"], chosen["BLOCK_OUTPUTS"])
         grid = (triton.cdiv(positions, chosen["BLOCK"]) * rest,)
-        kernel[grid](x, predicted, *others, positions, *x.shape[2:], *predicted.shape[2:], **chosen)
+        kernel[grid](*tensors, positions, *x.shape[2:], *predicted.shape[2:], **chosen)
 
 
 def _in_one_kernel(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stride: int, out: Tensor) -> None:
     """Writes the result to out (B, H', W', O); the samples stay on the chip."""
-    _launch(_convolve, x, predicted, _rows(weight), bias, out, stride=stride, **output_tiles(len(weight)))
+    _launch(_convolve, (x, predicted, _rows(weight), bias, out), stride, output_tiles(len(weight)))
 
 
-def constants(channels: int, stride: int, **tiles: int) -> dict[str, int]:
+def constants(channels: int, stride: int, tiles: Mapping[str, int]) -> dict[str, int]:
     """The arguments that a kernel is compiled for: `COLUMN_TILES`, `GRADIENT_TILES` or `output_tiles`."""
     # A matrix unit multiplies tiles of at least 16.
     block = min(max(triton.next_power_of_2(channels), 16), tiles["BLOCK_CHANNELS"])
