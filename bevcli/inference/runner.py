@@ -118,6 +118,7 @@ class Runner:
                 if not is_finite:
                     where = origin(self.model, lambda: self.model.step(prepared, state.memory, later))
                     return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
+            self.clock.waited()
             boxes = self.model.decode_boxes(found)
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)

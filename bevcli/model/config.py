@@ -226,6 +226,11 @@ class ModelConfig:
     def level_shapes(self) -> LevelShapes:
         """(height, width) of each of these levels."""
         width, height = self.image.padded_size
+        return self.level_shapes_of((height, width))
+
+    def level_shapes_of(self, image_size: tuple[int, int]) -> LevelShapes:
+        """(height, width) of each of these levels for images of another size (height, width), pixels."""
+        height, width = image_size
         strides = sorted(self.backbone.output_strides())
         while len(strides) < self.neck.levels:
             strides.append(2 * strides[-1])

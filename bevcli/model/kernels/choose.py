@@ -1,6 +1,6 @@
 """The fastest parts for a device, in the place of the plain ones: kernels, memory layout, folded batch norms."""
 
-from functools import lru_cache
+from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
 
@@ -17,7 +17,6 @@ from bevcli.model.deformable_convolution import (
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.temporal_model import TemporalModel
 
-KEPT_TABLES = 32  # of level sizes, for images of several sizes
 VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
 
 
@@ -28,7 +27,7 @@ def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: boo
     """
     if model.has_parts:
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    kept_sizes = lru_cache(KEPT_TABLES)(level_sizes)
+    kept_sizes = cache(level_sizes)  # all: CUDA graphs hold their addresses
     for module in model.modules():
         if isinstance(module, DeformableAttention):
             module.sampling = fastest_sampling(device)

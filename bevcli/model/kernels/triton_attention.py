@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 from itertools import accumulate
 from typing import Any
 
@@ -17,7 +17,6 @@ from bevcli.model.kernels.triton_bilinear import corner_of
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
-KEPT_TABLES = 32  # those of the sampling of all layers of a model, and of some frames' hits
 
 
 class TritonSampling(nn.Module):
@@ -89,9 +88,12 @@ def _launch(
             )
 
 
-@lru_cache(KEPT_TABLES)
+@cache
 def _table(rows: tuple[int, ...] | LevelShapes, device: torch.device) -> Tensor:
-    """The rows as int32 on a device. Equal tables, as all layers of a model need them, are uploaded once."""
+    """The rows as int32 on a device. Equal tables, as all layers and frames need them, are uploaded once.
+
+    None is given up, because CUDA graphs hold their addresses.
+    """
     return upload(torch.tensor(rows, dtype=torch.int32), device)
 
 
