@@ -7,6 +7,7 @@ import mmap
 import os
 import pickle
 import shutil
+import signal
 import tempfile
 import threading
 from collections.abc import Generator, Iterable
@@ -126,6 +127,7 @@ def _start_loader(maker: BatchMaker, line: Connection, folders: tuple[Path, ...]
     """Prepare a process, which ends as soon as the other end of the line is closed, or the process that holds it."""
     global _loader
     _loader = maker, folders
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the other end of the line is closed in any case
 
     def end_with_parent() -> None:
         line.poll(None)
