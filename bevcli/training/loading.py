@@ -7,6 +7,7 @@ import mmap
 import os
 import pickle
 import shutil
+import signal
 import tempfile
 import threading
 from collections.abc import Generator, Iterable
@@ -34,7 +35,7 @@ from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.samples import Batch, ClipConfig, draw_clips, load_batch
 
 MEMORY_FOLDER = Path("/dev/shm")  # files in memory, on Linux
-MIN_MEMORY_BYTES = 16e9  # free in that folder
+FREE_BATCHES = 16  # for so many, that folder has to have space
 ALIGNMENT = 64  # bytes
 
 
@@ -88,9 +89,9 @@ def loaded_batches(
         return
     context = get_context("spawn")
     line_end, line = context.Pipe(duplex=False)
-    in_memory = MEMORY_FOLDER.is_dir() and shutil.disk_usage(MEMORY_FOLDER).free >= MIN_MEMORY_BYTES
-    folder = Path(tempfile.mkdtemp(prefix="bevcli-batches-", dir=MEMORY_FOLDER if in_memory else None))
-    pool = ProcessPoolExecutor(loaders, context, _start_loader, (maker, line_end, folder))
+    parents = [str(MEMORY_FOLDER)] * os.access(MEMORY_FOLDER, os.W_OK) + [tempfile.gettempdir()]
+    folders = tuple(Path(tempfile.mkdtemp(prefix="bevcli-batches-", dir=parent)) for parent in parents)
+    pool = ProcessPoolExecutor(loaders, context, _start_loader, (maker, line_end, folders))
 
     def load(place: tuple[int, int]) -> Batch:
         try:
@@ -111,20 +112,26 @@ def loaded_batches(
     finally:
         line.close()  # the processes end at once
         pool.shutdown(cancel_futures=True)
+        _remove(folders)
+
+
+_loader: tuple[BatchMaker, tuple[Path, ...]]  # of a process that makes batches
+
+
+def _remove(folders: Iterable[Path]) -> None:
+    for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-_loader: tuple[BatchMaker, Path]  # of a process that makes batches
-
-
-def _start_loader(maker: BatchMaker, line: Connection, folder: Path) -> None:
+def _start_loader(maker: BatchMaker, line: Connection, folders: tuple[Path, ...]) -> None:
     """Prepare a process, which ends as soon as the other end of the line is closed, or the process that holds it."""
     global _loader
-    _loader = maker, folder
+    _loader = maker, folders
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the other end of the line is closed in any case
 
     def end_with_parent() -> None:
         line.poll(None)
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folders)
         os._exit(0)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
@@ -156,11 +163,13 @@ class _Packed:
 
 
 def _make_packed(place: tuple[int, int]) -> _Packed:
-    maker, folder = _loader
+    maker, folders = _loader
     arrays: list[pickle.PickleBuffer] = []
     rest = BytesIO()
     _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker(*place))
-    path, ends = folder / "-".join(map(str, place)), []
+    needed = FREE_BATCHES * sum(array.raw().nbytes for array in arrays)
+    roomy = (folder for folder in folders if shutil.disk_usage(folder).free >= needed)
+    path, ends = next(roomy, folders[-1]) / "-".join(map(str, place)), []
     with open(path, "wb") as file:
         for array in arrays:
             start = file.tell()

@@ -155,14 +155,21 @@ class Targets:
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
+        return self._changed(lambda tensor: upload(tensor, device))
+
+    def pinned(self) -> Targets:
+        """A copy in memory that a GPU reads by itself."""
+        return self._changed(pinned)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
+        """A copy with other tensors."""
+
+        def changed(part: Any) -> Any:
+            tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
+            return replace(part, **{name: change(x) for name, x in tensors.items()})
+
         parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
-        return replace(self, **{name: None if x is None else _moved(x, device) for name, x in parts.items()})
-
-
-def _moved(targets: Any, device: torch.device) -> Any:
-    """A copy of a dataclass of tensors on a device."""
-    tensors = {name: x for name, x in vars(targets).items() if isinstance(x, Tensor)}
-    return replace(targets, **{name: upload(x, device) for name, x in tensors.items()})
+        return replace(self, **{name: None if part is None else changed(part) for name, part in parts.items()})
 
 
 @dataclass(frozen=True)
@@ -188,8 +195,8 @@ class Batch:
         return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
 
     def pinned(self) -> Batch:
-        """A copy whose images are in memory that a GPU reads by itself."""
-        return self._with_images(pinned)
+        """A copy whose images and targets are in memory that a GPU reads by itself."""
+        return replace(self._with_images(pinned), targets=tuple(targets.pinned() for targets in self.targets))
 
     def normalised(self, image: ImageConfig) -> Batch:
         """The batch with its images normalised, where they are in bytes."""

@@ -106,7 +106,8 @@ def segmentation_targets(
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     """(S, Y·X): whether a class covers enough of a cell."""
     _check_map(bev_map, grid)
-    map_grid = BevGrid(*bev_map.cells.shape, bev_map.x_range_m, bev_map.y_range_m)
+    map_rows, map_columns = bev_map.cells.shape
+    map_grid = BevGrid(map_rows, map_columns, bev_map.x_range_m, bev_map.y_range_m)
     rows, columns = _sampled_cells(grid, map_grid)
     cells = bev_map.cells[::-1][rows[:, None], columns]  # the map's rows start at the largest y
     sampled = replace(bev_map, cells=cells)
