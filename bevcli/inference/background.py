@@ -1,7 +1,7 @@
 """While the model computes a frame, other threads prepare the next ones and write the one before."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 from typing import TypeVar
@@ -14,7 +14,7 @@ READING_TIMEOUT_S = 1800.0  # of all images of a frame, or of a training step
 WRITING_TIMEOUT_S = 120.0  # of one frame
 
 
-def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1) -> Iterator[T]:
+def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1) -> Generator[T]:
     """Yields work(item) for every item, in order, computed in background threads up to `depth` items ahead.
 
     An exception in `work` is raised when its item is due. If the caller stops early, the items that have not begun
