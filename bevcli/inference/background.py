@@ -1,7 +1,7 @@
 """While the model computes a frame, other threads prepare the next ones and write those before."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 from typing import Any, TypeVar
@@ -21,7 +21,7 @@ def read_ahead(
     depth: int = 2,
     threads: int = 1,
     load: Callable[[Any], T] | None = None,
-) -> Iterator[S]:
+) -> Generator[S]:
     """Yields work(item) for every item, in order, computed in background threads up to `depth` items ahead.
 
     An exception in `work` or `load` is raised when its item is due. If the caller stops early, the items that have not

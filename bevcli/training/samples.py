@@ -169,7 +169,8 @@ class Targets:
             return replace(part, **{name: change(x) for name, x in tensors.items()})
 
         parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
-        return replace(self, **{name: None if part is None else changed(part) for name, part in parts.items()})
+        moved: dict[str, Any] = {name: None if part is None else changed(part) for name, part in parts.items()}
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)
