@@ -100,7 +100,7 @@ def test_efficientnet_lite_runs_in_an_engine_and_in_int8(tmp_path):
     with torch.inference_mode():
         expected, found, close = model(small_inputs()).bev, *(step_of_file(file, small_inputs()).bev for file in files)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    assert 1e-5 < (close - expected).norm() / expected.norm() < 0.3  # of random weights
+    assert 1e-5 < (close - expected).norm() / expected.norm() < 0.15  # of random weights
 
 
 def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, tmp_path):
