@@ -40,7 +40,7 @@ class Backbone(nn.Module):
     """Images to feature maps of the configured output stages. A subclass makes `conv1`, `bn1` and the stages.
 
     Attributes:
-        by_image: on a CPU it is fastest in float32 and on one image at a time, whose maps fit into the caches.
+        by_image: on a CPU it is fastest on one image at a time, whose maps fit into the caches.
         output_stages: the stages, from 1, whose maps are returned.
         conv1: the convolution of the stem.
         bn1: the batch norm after it.

@@ -84,7 +84,7 @@ class EfficientNetLiteConfig:
 class EfficientNetLite(Backbone):
     """See `EfficientNetLiteConfig`. Images are RGB, with mean 127 and standard deviation 128 where it is pretrained."""
 
-    by_image = True  # depthwise convolutions wait for memory, and oneDNN's are slower in bfloat16
+    by_image = True  # depthwise convolutions wait for memory
 
     def __init__(self, config: EfficientNetLiteConfig) -> None:
         super().__init__(config.output_stages)

@@ -7,7 +7,6 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -66,11 +65,11 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
                 add_to_class(module, FusedBottleneck)
     dtype = DTYPES[precision]
     for part in network.image_parts:
-        alone = isinstance(part, Backbone) and part.by_image and device.type == "cpu"
-        own = torch.float32 if alone else dtype
-        part.to(own).register_forward_pre_hook(partial(_cast, own))
-        if alone:
+        part.to(dtype)
+        if isinstance(part, Backbone) and part.by_image and device.type == "cpu":
             add_to_class(part, ImageByImage)
+    for part in network.image_parts[:1]:
+        part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     rounds_attention = rounds or (precision != "fp32" and device.type == "cuda")
     rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
@@ -111,11 +110,6 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
     """Puts the methods of an addition before those of this one module, in place; its other parts stay as they are."""
     module.__class__ = type(type(module).__name__, (addition, type(module)), {})
-
-
-def _cast(dtype: torch.dtype, part: nn.Module, inputs: tuple[Tensor | Sequence[Tensor]]) -> tuple[Any]:
-    """The images, or the maps, that enter a part, in its dtype."""
-    return (inputs[0].to(dtype) if isinstance(inputs[0], Tensor) else [x.to(dtype) for x in inputs[0]],)
 
 
 class ImageByImage(nn.Module):

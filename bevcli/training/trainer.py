@@ -44,9 +44,9 @@ class FrozenStages:
     """
 
     def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
-        """stages: how many, from the first. dtype: of the computation and its results, where the backbone has both."""
+        """stages: how many, from the first. dtype: of the computation and its results."""
         self._device = backbone.conv1.weight.device
-        self._dtype = dtype = torch.float32 if backbone.by_image and self._device.type == "cpu" else dtype
+        self._dtype = dtype
         part = copy.deepcopy(backbone)
         part.stages = nn.ModuleList(part.stages[:stages])
         part.output_stages = tuple(range(1, len(part.stages) + 1))
