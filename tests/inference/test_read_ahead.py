@@ -2,7 +2,9 @@ import threading
 
 import pytest
 
+from bevcli.config import load_config
 from bevcli.inference.background import read_ahead
+from bevcli.inference.runner import AHEAD_BYTES, frames_ahead
 
 
 def test_everything_comes_in_order():
@@ -65,3 +67,13 @@ def test_an_error_of_loading_is_raised_at_its_item():
     assert [next(results), next(results)] == [0.5, 1.0]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+@pytest.mark.parametrize("cameras", [1, 6, 60])
+def test_frames_ahead_of_a_gpu_are_bounded_by_their_memory(cameras):
+    image = load_config("base").image
+    width, height = image.padded_size
+    depth, threads = frames_ahead(image, cameras, cores=16)
+    assert depth == 2 or depth * cameras * width * height * 3 * 4 <= AHEAD_BYTES
+    assert 1 <= threads <= 16
+    assert frames_ahead(image, cameras, cores=1)[1] == 1
