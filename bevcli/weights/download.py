@@ -53,7 +53,7 @@ def download(url: str, path: Path, expected_bytes: int | None, report: Report) -
     Args:
         url: http:// or https://. From https, redirects lead to https only.
         path: where to write. After an error it holds the part that has come, and PATH.json what tells its version.
-        expected_bytes: size of the file, if it is known: another size at the server ends the download at once.
+        expected_bytes: size of the file, if it is known: a larger one at the server ends the download at once.
         report: called with the bytes that are there, and with the size of the file or None.
 
     Raises:
@@ -187,7 +187,7 @@ class _Download:
     def _accept(self) -> None:
         """Check the last answer before its first byte; the headers before were those of redirects, and of a proxy.
 
-        A part must go on from what is there, in the same version. Raises _Failed, and WeightsError for another file.
+        A part must go on from what is there, in the same version. Raises _Failed and WeightsError.
         """
         part, length, tag = self._part, self._headers.get("content-length", ""), self._headers.get("etag", "")
         self._accepted, status = True, self._headers[":status"]
@@ -203,11 +203,6 @@ class _Download:
             self._start_anew()
             self._most = self.expected_bytes or MOST_BYTES
             self.total = int(length) if length.isdecimal() and len(length) < 16 else None
-            if self.expected_bytes and self.total not in (None, self.expected_bytes):
-                raise WeightsError(
-                    f"{self.url}: the server states {self.total:,} bytes, expected {self.expected_bytes:,}: it is "
-                    "another file, or the source is wrong"
-                )
             self._limit(self.total or 0)
             require_space(self._notes.parent, self.total or 0)
             if self.total and tag.isprintable() and tag.startswith('"') and len(tag) <= LONGEST_TAG:  # W/…: a weak one
@@ -230,8 +225,8 @@ class _Download:
         if size > self._most:
             self._start_anew()
             raise WeightsError(
-                f"{self.url}: the server sends more than {self._most:,} bytes: refused; if the file is so large, state "
-                "its size as `bytes` in the table of sources"
+                f"{self.url}: the server sends more than {self._most:,} bytes: refused (a larger file needs its size, "
+                "as `bytes` in the table of sources)"
             )
 
     def _refused(self, status: object) -> WeightsError:
