@@ -154,7 +154,7 @@ class RecordingReader:
         static = _applied({}, still)
         later = [*accumulate(reversed(firsts), min, initial=NO_FRAME)][-2::-1]  # the first frame behind each chunk
         state, waiting = static, defaultdict[int, list[Logged]](list)
-        for chunk, first_later in zip(self.chunks(), later, strict=True):
+        for first_later, chunk in zip(later, self.chunks(), strict=False):  # a run that is going on adds chunks
             for frame, row in zip(self._frames_of(chunk), _rows(chunk), strict=False):
                 waiting[frame].append(row)
             for frame in sorted(frame for frame in waiting if frame < first_later):

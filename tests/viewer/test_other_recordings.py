@@ -169,3 +169,11 @@ def fail_in(path):
     with open_recording(path) as file:
         assert file != path
         raise InputError(f"{file}: wrong")
+
+
+def test_a_recording_that_grows_while_it_is_read_is_no_error(recording, monkeypatch):
+    reader = RecordingReader(recording)
+    chunks = list(reader.chunks())
+    passes = [chunks[: len(chunks) // 2], chunks]
+    monkeypatch.setattr(reader, "chunks", lambda: passes.pop(0))
+    assert [frame.index for frame in reader.frames()] in ([0], [0, 1])
