@@ -31,6 +31,11 @@ def say(*texts: object, err: bool = False) -> None:
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
+def counted(count: int | str, things: str) -> str:
+    """A number of things, such as "6 cameras" or "1 camera". things: a plural that ends in s."""
+    return f"{count} {things.removesuffix('s') if str(count) == '1' else things}"
+
+
 def _escaped(char: str) -> str:
     """The character, or its escape if it could steer a terminal or cannot be seen."""
     shown = char.isprintable() or unicodedata.category(char) == "Zs"

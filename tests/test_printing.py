@@ -9,7 +9,7 @@ from source_code import ROOT, trees
 from bevcli.cli.bridge import print_note
 from bevcli.cli.progress import Progress
 from bevcli.errors import InputError
-from bevcli.printing import LONGEST_MESSAGE, one_line, say
+from bevcli.printing import LONGEST_MESSAGE, counted, one_line, say
 
 SAMPLE = ROOT.parent / "samples/street"
 NASTY = "\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"
@@ -64,6 +64,10 @@ def test_an_error_of_the_system_is_clean(tmp_path):
     done = command(tmp_path, "convert", SAMPLE, "out\x1b[2J" + "x" * 300)
     assert done.returncode == 1
     assert r"out\x1b[2Jxxx" in done.stderr
+
+
+def test_one_thing_is_no_plural():
+    assert [counted(count, "cameras") for count in (0, 1, 6)] == ["0 cameras", "1 camera", "6 cameras"]
 
 
 def test_only_say_prints():

@@ -23,6 +23,7 @@ from bevcli.printing import one_line, say
 from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+_OTHER_ARGUMENT = re.compile(r"`([a-z]\w*)=\"?([^`\"]*)\"?`")
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
@@ -252,8 +253,12 @@ def _exists(path: Path) -> bool:
 
 
 def as_flags(text: str) -> str:
-    """A text of the library for the command line: the running command's arguments in backticks become its flags."""
-    return _with_flags(text, _flags.get())
+    """A text of the library for the command line: the running command's arguments in backticks become its flags.
+
+    So do arguments with a value of other commands, such as `weights=FILE` in `bevcli weights fetch`.
+    """
+    flags = _flags.get()
+    return _OTHER_ARGUMENT.sub(_other_flag, _with_flags(text, flags)) if flags else text
 
 
 def print_note(text: str) -> None:
@@ -266,6 +271,11 @@ def _with_flags(text: str, flags: Mapping[str, _Flag]) -> str:
         return _as_flag(flags[found[1]], found[2]) if found[1] in flags else found[0]
 
     return _ARGUMENT.sub(flag, text)
+
+
+def _other_flag(found: re.Match[str]) -> str:
+    flag = f"--{found[1].replace('_', '-')}"
+    return flag if found[2] == "True" else f"{flag} {found[2]}"
 
 
 def _as_flag(flag: _Flag, value: str | None) -> str:

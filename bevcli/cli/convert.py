@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
-from bevcli.printing import say
+from bevcli.printing import counted, say
 from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
 
 PANEL = "Start"
@@ -55,4 +55,4 @@ def convert(
         name = load(GROUP, written.form).name
         say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)
     missing = f", {gaps} images missing" if gaps else ""
-    say(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")
+    say(f"{out}: {counted(count, 'frames')}, {counted(len(frame.rig.cameras), 'cameras')}{missing}")

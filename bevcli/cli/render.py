@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from bevcli.cli.bridge import argument
-from bevcli.printing import say
+from bevcli.printing import counted, say
 from bevcli.synth.options import RenderOptions
 
 PANEL = "Start"
@@ -24,5 +24,5 @@ def render(
         say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
     with Progress(options.frames, "frames") as progress:
         summary = render_sequence(out, options, progress=lambda frame: progress.advance())
-    cameras = len(summary.cameras)
-    say(f"{summary.folder}: {summary.frames} frames, {cameras} cameras, {summary.weather}, seed {summary.seed}")
+    size = f"{counted(summary.frames, 'frames')}, {counted(len(summary.cameras), 'cameras')}"
+    say(f"{summary.folder}: {size}, {summary.weather}, seed {summary.seed}")

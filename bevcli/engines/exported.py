@@ -19,7 +19,7 @@ from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.parsing.documents import parse_json
-from bevcli.printing import reason_of
+from bevcli.printing import counted, reason_of
 from bevcli.registry import load
 
 SUFFIX = ".onnx"
@@ -111,7 +111,7 @@ class ExportedModel(TemporalModel):
         count = prepared.images.shape[1]
         if count != self.cameras:
             raise WeightsError(
-                f"{self.file}: takes {self.cameras} cameras, but the sequence has {count}: "
+                f"{self.file}: takes {counted(self.cameras, 'cameras')}, but the sequence has {count}: "
                 f"use `bevcli export-onnx --cameras {count}`"
             )
         found = self.outputs_by_name(self.form.feed(prepared, memory))
@@ -152,7 +152,7 @@ class ExportedModel(TemporalModel):
         most, slots = int(found["most_cameras_per_cell"][0]), self.metadata.cameras_per_cell
         if most > slots:
             raise WeightsError(
-                f"{self.file}: takes {slots} cameras that see the same BEV cell, but the sequence has {most}: "
+                f"{self.file}: takes {counted(slots, 'cameras')} per BEV cell, but the sequence has {most}: "
                 f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
         return {name: torch.from_numpy(value) for name, value in found.items()}

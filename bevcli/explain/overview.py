@@ -13,6 +13,7 @@ from bevcli.explain.camera_figures import image_features, pillars, spatial_atten
 from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
 from bevcli.explain.trace import Trace
+from bevcli.printing import counted
 
 HEIGHT = 7.7  # inches
 MOST_CAMERAS = 6
@@ -62,7 +63,7 @@ def _images_and_features(figure: Figure, trace: Trace) -> None:
         axes.imshow(drawing.rgb_image(trace.frame, name), aspect="auto")
         drawing.bare(axes)
         drawing.show_lengths(figure.add_axes((0.265, bottom, 0.125, 0.118)), trace, lengths, place, aspect="auto")
-    figure.text(0.012, 0.8, f"{len(trace.frame.rig.cameras)} cameras", fontsize=12.5, color=INK)
+    figure.text(0.012, 0.8, counted(len(trace.frame.rig.cameras), "cameras"), fontsize=12.5, color=INK)
     figure.text(0.265, 0.8, "image features", fontsize=12.5, color=INK)
 
 

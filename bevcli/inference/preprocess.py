@@ -22,6 +22,7 @@ from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.export_form import raw_images
 from bevcli.model.step import PreparedFrame
+from bevcli.printing import counted
 
 
 class Preprocessor:
@@ -186,7 +187,8 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
     for drive, place in (places[index] for index in chosen):
         prepared = preprocess(drive.load(place))
         if len(prepared.assignment.cameras) != cameras:
-            raise InputError(f"{drive.name}: has {len(prepared.assignment.cameras)} cameras (the file takes {cameras})")
+            found = counted(len(prepared.assignment.cameras), "cameras")
+            raise InputError(f"{drive.name}: has {found} (the file takes {cameras})")
         if prepared.frame.images:
             empty = False
             yield raw_images(prepared.images, config).numpy()

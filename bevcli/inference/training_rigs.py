@@ -9,6 +9,7 @@ import numpy as np
 
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.model.config import ModelConfig
+from bevcli.printing import counted
 
 # How far outside the range of the training a camera may be without a note.
 _FOV_DEG, _HEIGHT_M, _TILT_DEG = 8.0, 0.3, 1.5
@@ -52,7 +53,7 @@ def weights_facts(config: ModelConfig) -> dict[str, str]:
     count = "{} to {}".format(*rigs.cameras) if rigs.cameras[0] < rigs.cameras[1] else f"{rigs.cameras[0]}"
     lenses = "field of view {:g} to {:g}°".format(*rigs.fov_deg)
     places = "height {:g} to {:g} m, pitch and roll up to {:g}°".format(*rigs.height_m, rigs.tilt_deg)
-    return facts | {"training_rigs": f"{count} cameras, {lenses}, {places}"}
+    return facts | {"training_rigs": f"{counted(count, 'cameras')}, {lenses}, {places}"}
 
 
 def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
@@ -79,7 +80,7 @@ def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:
     tilt = max(_tilt_deg(camera) for camera in rig.cameras)
     far = []
     if not trained.cameras[0] <= count <= trained.cameras[1]:
-        far.append(f"{count} cameras ({_range(trained.cameras, '')})")
+        far.append(f"{counted(count, 'cameras')} ({_range(trained.cameras, '')})")
     if _is_outside(heights, trained.height_m, _HEIGHT_M):
         far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({_range(trained.height_m, ' m')})")
     if _is_outside(fovs, trained.fov_deg, _FOV_DEG):

@@ -13,6 +13,7 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
+from bevcli.printing import counted
 from bevcli.recording import entities
 from bevcli.recording.box_lines import UNSEEN, labels_2d
 from bevcli.recording.colors import (
@@ -102,7 +103,7 @@ def _about_text(recorded: Recorded) -> str:
     names, untrained = recorded.drive.rig.names, recorded.model.untrained
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
     facts = (
-        f"bevcli {__version__}; {len(names)} cameras: {', '.join(names)}. "
+        f"bevcli {__version__}; {counted(len(names), 'cameras')}: {', '.join(names)}. "
         f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
     )
     return f"# {recorded.title}\n\n{warning}{facts}\n{HOW_TO_READ}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from bevcli.findings import SEVERITIES, Finding, errors_of
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.printing import aligned
+from bevcli.printing import aligned, counted
 from bevcli.rig.bev_checks import check_bev_frame
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.lens_checks import check_lenses
@@ -114,7 +114,7 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
     coverage = report.coverage
     once = 1 - coverage.unseen - coverage.overlap
     seen = f"{coverage.unseen:.1%} of the cells seen by no camera, {once:.1%} by one, {coverage.overlap:.1%} by more"
-    parts = [f"{name}: {len(rig.cameras)} cameras", "", _cameras(rig, coverage), "", f"BEV grid: {seen}"]
+    parts = [f"{name}: {counted(len(rig.cameras), 'cameras')}", "", _cameras(rig, coverage), "", f"BEV grid: {seen}"]
     parts += ["", *_finding_lines(report.findings)]
     if report.measures:
         rows = [("compared with nuScenes", "this rig", "nuScenes", "")]

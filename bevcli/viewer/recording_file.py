@@ -28,7 +28,8 @@ from rerun.chunk import RrdReader
 limit_memory()
 warnings.simplefilter("ignore")
 try:
-    for chunk in RrdReader(sys.argv[1]).stream():
+    reader = RrdReader(sys.argv[1])
+    for chunk in reader.stream() if reader.recordings() else ():
         chunk.to_record_batch()
 except Exception as error:
     sys.exit(" ".join(str(error).split()))
@@ -41,6 +42,7 @@ SECONDS, BYTES_PER_SECOND = 30.0, 1e6  # time limit of a process that reads a re
 RECORDING = "recording.rrd"
 LARGEST_INDEXED = 256 << 20  # bytes; to make an index takes several times its size in memory
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
+OLDEST = (0, 23)  # version of rerun whose files are read; the bytes after MAGIC state a file's
 FILE_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")  # bytes; kind and length of a message
 MESSAGE_KINDS = (1, 2, 3)  # facts of the recording, data, and the choice of a blueprint
 
@@ -65,7 +67,10 @@ def open_recording(path: Path) -> Iterator[Path]:
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         _check(copy, path)
-        yield copy
+        try:
+            yield copy
+        except BevcliError as error:
+            raise type(error)(str(error).replace(str(copy), str(path))) from None
 
 
 def recording_in(path: Path) -> Path:
@@ -126,7 +131,7 @@ def _run(path: Path, run: Callable[..., subprocess.CompletedProcess[bytes]]) -> 
 def _is_whole(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            start = file.read(len(MAGIC))
+            start, version = file.read(len(MAGIC)), file.read(3)
             size = file.seek(0, 2)
             file.seek(max(0, size - 12))
             end = file.read(12)
@@ -137,6 +142,11 @@ def _is_whole(path: Path) -> bool:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if not start:
         raise InputError(f"{path}: is not a recording: the file is empty")
+    if start in (b"RRF0", b"RRF1") or (start == MAGIC and tuple(version[:2]) < OLDEST):
+        raise InputError(
+            f"{path}: an old version of rerun wrote this recording, {'.'.join(map(str, version))} (expected "
+            f"{'.'.join(map(str, OLDEST))} or newer): open it with that version of rerun, or record it anew"
+        )
     if start != MAGIC:
         raise InputError(f"{path}: is not a recording (expected a file that starts with RRF2, found {start!r})")
     return has_whole_messages

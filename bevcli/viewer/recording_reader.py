@@ -1,9 +1,11 @@
-"""Reads a recording frame by frame, in the order of writing, with one frame at a time in memory."""
+"""Reads a recording frame by frame, in the order of frames, with as few frames in memory as the file's order allows."""
 
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +20,24 @@ from bevcli.recording import entities
 Row = dict[str, pa.Scalar]
 
 
+Logged = tuple[bytes, str, Row]  # the row's identity, which grows with the time of logging; its entity; its components
+OF_EACH_FRAME = (entities.EGO, entities.BOXES)  # never those of an earlier frame
+NO_FRAME = np.inf  # after all frames
+
+
 @dataclass(frozen=True)
 class RecordedFrame:
-    """The state of all entities at one frame.
+    """The state of all entities at one frame. What is read is checked: InputError for other types and lengths.
 
     Attributes:
         index: the frame's index.
         rows: by entity, then by component: the newest value, static ones included.
+        path: the recording's file, for messages.
     """
 
     index: int
     rows: Mapping[str, Row]
+    path: Path
 
     def has(self, entity: str, component: str) -> bool:
         """True if the entity has a value for this component."""
@@ -36,32 +45,87 @@ class RecordedFrame:
 
     def values(self, entity: str, component: str) -> list[Any]:
         """The values of a component as Python objects; [] if there are none."""
-        return self.rows[entity][component].as_py() if self.has(entity, component) else []
+        try:
+            return self.rows[entity][component].as_py() if self.has(entity, component) else []
+        except (ValueError, OverflowError) as error:  # such as bytes that are no text, or times that Python lacks
+            raise self.wrong(entity, component, "values that can be read", error) from None
 
-    def array(self, entity: str, component: str, width: int) -> Array:
-        """The values of a component as (N, width) float64, `width` numbers each; (0, width) if there are none."""
-        return np.asarray(self._numbers(entity, component), dtype=np.float64).reshape(-1, width)
+    def texts(self, entity: str, component: str, count: int | None = None) -> list[str]:
+        """The values of a component that are texts; [] if there are none. count: as of `array`."""
+        values = self.values(entity, component)
+        if not all(isinstance(value, str) for value in values) or count not in (None, len(values)):
+            raise self.wrong(entity, component, "texts", values, count)
+        return values
+
+    def integers(self, entity: str, component: str, count: int | None = None) -> list[int]:
+        """The values of a component that are integers of 64 bits or booleans; [] if there are none. count: as above."""
+        values = self.values(entity, component)
+        whole = all(isinstance(value, int) and -(1 << 63) <= value < 1 << 63 for value in values)
+        if not whole or count not in (None, len(values)):
+            raise self.wrong(entity, component, "integers of 64 bits", values, count)
+        return values
+
+    def array(self, entity: str, component: str, width: int, count: int | None = None, *, nan: bool = False) -> Array:
+        """The values of a component as (N, width) float64, `width` numbers each; (0, width) if there are none.
+
+        count: the N that is expected, if any is. nan: NaN, for a number that is not known, may be among them.
+        """
+        flat = self._flat(entity, component, width)
+        numbers = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
+        found = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if numbers else np.zeros(1)
+        if not numbers or len(found) % width or count not in (None, len(found) // width):
+            raise self.wrong(entity, component, f"values of {width} numbers", flat, count)
+        if not (np.isfinite(found) | (nan & np.isnan(found))).all():
+            raise self.wrong(entity, component, "finite numbers", "NaN or infinity")
+        return found.reshape(-1, width)
+
+    def strips(self, entity: str, component: str) -> list[Array]:
+        """The values of a component that are lists of points, (P, 2) each."""
+        if not self.has(entity, component):
+            return []
+        lists, points = self.rows[entity][component].values, self.array(entity, component, 2)
+        ends = np.cumsum(lists.value_lengths().to_numpy(zero_copy_only=False)) if pa.types.is_list(lists.type) else [-1]
+        if len(ends) and ends[-1] != len(points):
+            raise self.wrong(entity, component, "lists of points (x, y)", lists.type)
+        return np.split(points, ends[:-1])[: len(ends)]
 
     def blob(self, entity: str, component: str) -> bytes:
         """The bytes of a component that is one blob, such as a JPEG; empty if there is none."""
-        return np.asarray(self._numbers(entity, component), dtype=np.uint8).tobytes()
+        flat = self._flat(entity, component)
+        if flat.type != pa.uint8() or flat.null_count:
+            raise self.wrong(entity, component, "bytes", flat.type)
+        return flat.to_numpy().tobytes()
 
-    def _numbers(self, entity: str, component: str) -> pa.Array:
+    def wrong(self, entity: str, component: str, expected: str, found: object, count: int | None = None) -> InputError:
+        """The error of a component whose values are not the expected ones, or not as many as the `count`."""
+        expected = expected if count is None else f"{count} {expected}"
+        found = f"{len(found)} of type {found.type}" if isinstance(found, pa.Array) else f"{found!s:.40}"
+        return InputError(
+            f"{self.path}: frame {self.index}: {entity}: {component}: expected {expected}, found {found}: "
+            "is it a recording of `bevcli run`?"
+        )
+
+    def _flat(self, entity: str, component: str, width: int = 1) -> pa.Array:
         if not self.has(entity, component):
             return pa.array([], pa.uint8())
         values = self.rows[entity][component].values
-        while pa.types.is_nested(values.type):
+        while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
+            if pa.types.is_fixed_size_list(values.type) and values.type.list_size != width:
+                raise self.wrong(entity, component, f"{width} numbers in each value", values)
             values = values.flatten()
         return values
 
 
 class RecordingReader:
-    """A recording that `Recording` wrote. Raises InputError if the file cannot be read."""
+    """A recording that `Recording` wrote. Raises InputError if the file cannot be read or holds several recordings."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with self._reading():
             self._reader = RrdReader(path)
+            count = len(self._reader.recordings())
+        if count != 1:
+            raise InputError(f"{self.path}: the file holds {count} recordings (expected one of `bevcli run`)")
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -78,31 +142,53 @@ class RecordingReader:
             yield from self._reader.stream()
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """The frames in order, each with the state of all entities."""
-        state: dict[str, Row] = {}
-        current: int | None = None
-        for entity, frame, row in self._rows():
-            if frame is not None and (current is None or frame > current):
-                if current is not None:
-                    yield RecordedFrame(current, dict(state))
-                current = frame
-            if frame is None or frame == current:  # not a BEV image that was written late for an earlier frame
-                _apply(state, entity, row)
-        if current is not None:
-            yield RecordedFrame(current, dict(state))
+        """The frames in order, each with the state of all entities.
 
-    def _rows(self) -> Iterator[tuple[str, int | None, Row]]:
+        A frame without its vehicle or its boxes is left out: the file was cut within it, or another program wrote it.
+        """
+        still: list[Logged] = []
+        firsts: list[float] = []
         for chunk in self.chunks():
-            batch = chunk.to_record_batch()
-            names = [field.name for field in batch.schema if (field.metadata or {}).get(b"rerun:kind") == b"data"]
-            timed = entities.FRAME_TIMELINE in batch.schema.names
-            for i in range(batch.num_rows):
-                frame = batch.column(entities.FRAME_TIMELINE)[i].as_py() if timed else None
-                yield chunk.entity_path.strip("/"), frame, {n: batch.column(n)[i] for n in names}
+            firsts.append(min(self._frames_of(chunk), default=NO_FRAME))
+            still += _rows(chunk) if chunk.is_static else ()
+        static = _applied({}, still)
+        later = [*accumulate(reversed(firsts), min, initial=NO_FRAME)][-2::-1]  # the first frame behind each chunk
+        state, waiting = static, defaultdict[int, list[Logged]](list)
+        for first_later, chunk in zip(later, self.chunks(), strict=False):  # a run that is going on adds chunks
+            for frame, row in zip(self._frames_of(chunk), _rows(chunk), strict=False):
+                waiting[frame].append(row)
+            for frame in sorted(frame for frame in waiting if frame < first_later):
+                rows = waiting.pop(frame)
+                state = _applied(state | {entity: static.get(entity, {}) for entity in OF_EACH_FRAME}, rows)
+                if {entity for _, entity, _ in rows}.issuperset(OF_EACH_FRAME):
+                    yield RecordedFrame(frame, state, self.path)
+
+    def _frames_of(self, chunk: Chunk) -> list[int]:
+        """The frame of each row; [] where the rows are of no frame. Raises InputError for times in place of frames."""
+        if entities.FRAME_TIMELINE not in chunk.timeline_names:
+            return []
+        frames = chunk.to_record_batch().column(entities.FRAME_TIMELINE)
+        if frames.type != pa.int64():
+            raise InputError(
+                f'{self.path}: the timeline "{entities.FRAME_TIMELINE}" holds {frames.type} (expected the numbers of '
+                "frames): is it a recording of `bevcli run`?"
+            )
+        return frames.to_pylist()
 
 
-def _apply(state: dict[str, Row], entity: str, row: Row) -> None:
-    if "Clear:is_recursive" in row:
-        state.pop(entity, None)
-        return
-    state[entity] = {**state.get(entity, {}), **{n: value for n, value in row.items() if value.is_valid}}
+def _rows(chunk: Chunk) -> Iterator[Logged]:
+    batch, entity = chunk.to_record_batch(), chunk.entity_path.strip("/")
+    names = [field.name for field in batch.schema if (field.metadata or {}).get(b"rerun:kind") == b"data"]
+    for i in range(batch.num_rows):
+        yield batch.column(0)[i].as_py(), entity, {name: batch.column(name)[i] for name in names}
+
+
+def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
+    """The state after rows, which are taken in the order of logging."""
+    state = dict(state)
+    for _, entity, row in sorted(rows, key=lambda row: row[0]):
+        if "Clear:is_recursive" in row:
+            state.pop(entity, None)
+        else:
+            state[entity] = {**state.get(entity, {}), **{n: value for n, value in row.items() if value.is_valid}}
+    return state

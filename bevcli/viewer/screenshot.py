@@ -48,7 +48,7 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
         client = _connect(process, port)
         client.open(str(recording))
         state = _wait(process, lambda: _opened(client), "the viewer cannot open the recording")
-        _go_to(client, state, frame)
+        _go_to(recording, client, state, frame)
         time.sleep(SETTLE_S)
         _write(image, client.take_screenshot())
         return tuple(view.name for view in client.get_state().views)
@@ -79,13 +79,13 @@ def _opened(client: ViewerClient) -> ViewerState | None:
     return state if ready else None
 
 
-def _go_to(client: ViewerClient, state: ViewerState, frame: int | None) -> None:
+def _go_to(recording: Path, client: ViewerClient, state: ViewerState, frame: int | None) -> None:
     timeline = next((t for t in state.recordings[0].timelines if t.name == entities.FRAME_TIMELINE), None)
-    if timeline is None or timeline.start is None or timeline.end is None:
-        raise InputError("the recording has no frames (expected one that `bevcli run` wrote)")
+    if timeline is None or timeline.start is None or timeline.end is None or timeline.time_type != "sequence":
+        raise InputError(f"{recording}: the recording has no frames (expected one of `bevcli run`)")
     wanted = timeline.start if frame is None else frame
     if not timeline.start <= wanted <= timeline.end:
-        raise InputError(f"`frame={wanted}`: the recording has frames {timeline.start} to {timeline.end}")
+        raise InputError(f"{recording}: `frame={wanted}`: the recording has frames {timeline.start} to {timeline.end}")
     client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
 
 

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bevcli.recording import entities
+from bevcli.viewer.export import recorded_boxes
 from bevcli.viewer.recording_reader import RecordingReader
 
 SHOWN_ENTITIES = 15
@@ -63,16 +64,17 @@ def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
         sizes[chunk.entity_path] += chunk.to_record_batch().nbytes
     boxes: Counter[str] = Counter()
     times: list[int] = []
-    title, untrained = ["a recording"], False
+    title, untrained = "", False
     for frame in reader.frames():
-        boxes.update(frame.values(entities.BOXES, "name"))
-        times += frame.values(entities.EGO, "timestamp_ns")
-        title = frame.values(entities.RUN, "title") or ["a recording"]
-        untrained = any(frame.values(entities.RUN, "untrained"))
+        recorded = recorded_boxes(frame)
+        boxes.update(recorded.boxes.classes.tolist())
+        times.append(recorded.stamp.timestamp_ns)
+        title = "".join(frame.texts(entities.RUN, "title"))
+        untrained = any(frame.integers(entities.RUN, "untrained"))
     return RecordingSummary(
         path=path,
         file_bytes=path.stat().st_size,
-        title=title[0],
+        title=title or "a recording",
         untrained=untrained,
         timestamps_ns=tuple(times),
         boxes=dict(boxes.most_common()),

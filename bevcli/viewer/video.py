@@ -75,15 +75,9 @@ def frame_rate(recording: Path) -> tuple[int, float]:
 
     Images are not decoded.
     """
-    times: dict[int, int] = {}  # timestamp in nanoseconds by frame
-    for chunk in RecordingReader(recording).chunks():
-        if chunk.entity_path.strip("/") == entities.EGO:
-            batch = chunk.to_record_batch()
-            if "timestamp_ns" in batch.schema.names:
-                frames = batch.column(entities.FRAME_TIMELINE).to_pylist()
-                stamps = batch.column("timestamp_ns").to_pylist()
-                times.update({f: stamp[0] for f, stamp in zip(frames, stamps, strict=True) if stamp})
-    steps = np.diff(np.array([times[frame] for frame in sorted(times)], dtype=np.int64))
+    frames = RecordingReader(recording).frames()
+    times = np.array([frame.integers(entities.EGO, "timestamp_ns", 1)[0] for frame in frames], dtype=np.int64)
+    steps = np.diff(times)
     seconds = float(np.median(steps[steps > 0])) / 1e9 if (steps > 0).any() else 1.0
     return len(times), float(np.clip(1 / seconds, SLOWEST, FASTEST))
 
@@ -105,7 +99,7 @@ def draw_frame_at(recording: Path, index: int) -> np.ndarray | None:
     for frame in RecordingReader(recording).frames():
         if frame.index == index:
             return draw_frame(frame, tiles(frame), images)
-        for name in frame.values(entities.RUN, "camera_names"):
+        for name in frame.texts(entities.RUN, "camera_names"):
             if frame.has(entities.image(name), "VideoStream:sample"):  # a video is decoded in order
                 images.image(frame, name)
     return None

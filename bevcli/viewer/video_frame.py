@@ -1,9 +1,9 @@
 """Draws one frame of a video: all cameras with their boxes, the BEV to the right, a legend below."""
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -47,12 +47,14 @@ Canvas = NDArray[np.uint8]
 ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 SUBPIXEL_BITS = 3
+STRIPS = "LineStrips2D:strips"
+FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
 OPACITIES = 10  # steps of opacity, faint to opaque
 
 
 def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
     """Draws the line strips of an entity, opaque."""
-    strips = frame.values(entity, "LineStrips2D:strips")
+    strips = frame.strips(entity, STRIPS)
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
     for strip, color in zip(strips, colors, strict=True):
         _draw_line(canvas, strip, color, to_canvas, thickness)
@@ -60,9 +62,9 @@ def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
 
 def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
     """Draws the line strips of an entity with the opacity of their colours, in OPACITIES steps."""
-    strips = frame.values(entity, "LineStrips2D:strips")
+    strips = frame.strips(entity, STRIPS)
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
-    packed = np.array(frame.values(entity, "LineStrips2D:colors") or [255], dtype=np.uint32)
+    packed = np.array(frame.integers(entity, "LineStrips2D:colors") or [255])
     opacity = np.broadcast_to(packed if len(packed) == len(strips) else packed[:1], len(strips)) & 255
     step = np.ceil(opacity / 255 * OPACITIES).astype(int)
     for level in np.unique(step[step > 0]):
@@ -72,16 +74,15 @@ def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canv
         canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
 
 
-def _draw_line(canvas: Canvas, strip: Any, color: Color, to_canvas: ToCanvas, thickness: int = 1) -> None:
-    points = np.clip(to_canvas(np.array(strip)), -1e5, 1e5) * (1 << SUBPIXEL_BITS)
-    points = np.round(points).astype(np.int32)
+def _draw_line(canvas: Canvas, strip: Array, color: Color, to_canvas: ToCanvas, thickness: int = 1) -> None:
+    points = np.round(to_canvas(strip) * (1 << SUBPIXEL_BITS)).astype(np.int32)
     cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
     """Draws the 2D arrows of an entity."""
     starts = frame.array(entity, "Arrows2D:origins", 2)
-    ends = starts + frame.array(entity, "Arrows2D:vectors", 2)
+    ends = starts + frame.array(entity, "Arrows2D:vectors", 2, len(starts))
     colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
     for start, end, color in zip(to_canvas(starts), to_canvas(ends), colors, strict=True):
         cv2.arrowedLine(canvas, start.astype(int).tolist(), end.astype(int).tolist(), color, 1, cv2.LINE_AA, 0, 0.25)
@@ -91,7 +92,7 @@ def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     """Draws the labels of an entity as text on a dark background, centred on the labelled points."""
     positions = to_canvas(frame.array(entity, "Points2D:positions", 2))
     colors = entity_colors(frame, entity, "Points2D:colors", len(positions))
-    for text, (x, y), color in zip(frame.values(entity, "Points2D:labels"), positions, colors, strict=False):
+    for text, (x, y), color in zip(frame.texts(entity, "Points2D:labels"), positions, colors, strict=False):
         draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
 
 
@@ -112,7 +113,7 @@ def draw_text(
 
 def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
     """`count` colours, BGR. One recorded colour is repeated; without a recorded colour all are white."""
-    packed = frame.values(entity, component) or [0xFFFFFFFF]
+    packed = frame.integers(entity, component) or [0xFFFFFFFF]
     colors = [((c >> 8) & 255, (c >> 16) & 255, (c >> 24) & 255) for c in packed]
     return colors if len(colors) == count else colors[:1] * count
 
@@ -123,7 +124,11 @@ def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
     if not formats:
         return None
     pixels = np.frombuffer(frame.blob(entity, "Image:buffer"), dtype=np.uint8)
-    return pixels.reshape(formats[0]["height"], formats[0]["width"], 3)[..., ::-1]
+    stated = formats[0] if isinstance(formats[0], dict) else {}
+    shape = (*(size if isinstance(size := stated.get(key), int) else 0 for key in ("height", "width")), 3)
+    if pixels.size != math.prod(shape) or not pixels.size:
+        raise frame.wrong(entity, "Image:buffer", f"{shape[1]} x {shape[0]} pixels RGB", f"{pixels.size} bytes")
+    return pixels.reshape(shape)[..., ::-1]
 
 
 WIDTH, HEIGHT = 1920, 640
@@ -152,7 +157,9 @@ class Tile:
 
 def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     """The rectangles of the cameras of a recording, in rows in the same order as in the viewer."""
-    sizes = {name: _camera_size(frame, name) for name in frame.values(entities.RUN, "camera_names")}
+    sizes = {name: _camera_size(frame, name) for name in frame.texts(entities.RUN, "camera_names")}
+    if not sizes:
+        raise frame.wrong(entities.RUN, "camera_names", "the names of cameras", "none")
     aspect = min(width / height for width, height in sizes.values())
     rows = rows_of_largest_images(_camera_yaws(frame), aspect, CAMERAS_WIDTH, CAMERAS_HEIGHT)
     cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
@@ -162,20 +169,23 @@ def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
         for c, name in enumerate(row):
             width, height = sizes[name]
             scale = min(cell[0] / width, cell[1] / height)
-            w, h = round(width * scale), round(height * scale)
+            w, h = max(1, round(width * scale)), max(1, round(height * scale))
             left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
             layout.append(Tile(name, left, top, w, h))
     return tuple(layout)
 
 
 def _camera_size(frame: RecordedFrame, camera: str) -> Array:
-    return frame.array(entities.camera(camera), "Pinhole:resolution", 2)[0]  # width, height, pixels
+    (size,) = frame.array(entities.camera(camera), "Pinhole:resolution", 2, 1)  # width, height, pixels
+    if (size < 1).any():
+        raise frame.wrong(entities.camera(camera), "Pinhole:resolution", "sizes above 0", size)
+    return size
 
 
 def _camera_yaws(frame: RecordedFrame) -> dict[str, float]:
     from_world = _rotation(frame, entities.EGO).T
     yaws = {}
-    for name in frame.values(entities.RUN, "camera_names"):
+    for name in frame.texts(entities.RUN, "camera_names"):
         ahead = from_world @ _rotation(frame, entities.camera(name))[:, 2]
         yaws[name] = float(np.arctan2(ahead[1], ahead[0]))
     return yaws
@@ -202,7 +212,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     scale = np.array([tile.width / width, tile.height / height])
 
     def to_canvas(points: Array) -> Array:
-        return points * scale
+        return np.clip(points * scale, -FAR, FAR)
 
     boxes = entities.overlay(tile.camera, "boxes")
     for kind in KINDS:
@@ -216,11 +226,11 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
 
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
-    rings = [np.abs(strip).max() for strip in frame.values(entities.BEV_RINGS, "LineStrips2D:strips")]
-    reach = BEV_MARGIN * max(rings) if rings else BEV_RANGE_M
+    rings = max((np.abs(ring).max(initial=0) for ring in frame.strips(entities.BEV_RINGS, STRIPS)), default=0)
+    reach = BEV_MARGIN * rings or BEV_RANGE_M
 
     def to_canvas(points: Array) -> Array:
-        return (points / reach + 1) * BEV_SIDE / 2
+        return np.clip((points / reach + 1) * BEV_SIDE / 2, -FAR, FAR)
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
@@ -237,34 +247,34 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
 
 
 def _draw_placed(canvas: Canvas, frame: RecordedFrame, entity: str, image: Canvas, to_canvas: ToCanvas) -> None:
-    start = frame.array(entity, "Transform3D:translation", 3)[0, :2]
-    extent = frame.array(entity, "Transform3D:scale", 3)[0, :2] * image.shape[1::-1]
+    start = frame.array(entity, "Transform3D:translation", 3, 1)[0, :2]
+    extent = frame.array(entity, "Transform3D:scale", 3, 1)[0, :2] * image.shape[1::-1]
     left, top = to_canvas(start).astype(int)
     right, bottom = to_canvas(start + extent).astype(int)
     x0, y0, x1, y1 = max(left, 0), max(top, 0), min(right, BEV_SIDE), min(bottom, BEV_SIDE)
-    whole = cv2.resize(image, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST)
-    canvas[y0:y1, x0:x1] = whole[y0 - top : y1 - top, x0 - left : x1 - left]
+    rows = (np.arange(y0, y1) - top) * image.shape[0] // max(1, bottom - top)
+    columns = (np.arange(x0, x1) - left) * image.shape[1] // max(1, right - left)
+    canvas[y0:y1, x0:x1] = image[rows[:, None], columns]
 
 
 def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
-    title = "".join(frame.values(entities.RUN, "title"))
-    scene = "".join(frame.values(entities.EGO, "scene"))
-    speed = "".join(frame.values(entities.SPEED, "Points3D:labels"))
+    title = "".join(frame.texts(entities.RUN, "title"))
+    scene = "".join(frame.texts(entities.EGO, "scene"))
+    speed = "".join(frame.texts(entities.SPEED, "Points3D:labels"))
     draw_text(canvas, f"{title}   {scene}   frame {frame.index}   {speed}", (16, 24), TEXT, 0.6)
-    note = "".join(frame.values(entities.RUN, "note"))
-    if any(frame.values(entities.RUN, "untrained")):
+    note = "".join(frame.texts(entities.RUN, "note"))
+    if any(frame.integers(entities.RUN, "untrained")):
         note = "UNTRAINED WEIGHTS: boxes are meaningless"
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
-    counts = Counter(frame.values(entities.BOXES, "name"))
+    counts = Counter(frame.texts(entities.BOXES, "name"))
     for index, (name, color) in enumerate(_class_colors(frame).items()):
         place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
-    names, colors = (frame.values(entities.RUN, key) for key in ("line_names", "line_colors"))
-    for index, (name, color) in enumerate(zip(names, map(color_of_hex, colors), strict=True)):
+    for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
         _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
-        classes = frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES)
+        classes = frame.texts(entities.RUN, "map_classes") or list(MAP_CLASSES)
         width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
         for index, (name, color) in enumerate(map_colors(classes).items()):
             _draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
@@ -272,10 +282,20 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
 
 def _class_colors(frame: RecordedFrame) -> dict[str, Color]:
     """The colours of the model's classes. Recordings of version 0.1.0 name the classes only."""
-    names, stated = (frame.values(entities.RUN, key) for key in ("class_names", "class_colors"))
-    if not stated:
+    if not frame.has(entities.RUN, "class_colors"):
+        names = frame.texts(entities.RUN, "class_names")
         return class_colors(NUSCENES_CLASSES.get(name, ObjectClass(name)) for name in names)
-    return dict(zip(names, map(color_of_hex, stated), strict=True))
+    return _named_colors(frame, "class_names", "class_colors")
+
+
+def _named_colors(frame: RecordedFrame, names: str, colors: str) -> dict[str, Color]:
+    """The colours that the recording states, by name."""
+    keys = frame.texts(entities.RUN, names)
+    found = frame.texts(entities.RUN, colors, len(keys))
+    try:
+        return {name: color_of_hex(color) for name, color in zip(keys, found, strict=True)}
+    except ValueError:
+        raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", found) from None
 
 
 def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str) -> None:

@@ -1,40 +1,50 @@
-"""`download`: a file by HTTP with libcurl, which resumes a cut download.
+"""`download`: a file by HTTP with libcurl; a download that was cut goes on if the server still has the same file.
 
-pooch starts a cut download anew. huggingface_hub resumes one, but by an internal function that neither asks whether the
-file is still the same nor ends a download that trickles. libcurl does both.
+libcurl keeps limits that the HTTP packages of Python lack: on the speed, and on the time of all, name look-up and
+headers included. Each answer is checked before its first byte is written.
 """
 
 import os
+import re
 import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
 
-from bevcli.errors import OutputError, WeightsError
+from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
 from bevcli.writing import output_errors
 
-STALL_S, STALL_BYTES = 30, 1024  # a transfer that is slower than so many bytes in a second, for so long, is cut
+STALL_S, STALL_BYTES = 20, 4096  # a transfer that is slower than so many bytes in a second, for so long, is cut
 CONNECT_S = 20
-ATTEMPTS = 4  # in a row without a new byte
-PAUSE_S = 2.0  # before the second attempt; longer before the next ones
-MOST_BYTES = 20 << 30  # of a file whose size is not known
+WHOLE_S = 12 * 3600  # for all attempts
+ATTEMPTS = 5  # that fail; one that brings a LEAST_SHARE-th of the file or more does not count
+LEAST_SHARE = 16
+PAUSE_S = 1.0  # after the first failed attempt; longer after the next ones
+MOST_BYTES = 4 << 30  # of a file whose size is not in the table of sources
 SPARE_BYTES = 64 << 20  # that stay free on the disk
 MOST_REDIRECTS = 10
+LONGEST_TAG = 256
+NOT_RESUMED = (400, 412, 416, 431)  # statuses of a server that does not go on, but may send all
+CONTENT_RANGE = re.compile(r"bytes (\d{1,15})-(\d{1,15})/(\d{1,15})")
 Report = Callable[[int, int | None], None]
 
 
-class _Validator(msgspec.Struct, frozen=True):
-    """What tells one version of a file at a URL from another, for If-Range. total: its size in bytes."""
+class _Version(msgspec.Struct, frozen=True):
+    """A version of the file at a URL: its strong ETag, and its size in bytes."""
 
     url: str
     tag: str
-    total: int | None
+    total: int
+
+
+class _Failed(Exception):
+    """Another attempt may help."""
 
 
 def download(url: str, path: Path, expected_bytes: int | None, report: Report) -> None:
@@ -43,7 +53,7 @@ def download(url: str, path: Path, expected_bytes: int | None, report: Report) -
     Args:
         url: http:// or https://. From https, redirects lead to https only.
         path: where to write. After an error it holds the part that has come, and PATH.json what tells its version.
-        expected_bytes: size of the file, if it is known: another size at the server ends the download at once.
+        expected_bytes: size of the file, if it is known: a larger one at the server ends the download at once.
         report: called with the bytes that are there, and with the size of the file or None.
 
     Raises:
@@ -53,7 +63,7 @@ def download(url: str, path: Path, expected_bytes: int | None, report: Report) -
     require_space(path.parent, (expected_bytes or 0) - (path.stat().st_size if path.exists() else 0))
     with output_errors(path), path.open("ab") as file:
         _lock(file, path)
-        _download(_Transfer(url, path, file, expected_bytes, report))
+        _Download(url, file, expected_bytes, report).run()
 
 
 def require_space(folder: Path, wanted: int) -> None:
@@ -78,73 +88,57 @@ def _lock(file: BinaryIO, path: Path) -> None:
         raise WeightsError(f"{path}: another process is downloading it: wait for it, then try again") from None
 
 
-def _download(transfer: "_Transfer") -> None:
-    """Try until the file is whole, or until several attempts in a row have brought nothing."""
-    failed, problem = 0, ""
-    while failed < ATTEMPTS:
-        if failed:
+class _Download:
+    """A download of several attempts."""
+
+    def __init__(self, url: str, file: BinaryIO, expected_bytes: int | None, report: Report) -> None:
+        self.url, self.file, self.expected_bytes, self.report = url, file, expected_bytes, report
+        self.done = file.seek(0, os.SEEK_END)  # bytes that have come
+        self.total: int | None = None  # of the file, as the server states it
+        self._notes = Path(f"{file.name}.json")
+        self._raised: BaseException | None = None
+
+    def run(self) -> None:
+        """Try until the file is whole, time is up, or several attempts have failed."""
+        end, failed, highest = time.monotonic() + WHOLE_S, 0, self.done
+        for attempts in count(1):
+            try:
+                self._attempt(end - time.monotonic())
+                return
+            except _Failed as error:
+                problem = error
+            least = max(1, (self.total or MOST_BYTES) // LEAST_SHARE)
+            failed += self.done - highest < least
+            highest = max(highest, self.done)
+            if failed >= ATTEMPTS or time.monotonic() + PAUSE_S * failed >= end:
+                is_kept = self._usable_part() is not None
+                kept = f"{self.done:,} bytes are kept: the same command goes on from there" if is_kept else "try later"
+                raise WeightsError(f"{self.url}: the download broke off {attempts} times ({problem}); {kept}")
             time.sleep(PAUSE_S * failed)
-        before = transfer.done
-        problem = transfer.attempt()
-        if not problem:
-            return
-        failed = 0 if transfer.done > before else failed + 1
-    raise WeightsError(
-        f"{transfer.url}: the download broke off {ATTEMPTS} times in a row ({problem}); {transfer.done:,} bytes "
-        "are kept: the same command goes on from there"
-    )
 
-
-@dataclass
-class _Transfer:
-    """A download of several attempts. total: size of the file as the server states it."""
-
-    url: str
-    path: Path
-    file: BinaryIO
-    expected_bytes: int | None
-    report: Report
-    total: int | None = None
-    _headers: dict[str, str] = field(default_factory=dict)
-    _raised: BaseException | None = None
-
-    @property
-    def done(self) -> int:
-        """Bytes that have come."""
-        return self.file.seek(0, os.SEEK_END)
-
-    @property
-    def _notes(self) -> Path:
-        return self.path.with_name(f"{self.path.name}.json")
-
-    def attempt(self) -> str:
-        """Get what is missing. Returns why the transfer broke off, "" if the file is whole."""
+    def _attempt(self, seconds: float) -> None:
+        """Get what is missing. Raises _Failed, and WeightsError where no other attempt can help."""
         import pycurl
 
-        validator = self._validator()
-        if validator is None:
+        self._part, self._accepted = self._usable_part(), False
+        if self._part is None:
             self._start_anew()
-        elif validator.total == self.done:
-            return ""
-        curl = self._curl(pycurl, validator)
+        elif self._part.total == self.done:
+            return
+        curl = self._curl(pycurl, seconds)
         try:
             curl.perform()
-            status = curl.getinfo(pycurl.RESPONSE_CODE)
         except pycurl.error as error:
-            if self._raised is not None:
-                raise self._raised from None
-            code, message = error.args
-            return self._failure(pycurl, code, message, curl.getinfo(pycurl.RESPONSE_CODE))
+            self._fail(pycurl, error, curl.getinfo(pycurl.RESPONSE_CODE))
         finally:
             curl.close()
             self.file.flush()
-        if status not in (200, 206):
-            raise WeightsError(f"{self.url}: the server answers with status {status} (expected the file)")
-        if self.total is not None and self.done != self.total:
-            return f"{self.done:,} of {self.total:,} bytes came"
-        return ""
+        if not self._accepted:  # a file without a byte
+            self._accept()
+        if self.total not in (None, self.done):
+            raise _Failed(f"{self.done:,} of {self.total:,} bytes came")
 
-    def _curl(self, pycurl: Any, validator: _Validator | None) -> Any:
+    def _curl(self, pycurl: Any, seconds: float) -> Any:
         import certifi
 
         curl = pycurl.Curl()
@@ -157,19 +151,20 @@ class _Transfer:
         curl.setopt(pycurl.FAILONERROR, True)
         curl.setopt(pycurl.NOSIGNAL, True)
         curl.setopt(pycurl.CONNECTTIMEOUT, CONNECT_S)
+        curl.setopt(pycurl.TIMEOUT_MS, max(1, int(1000 * seconds)))
         curl.setopt(pycurl.LOW_SPEED_LIMIT, STALL_BYTES)
         curl.setopt(pycurl.LOW_SPEED_TIME, STALL_S)
         curl.setopt(pycurl.CAINFO, os.environ.get("SSL_CERT_FILE") or certifi.where())
         curl.setopt(pycurl.USERAGENT, "bevcli")
         curl.setopt(pycurl.HEADERFUNCTION, self._guarded(self._read_header))
         curl.setopt(pycurl.WRITEFUNCTION, self._guarded(self._write))
-        if validator is not None:
-            curl.setopt(pycurl.RESUME_FROM_LARGE, self.done)
-            curl.setopt(pycurl.HTTPHEADER, [f"If-Range: {validator.tag}"])
+        if self._part is not None:
+            curl.setopt(pycurl.RANGE, f"{self.done}-")
+            curl.setopt(pycurl.HTTPHEADER, [f"If-Range: {self._part.tag}"])
         return curl
 
     def _guarded(self, callback: Callable[[bytes], None]) -> Callable[[bytes], int | None]:
-        """The callback for libcurl: an exception, such as Ctrl-C, ends the transfer and is raised by `attempt`."""
+        """The callback for libcurl: an exception, such as Ctrl-C, ends the transfer and is raised by `_fail`."""
 
         def called(data: bytes) -> int | None:
             try:
@@ -184,63 +179,85 @@ class _Transfer:
     def _read_header(self, line: bytes) -> None:
         text = line.decode("latin-1").strip()
         if text.startswith("HTTP/"):  # of each answer, redirects included
-            self._headers = {"status": text.split()[1] if " " in text else ""}
-        elif text:
+            self._headers = {":status": text.split()[1] if " " in text else ""}
+        else:
             name, _, value = text.partition(":")
             self._headers[name.strip().lower()] = value.strip()
-        elif self._headers.get("status") in ("200", "206"):
-            self._begin()
 
-    def _begin(self) -> None:
-        """Check what the server states of the file, before its first byte."""
-        length, status = self._headers.get("content-length", ""), self._headers["status"]
-        self.total = (
-            int(length) + (self.done if status == "206" else 0) if length.isdecimal() and len(length) < 16 else None
-        )
-        if self.expected_bytes and self.total not in (None, self.expected_bytes):
-            raise WeightsError(
-                f"{self.url}: the server states {self.total:,} bytes, expected {self.expected_bytes:,}: it is another "
-                "file, or the source is wrong"
-            )
-        if self.total is not None:
-            require_space(self.path.parent, self.total - self.done)
-        tag = self._headers.get("etag", "")
-        if status == "200" and tag and not tag.startswith("W/"):  # a weak one does not promise the same bytes
-            self._notes.write_bytes(msgspec.json.encode(_Validator(self.url, tag, self.total)))
+    def _accept(self) -> None:
+        """Check the last answer before its first byte; the headers before were those of redirects, and of a proxy.
+
+        A part must go on from what is there, in the same version. Raises _Failed and WeightsError.
+        """
+        part, length, tag = self._part, self._headers.get("content-length", ""), self._headers.get("etag", "")
+        self._accepted, status = True, self._headers[":status"]
+        if status == "206":
+            stated = CONTENT_RANGE.fullmatch(self._headers.get("content-range", ""))
+            first, last, self.total = map(int, stated.groups()) if stated else (-1, -1, -1)
+            goes_on = part is not None and (first, self.total, tag or part.tag) == (self.done, part.total, part.tag)
+            if not goes_on or not first <= last < self.total:
+                self._start_anew()
+                raise _Failed("the server sends a part that does not go on from what is there")
+            self._most = last + 1
+        elif status == "200":
+            self._start_anew()
+            self._most = self.expected_bytes or MOST_BYTES
+            self.total = int(length) if length.isdecimal() and len(length) < 16 else None
+            self._limit(self.total or 0)
+            require_space(self._notes.parent, self.total or 0)
+            if self.total and tag.isprintable() and tag.startswith('"') and len(tag) <= LONGEST_TAG:  # W/…: a weak one
+                self._notes.write_bytes(msgspec.json.encode(_Version(self.url, tag, self.total)))
+        else:
+            raise self._refused(status)
         self.report(self.done, self.total)
 
     def _write(self, data: bytes) -> None:
-        if self.done + len(data) > (self.expected_bytes or self.total or MOST_BYTES):
-            raise WeightsError(f"{self.url}: the server sends more than the {self.done:,} bytes of the file: refused")
+        if not self._accepted:
+            self._accept()
+        self._limit(self.done + len(data))
+        if self.total is None:
+            require_space(self._notes.parent, len(data))
         self.file.write(data)
+        self.done += len(data)
         self.report(self.done, self.total)
 
-    def _validator(self) -> _Validator | None:
-        """What tells the version of the part that is there; None if it is of no use."""
-        if not self.done or not self._notes.is_file():
-            return None
+    def _limit(self, size: int) -> None:
+        if size > self._most:
+            self._start_anew()
+            raise WeightsError(
+                f"{self.url}: the server sends more than {self._most:,} bytes: refused (a larger file needs its size, "
+                "as `bytes` in the table of sources)"
+            )
+
+    def _refused(self, status: object) -> WeightsError:
+        return WeightsError(f"{self.url}: the server answers with status {status} (expected the file)")
+
+    def _usable_part(self) -> _Version | None:
+        """The version of the part that is there; None if it cannot be used."""
         try:
-            found = msgspec.json.decode(read_bytes(self._notes, 1 << 16), type=_Validator)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
+            found = msgspec.json.decode(read_bytes(self._notes, 1 << 16), type=_Version) if self.done else None
+        except (msgspec.MsgspecError, ValueError, RecursionError, OSError, BevcliError):
             return None
-        usable = found.url == self.url and found.tag.isprintable() and (found.total or MOST_BYTES) >= self.done
-        return found if usable else None
+        return found if found is not None and found.url == self.url and found.total >= self.done else None
 
     def _start_anew(self) -> None:
         self.file.truncate(0)
+        self.done = 0
         self._notes.unlink(missing_ok=True)
 
-    def _failure(self, pycurl: Any, code: int, message: str, status: int) -> str:
-        """Why a transfer broke off, if another attempt may help. Raises WeightsError if not."""
-        if code == pycurl.E_RANGE_ERROR or status == 416:  # the file has changed, or the server cannot resume
-            self._start_anew()
-            return "the server does not resume"
-        if code == pycurl.E_HTTP_RETURNED_ERROR and (status in (408, 429) or status >= 500):
-            return f"status {status}"
+    def _fail(self, pycurl: Any, error: Exception, status: int) -> None:
+        """Raise what a callback has raised; _Failed if another attempt may help; else WeightsError."""
+        if self._raised is not None:
+            raise self._raised from None
+        code, message = error.args
         if code == pycurl.E_HTTP_RETURNED_ERROR:
-            raise WeightsError(f"{self.url}: the server answers with status {status} (expected the file)")
+            if self._part is not None and status in NOT_RESUMED:
+                self._start_anew()
+            elif status not in (408, 429) and status < 500:
+                raise self._refused(status)
+            raise _Failed(f"status {status}")
         final = (pycurl.E_UNSUPPORTED_PROTOCOL, pycurl.E_URL_MALFORMAT, pycurl.E_TOO_MANY_REDIRECTS,
                  pycurl.E_PEER_FAILED_VERIFICATION, pycurl.E_SSL_CACERT_BADFILE)  # fmt: skip
         if code in final:
             raise WeightsError(f"{self.url}: cannot be downloaded ({message})")
-        return message
+        raise _Failed(message)

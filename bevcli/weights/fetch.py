@@ -92,8 +92,8 @@ def by_hand(weights: NamedWeights) -> str:
     """How to get weights that have no source."""
     where = weights.source.page or "its publisher"
     return (
-        f"can only be downloaded by hand, from {where}: pass `weights=FILE`, or state the file as `source` of "
-        f"[{weights.name}] in {own_table()}"
+        f"can only be downloaded by hand, from {where}: run the model with `weights=FILE`, or state the file "
+        f"as `source` of [{weights.name}] in {own_table()}"
     )
 
 

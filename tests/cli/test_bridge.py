@@ -226,7 +226,9 @@ def test_the_docstring_of_a_class_has_the_help_texts():
         ('pass `names={"CAM": "/topic"}`', "pass --names CAM=/topic"),
         ("`calibration=(1, -2.5)`", "--calibration 1,-2.5"),
         ("`rate_hz` and `strict` exclude each other", "--rate and --strict exclude each other"),
-        ("`unknown=3`, `bevcli run` and `READ`", "`unknown=3`, `bevcli run` and `READ`"),
+        ("`unknown`, `bevcli run` and `READ`", "`unknown`, `bevcli run` and `READ`"),
+        ("pass `of_others=FILE` there, `other=True`", "pass --of-others FILE there, --other"),
+        ('`of_others="auto"`', "--of-others auto"),
     ],
 )
 def test_arguments_in_messages_become_flags(library, shown):

@@ -117,7 +117,9 @@ def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, t
     for entry in proto.metadata_props:
         entry.value = "1" if entry.key == "cameras_per_cell" else entry.value
     onnx.save(proto, one)
-    with pytest.raises(WeightsError, match=r"takes 1 cameras .* has 2: use `bevcli export-onnx --cameras-per-cell 2`"):
+    with pytest.raises(
+        WeightsError, match=r"takes 1 camera per BEV cell, .* has 2: use `bevcli export-onnx --cameras-per-cell 2`"
+    ):
         step_of_file(load_exported(one, "onnxruntime"), inputs)
 
 

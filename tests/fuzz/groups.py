@@ -13,7 +13,9 @@ from pathlib import Path
 from random import Random
 
 from file_cases import batch_record, mesh, onnx_file, sqlite_schema
+from recording_cases import cut_recording, foreign_columns, reordered_recording
 from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
+from server_cases import server_behaviour
 
 
 @dataclass(frozen=True)
@@ -38,4 +40,8 @@ GROUPS = {
     "mesh with siblings": Group(mesh, 400),
     "batch record": Group(batch_record, 1000),
     "SQLite schema": Group(sqlite_schema, 700),
+    "foreign columns of recordings": Group(foreign_columns, 400),
+    "order of recordings": Group(reordered_recording, 100),
+    "cuts of recordings": Group(cut_recording, 200),
+    "servers of weights": Group(server_behaviour, 1000),
 }

@@ -11,11 +11,13 @@ class Recorded:
     """One horizontal line on a row, with a colour."""
 
     def __init__(self, opacity: int) -> None:
-        strips = [[[2.0, 5.0], [17.0, 5.0]]]
-        self.components = {"LineStrips2D:strips": strips, "LineStrips2D:colors": [GREEN | opacity]}
+        self.color = GREEN | opacity
 
-    def values(self, entity: str, component: str) -> list:
-        return self.components[component]
+    def strips(self, entity: str, component: str) -> list[np.ndarray]:
+        return [np.array([[2.0, 5.0], [17.0, 5.0]])]
+
+    def integers(self, entity: str, component: str) -> list[int]:
+        return [self.color]
 
 
 def green_of(opacity: int) -> int:

@@ -161,7 +161,7 @@ def test_a_message_of_unknown_kind_is_damage_not_the_end(recording, tmp_path, me
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
 def test_the_first_process_to_read_a_recording_has_one_gigabyte(recording):
-    greedy = recording_file.CHECK.replace("try:\n    for", "bytearray(1200 << 20)\ntry:\n    for")
+    greedy = recording_file.CHECK.replace("try:\n", "bytearray(1200 << 20)\ntry:\n")
     done = recording_file._run(recording, partial(run_python, greedy, [recording], 1 << 30))
     assert done.returncode == 1
     assert b"MemoryError" in done.stderr

@@ -24,11 +24,14 @@ class Files(BaseHTTPRequestHandler):
     def log_message(self, *arguments: object) -> None:
         pass
 
+    @property
+    def first(self) -> int:
+        """The first byte that is asked for."""
+        return int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")[0])
+
     def send(self, body: bytes, *, length: int | None = None, tag: str = '"v1"', ranges: bool = True) -> None:
         """The body, or the rest of it, under a length that may be a lie; None: the true one."""
-        first = 0
-        if ranges and self.headers.get("If-Range") == tag:
-            first = int(self.headers["Range"].removeprefix("bytes=").partition("-")[0])
+        first = self.first if ranges and self.headers.get("If-Range") == tag else 0
         total = len(self.content) if length is None else length
         self.send_response(206 if first else 200)
         if first:
@@ -53,6 +56,62 @@ class Files(BaseHTTPRequestHandler):
         """The second request finds another version, from whose start it has to be sent."""
         first = len(self.asked) == 1
         self.send(b"x" * 1000 if first else self.content, tag='"v1"' if first else '"v2"')
+
+    def part(self, first: int, body: bytes, tag: str = '"v1"') -> None:
+        self.send_response(206)
+        self.send_header("Content-Range", f"bytes {first}-{first + len(body) - 1}/{len(self.content)}")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("ETag", tag)
+        self.end_headers()
+        self.wfile.write(body)
+        self.close_connection = True
+
+    def half_first(self) -> bool:
+        """True for the first request, which gets one half of the file."""
+        if self.first:
+            return False
+        self.send(self.content[: len(self.content) // 2])
+        return True
+
+    def one_byte_more(self) -> None:
+        self.send(self.content[: len(self.asked)])
+
+    def half_without_ranges(self) -> None:
+        self.send(self.content[: len(self.content) // 2], ranges=False)
+
+    def rest_in_parts(self) -> None:
+        if not self.half_first():
+            self.part(self.first, self.content[self.first :][: len(self.content) // 8])
+
+    def rest_of_another_version(self) -> None:
+        if not self.half_first():
+            self.part(self.first, bytes(byte ^ 1 for byte in self.content[self.first :]), '"v2"')
+
+    def rest_from_elsewhere(self) -> None:
+        if not self.half_first():
+            self.part(self.first - 7, self.content[self.first - 7 :])
+
+    def part_without_a_range(self) -> None:
+        self.part(0, self.content[: len(self.content) // 2])
+
+    def no_rest(self) -> None:
+        if len(self.asked) == 2:
+            self.send_error(416)
+        else:
+            self.send(self.content[: len(self.content) // (2 if len(self.asked) == 1 else 1)])
+
+    def long_tag(self) -> None:
+        self.send(self.content[: len(self.content) * len(self.asked) // 2], tag=f'"{"x" * 60_000}"')
+
+    def slow_for_ever(self) -> None:
+        self.send(b"")
+        while not self.stop.wait(0.02):
+            self.wfile.write(b"x" * 100)
+
+    def slow_headers(self) -> None:
+        self.wfile.write(b"HTTP/1.1 200 OK\r\nX: ")
+        while not self.stop.wait(0.1):
+            self.wfile.write(b"H")
 
     def without_ranges(self) -> None:
         self.send(self.content[: len(self.content) * len(self.asked) // 2], ranges=False)
@@ -89,6 +148,10 @@ class Files(BaseHTTPRequestHandler):
             self.send_error(503)
         else:
             self.whole()
+
+    def no_content(self) -> None:
+        self.send_response(204)
+        self.end_headers()
 
     def missing(self) -> None:
         self.send_error(404)
