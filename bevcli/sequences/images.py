@@ -51,6 +51,11 @@ class ImageSource:
         return str(self.path) if self.video_index is None else f"{self.path}#{self.video_index}"
 
 
+def no_image_error(drive: str, camera: str, reason: str) -> InputError:
+    """The error of a drive of which not one image could be read. camera, reason: of the first one."""
+    return InputError(f"{drive}: not one image could be read (camera {camera}: {reason}): bring the images back")
+
+
 class UnreadableImage(Exception):
     """An image is missing or broken. The message is the reason."""
 

@@ -44,7 +44,10 @@ class WithoutGroundTruth(DerivedSequence):
 
 
 class WithClassNames(DerivedSequence):
-    """A sequence whose ground truth has the names of known classes; a note names boxes of other classes."""
+    """A sequence whose ground truth has the names of known classes, without impossible boxes.
+
+    A note names boxes of other classes.
+    """
 
     def __init__(self, sequence: Sequence, names: ClassNames) -> None:
         super().__init__(sequence)
@@ -66,7 +69,12 @@ class WithClassNames(DerivedSequence):
 
     def _renamed(self, frame: Frame) -> Frame:
         truth = frame.ground_truth
-        return frame if truth is None else replace(frame, ground_truth=self._names.renamed(truth))
+        if truth is None:
+            return frame
+        possible = truth.possible()
+        left_out = int((~possible).sum())
+        truth = self._names.renamed(truth[possible] if left_out else truth)
+        return replace(frame, ground_truth=truth, impossible_boxes=left_out)
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

@@ -24,13 +24,20 @@ def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
         data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors, dialect)
         data["translations"], data["quaternions"] = _read_poses(tables, data.pop("poses"))
         lidar = np.isin(sensors.channels[data["sensors"]], dialect.lidars)
-        lidar_rows = _lidar_of_samples(tables, data["samples"], np.flatnonzero(lidar), sample_tokens, dialect)
         image_rows = np.flatnonzero(~lidar)
-        owners, times = sample_scenes[data["samples"][image_rows]], data["times_us"][image_rows]
-        images = Images(**_rows(data, image_rows[np.lexsort((times, owners))]))
+        if not len(image_rows):
+            raise InputError(f"{tables / 'sample_data.json'}: no row belongs to a camera (expected camera images)")
+        image_rows = image_rows[np.lexsort((data["times_us"][image_rows], sample_scenes[data["samples"][image_rows]]))]
+        images = Images(**_rows(data, image_rows))
+        starts = _starts(sample_scenes[images.samples], len(names))
+        nearest = image_rows[_nearest(sample_times, sample_scenes, images.times_us, starts)]
+        lidar_rows = np.full(len(sample_tokens), -1)
+        lidar_rows[data["samples"][lidar]] = np.flatnonzero(lidar)
         annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
-    scenes = Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names)))
-    translations, quaternions, lidars = (data[name][lidar_rows] for name in ("translations", "quaternions", "sensors"))
+    scenes = Scenes(names, _starts(sample_scenes, len(names)), starts)
+    pose_rows = np.where(lidar_rows < 0, nearest, lidar_rows)
+    translations, quaternions = data["translations"][pose_rows], data["quaternions"][pose_rows]
+    lidars = np.where(lidar_rows < 0, -1, data["sensors"][lidar_rows])
     samples = Samples(sample_tokens, sample_times, translations, quaternions, lidars, first_annotation)
     return NuScenesIndex(scenes, sensors, samples, images, annotations)
 
@@ -44,10 +51,10 @@ def _joined(parts: list[Columns]) -> Columns:
 
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
-    channels = read_rows(tables / "sensor.json").by_token("channel")
-    table = read_rows(tables / "calibrated_sensor.json")
+    channels, table = read_rows(tables / "sensor.json"), read_rows(tables / "calibrated_sensor.json")
+    places = places_of(table.tokens("sensor_token"), channels.tokens("token"), channels.path)
     sensors = Sensors(
-        np.array([channels.get(token, "") for token in table.texts("sensor_token")], dtype=np.str_),
+        np.array(channels.texts("channel"), dtype=np.str_)[places],
         table.vectors("translation", 3),
         table.quaternions("rotation"),
         np.array([_intrinsics(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
@@ -109,9 +116,7 @@ def _read_sensor_data(
         )
         if len(needed):
             parts.append(_sensor_data_of(needed, sample_tokens, sensor_tokens))
-    if not parts:
-        raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
-    return _joined(parts)
+    return _joined(parts or [_sensor_data_of(Rows(path, []), sample_tokens, sensor_tokens)])
 
 
 def _sensor_data_of(rows: Rows, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]) -> Columns:
@@ -141,17 +146,16 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 
-def _lidar_of_samples(
-    tables: Path, samples: Ints, lidar_rows: Ints, sample_tokens: NDArray[np.bytes_], dialect: Dialect
-) -> Ints:
-    """(N,) the row of each sample's lidar keyframe."""
-    rows = np.full(len(sample_tokens), -1, dtype=np.int64)
-    rows[samples[lidar_rows]] = lidar_rows
-    if (rows < 0).any():
-        token = sample_tokens[rows < 0][0].decode()
-        raise InputError(
-            f'{tables / "sample_data.json"}: sample "{token}" has no keyframe of {" or ".join(dialect.lidars)}'
-        )
+def _nearest(times: Ints, scenes: Ints, image_times: Ints, starts: Ints) -> Ints:
+    """(N,) the image of its scene that is nearest in time to each sample; any image for a scene without images.
+
+    times, scenes: (N,) of the samples. image_times: (P,) by scene and time. starts: (S + 1,) first image of each scene.
+    """
+    rows = np.zeros(len(times), dtype=np.int64)
+    for scene in np.flatnonzero(np.diff(starts)):
+        own, among = scenes == scene, image_times[starts[scene] : starts[scene + 1]]
+        middles = (among[1:] + among[:-1]) / 2
+        rows[own] = starts[scene] + np.searchsorted(middles, times[own])
     return rows
 
 
@@ -198,7 +202,7 @@ class _Names:
         attributes = _optional(tables / "attribute.json", "name") if dialect.has_attributes else {}
         self.attribute = {token: name.encode() for token, name in attributes.items()}
         self.visibility = {
-            token: dialect.visibilities.get(level) or _middle(level, tables)
+            token: dialect.visibilities.get(level) or _middle(level)
             for token, level in _optional(tables / "visibility.json", "level").items()
         }
 
@@ -207,12 +211,20 @@ def _optional(path: Path, name: str) -> dict[str, str]:
     return read_rows(path).by_token(name) if path.is_file() else {}
 
 
-def _middle(level: str, tables: Path) -> float:
-    """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1."""
-    found = re.fullmatch(r"v([0-9]{1,3})-([0-9]{1,3})", level)
-    if found is None:
-        raise InputError(f'{tables / "visibility.json"}: unknown level "{level:.40}" (expected such as v40-60)')
-    return (int(found[1]) + int(found[2])) / 200
+def _middle(level: str) -> float:
+    """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1; NaN for other levels."""
+    found = re.fullmatch(r"v(100|[0-9]{1,2})-(100|[0-9]{1,2})", level)
+    return np.nan if found is None else (int(found[1]) + int(found[2])) / 200
+
+
+def _num_points(rows: Rows) -> Ints:
+    """(A,) lidar and radar points; -1 where one of them is null."""
+    columns = [rows.column(name) for name in ("num_lidar_pts", "num_radar_pts")]
+    known = [None not in counts for counts in zip(*columns, strict=True)]
+    found = np.full(len(rows), -1, dtype=np.int64)
+    some = rows.where(known)
+    found[known] = some.integers("num_lidar_pts") + some.integers("num_radar_pts")
+    return found
 
 
 def _columns(rows: Rows, names: _Names) -> Columns:
@@ -231,5 +243,5 @@ def _columns(rows: Rows, names: _Names) -> Columns:
         "sizes_wlh": rows.vectors("size", 3),
         "quaternions": rows.quaternions("rotation"),
         "visibilities": np.array([names.visibility.get(token, np.nan) for token in rows.texts("visibility_token")]),
-        "num_points": rows.integers("num_lidar_pts") + rows.integers("num_radar_pts"),
+        "num_points": _num_points(rows),
     }

@@ -1,7 +1,7 @@
 """A nuScenes dataset root as a Sequence, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 from bevcli.sequences.images import ImageReader, ImageSource
+from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
@@ -82,12 +83,32 @@ class TableSequence(Sequence):
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
-        self.rig = scene_rig(self.index, dialect, self.scenes[0])
+        self.rig = self._rig(self.scenes[0])
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
-        self.notes = (note,) if note else ()
+        self.notes = ((note,) if note else ()) + tuple(self._table_notes())
+
+    def _table_notes(self) -> Iterator[str]:
+        """What the tables lack."""
+        samples, annotations, scenes = self.index.samples, self.index.annotations, self.index.scenes
+        own = np.concatenate([np.arange(*scenes.first_sample[scene : scene + 2]) for scene in self.scenes])
+        if without := int((samples.lidars[own] < 0).sum()):
+            yield (
+                f"{self.tables / 'sample_data.json'}: {without} of {len(own)} samples have no keyframe of "
+                f"{' or '.join(self.dialect.lidars)}: their pose is that of the image nearest in time"
+            )
+        if self.dialect.ego_from_bev is None and self.rig.ego_from_bev_assumed:
+            yield from rig_notes(self.rig, str(self.tables))
+        owners = np.searchsorted(samples.first_annotation, np.arange(len(annotations.categories)), side="right") - 1
+        mine = np.isin(owners, own)
+        lost = np.flatnonzero(mine & (annotations.categories == b""))
+        if len(lost):
+            yield (
+                f"{self.tables / 'sample_annotation.json'}: {len(lost)} of {int(mine.sum())} boxes are left out: "
+                f'instance.json lacks their instance, such as token "{annotations.instances[lost[0]].decode()}"'
+            )
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -101,7 +122,7 @@ class TableSequence(Sequence):
             found.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
         for category, count in found.items():
-            if name := self.dialect.class_of(category.decode()):
+            if category and (name := self.dialect.class_of(category.decode())):
                 counts[name] += count
         return counts
 
@@ -137,8 +158,14 @@ class TableSequence(Sequence):
 
     def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
         """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
-        rig, motion = scene_rig(self.index, self.dialect, scene), scene_motion(self.index, scene)
-        return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
+        motion = scene_motion(self.index, scene)
+        return self._rig(scene), motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
+
+    def _rig(self, scene: int) -> CameraRig:
+        try:
+            return scene_rig(self.index, self.dialect, scene)
+        except InputError as error:
+            raise InputError(f"{self.tables / 'sample_data.json'}: {error}") from None
 
     def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
@@ -200,9 +227,11 @@ def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
     cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
-    if dialect.ego_from_bev is not None:
-        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True)
-    lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
+    lidars = index.samples.lidars[slice(*index.scenes.first_sample[scene : scene + 2])]
+    lidar = next((int(one) for one in lidars if one >= 0), None)
+    if dialect.ego_from_bev is not None or lidar is None:
+        ego_from_bev = default_ego_from_bev() if dialect.ego_from_bev is None else dialect.ego_from_bev
+        return CameraRig(tuple(cameras), ego_from_bev, ego_from_bev_assumed=True)
     return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)
 
 
