@@ -14,6 +14,7 @@ from bevcli.sequences.files.class_names import ClassNames
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+SHORTEST_PERIODS_NS = 3_000_000, 5_000_000  # between frames: a shorter one has a wrong unit; the right unit gives more
 LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
@@ -75,6 +76,20 @@ class WithClassNames(DerivedSequence):
         left_out = int((~possible).sum())
         truth = self._names.renamed(truth[possible] if left_out else truth)
         return replace(frame, ground_truth=truth, impossible_boxes=left_out)
+
+
+def check_time_unit(sequence: Sequence, source: object) -> None:
+    """Raise InputError where frames follow each other so fast that their times are no nanoseconds."""
+    times = (np.array([sequence.stamps[k].timestamp_ns for k in scene]) for scene in scenes_of(sequence.stamps))
+    periods = np.concatenate([np.diff(scene) for scene in times])
+    period = np.median(periods) if len(periods) else np.inf
+    if period < SHORTEST_PERIODS_NS[0]:
+        units = {1000: "microseconds", 10**6: "milliseconds", 10**9: "seconds"}
+        factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)
+        raise InputError(
+            f"{source}: the timestamps are {factor} times too small, as if {units[factor]} were given for nanoseconds: "
+            f"the frames are {period:.0f} ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
+        )
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

@@ -76,13 +76,18 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     array = array_of_numbers(value)
     if array is None or array.shape != shape:
         message = "is not an array of numbers" if array is None else "has the wrong shape"
-        found = value if array is None else "x".join(map(str, array.shape)) or value
+        found = quoted(value) if array is None else "x".join(map(str, array.shape)) or value
         report.error("wrong-shape", name, message, expected=expected, found=found)
         return None
     if not (np.abs(array) < LARGEST_NUMBER).all():
         report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
         return None
     return array
+
+
+def quoted(value: object) -> object:
+    """A value of a file for a message: a text is in quotes."""
+    return f'"{value}"' if isinstance(value, str) else value
 
 
 def array_of_numbers(value: object) -> Array | None:
@@ -107,7 +112,7 @@ def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Arra
         report.missing(name, expected)
         return None
     if not isinstance(value, dict):
-        report.error("wrong-shape", name, "is not a transform", expected=expected, found=value)
+        report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
         return None
     inside = report.within(name)
     translation, rotation = parse_numbers(value, "translation", (3,), inside), _parse_rotation(value, inside)
