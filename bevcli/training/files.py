@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
 from bevcli.parsing.pth import read_pth
-from bevcli.writing import whole_file, write_whole
+from bevcli.writing import output_errors, whole_file, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +30,7 @@ FORMAT = "bevcli-training/1"
 LARGEST_CSV_BYTES = 256 * MIB
 Row = Mapping[str, float]
 # What PyTorch raises for contents that belong to another model.
+_NO_ROW = (ValueError, TypeError, csv.Error)  # for no number, a missing or an additional one, a null byte
 _DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
@@ -74,13 +74,38 @@ def load_checkpoint(
                 f"start a new training with `weights={path.with_name('weights.safetensors')}` and another `out`"
             )
         trained.load_state_dict(contents["model"])
-        optimizer.load_state_dict(contents["optimizer"])
+        _load_optimizer(optimizer, contents["optimizer"])
         for key, value in {} if average is None else average.items():
             value.copy_(contents["average"][key])
-        return int(contents["step"])
+        _check_finite([*trained.state_dict().values(), *(average or {}).values()])
+        if type(contents["step"]) is not int or contents["step"] < 0:
+            raise ValueError(f"its step is {contents['step']!r:.40} (expected an integer, 0 or more)")
+        return contents["step"]
     except _DAMAGE as error:
         reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
+
+
+def _load_optimizer(optimizer: torch.optim.AdamW, state: Any) -> None:
+    """Restore moments and steps; the settings stay those of this training. Raises ValueError for a wrong shape or NaN.
+
+    PyTorch itself checks neither.
+    """
+    groups = [{**group, "params": one["params"]} for group, one in
+              zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True)]  # fmt: skip
+    optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
+    for parameter, own in optimizer.state.items():
+        moments = [own["exp_avg"], own["exp_avg_sq"]]
+        if any(moment.shape != parameter.shape for moment in moments) or own["step"].numel() != 1:
+            raise ValueError("the optimizer's moments have another shape than the weights")
+        if (moments[1] < 0).any() or own["step"] < 0:
+            raise ValueError("the optimizer's second moments or steps are negative")
+        _check_finite([*moments, own["step"]])
+
+
+def _check_finite(tensors: Iterable[Tensor]) -> None:
+    if not all(torch.isfinite(tensor).all() for tensor in tensors):
+        raise ValueError("some of its numbers are NaN or infinite")
 
 
 def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
@@ -165,19 +190,26 @@ def _read(path: Path) -> list[Row]:
     if not path.is_file():
         return []
     text = read_text(path, LARGEST_CSV_BYTES)
+    lines = text.splitlines()
     try:
-        rows: list[Row] = [
-            {name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))
-        ]
-    except (ValueError, TypeError, csv.Error) as error:  # no number, a missing or an additional one, a null byte
-        raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
+        rows = _rows(lines)
+    except _NO_ROW:
+        try:
+            rows = _rows(lines[:-1])  # a full disk may have cut the last row off
+        except _NO_ROW as error:
+            raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
     if rows and "step" not in rows[0]:
         raise InputError(f"{path}: has no column step: move it away, or start a new training")
     return rows
 
 
+def _rows(lines: list[str]) -> list[Row]:
+    """Raises one of _NO_ROW."""
+    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(lines)]
+
+
 def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
-    with path.open(mode, newline="") as file:
+    with output_errors(path), path.open(mode, newline="") as file:
         if rows:
             writer = csv.DictWriter(file, list(rows[0]))
             if header:

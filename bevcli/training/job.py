@@ -1,10 +1,12 @@
 """Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
 
+import contextlib
+import json
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.distributed
@@ -14,6 +16,8 @@ from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.network import Network, build_network
+from bevcli.parsing.documents import read_json
+from bevcli.runs.folder import OWN, folder_lock
 from bevcli.synth.drives import Drives, check_training_seeds
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
@@ -27,7 +31,7 @@ from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.warm_start import WarmStart, warm_start
 from bevcli.weights.fetch import weights_file
-from bevcli.writing import output_errors
+from bevcli.writing import write_whole
 
 
 @dataclass(frozen=True)
@@ -187,6 +191,7 @@ class TrainingJob:
         notes: about the drives, for the user.
         log: where the learning curves are written, besides the CSV files; None for nowhere.
         warm_start: what the training starts from; None for random weights, or if it is resumed.
+        lock: keeps other trainings out of the folder until it is closed; empty in other processes than the leader.
     """
 
     model: Network
@@ -200,6 +205,26 @@ class TrainingJob:
     notes: tuple[str, ...] = ()
     log: Log | None = None
     warm_start: WarmStart | None = None
+    lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+
+    def changed_settings(self) -> tuple[str, ...]:
+        """A note where the settings differ from those of the training so far in this folder; stores them."""
+        file, before = self.out / OWN / "training.json", None
+        settings = {"seed": str(self.seed), **_flat(asdict(self.config))}
+        with contextlib.suppress(InputError):  # a new training, or one of an older version
+            before = read_json(file) if (self.out / CHECKPOINT).exists() else None
+        write_whole(file, json.dumps(settings).encode(), parents=True)
+        old = before if isinstance(before, dict) else {}
+        changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
+        return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """A table of tables as texts with names such as "optimizer.learning_rate"."""
+    found: dict[str, str] = {}
+    for name, value in table.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": str(value)}
+    return found
 
 
 def prepare_training(
@@ -236,14 +261,15 @@ def prepare_training(
     model, started = build_network(model_config), None
     if options.weights is not None and not options.resume:
         started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
-    if not options.resume:
-        with output_errors(out, "made"):
-            out.mkdir(parents=True, exist_ok=True)
-    group = join_process_group(device)
+    group, lock = join_process_group(device), contextlib.ExitStack()
+    if group.leads and not (options.resume and not out.exists()):
+        lock.enter_context(folder_lock(out))
+        check_folder(out, resume=options.resume)  # again: another training may have been faster
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
         write_split(out / "split.toml", split)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, started)
+    rest = options.seed, group, notes, options.log, started, lock
+    return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
 
 def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:
