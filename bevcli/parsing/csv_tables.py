@@ -64,10 +64,8 @@ class CsvRow:
 def _advice(text: str, column: str) -> str:
     """The way to an integer from a cell that is none: the right number, or that it is lost."""
     try:
-        value = Decimal(text if text.isascii() and "_" not in text else "")
+        value = Decimal(text if re.fullmatch("[-+.0-9eE]+", text) else "")
     except InvalidOperation:
-        return "write digits only"
-    if not value.is_finite():
         return "write digits only"
     if value.as_tuple().exponent > 0 or value.adjusted() > 40:  # type: ignore[operator]
         return "its last digits are lost, as spreadsheets round long numbers: write the table anew from its source"

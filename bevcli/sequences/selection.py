@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence as Indices
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +45,7 @@ class WithoutGroundTruth(DerivedSequence):
 
 
 class WithClassNames(DerivedSequence):
-    """A sequence whose ground truth has the names of known classes, without impossible boxes.
-
-    A note names boxes of other classes.
-    """
+    """A sequence whose ground truth has the names of known classes, without impossible boxes; a note names others."""
 
     def __init__(self, sequence: Sequence, names: ClassNames) -> None:
         super().__init__(sequence)
@@ -72,17 +69,15 @@ class WithClassNames(DerivedSequence):
         truth = frame.ground_truth
         if truth is None:
             return frame
-        possible = truth.possible()
-        left_out = int((~possible).sum())
-        truth = self._names.renamed(truth[possible] if left_out else truth)
-        return replace(frame, ground_truth=truth, impossible_boxes=left_out)
+        kept = truth if (possible := truth.possible()).all() else truth[possible]
+        return replace(frame, ground_truth=self._names.renamed(kept), impossible_boxes=len(truth) - len(kept))
 
 
 def check_time_unit(sequence: Sequence, source: object) -> None:
     """Raise InputError where frames follow each other so fast that their times are no nanoseconds."""
-    times = (np.array([sequence.stamps[k].timestamp_ns for k in scene]) for scene in scenes_of(sequence.stamps))
-    periods = np.concatenate([np.diff(scene) for scene in times])
-    period = np.median(periods) if len(periods) else np.inf
+    pairs = pairwise(sequence.stamps)
+    periods = [after.timestamp_ns - before.timestamp_ns for before, after in pairs if before.scene == after.scene]
+    period = np.median(periods) if periods else np.inf
     if period < SHORTEST_PERIODS_NS[0]:
         units = {1000: "microseconds", 10**6: "milliseconds", 10**9: "seconds"}
         factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)

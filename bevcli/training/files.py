@@ -5,10 +5,12 @@ A file is written under a temporary name and renamed: a kill leaves the old one 
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.util
+import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +32,6 @@ FORMAT = "bevcli-training/1"
 LARGEST_CSV_BYTES = 256 * MIB
 Row = Mapping[str, float]
 # What PyTorch raises for contents that belong to another model.
-_NO_ROW = (ValueError, TypeError, csv.Error)  # for no number, a missing or an additional one, a null byte
 _DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
@@ -74,10 +75,13 @@ def load_checkpoint(
                 f"start a new training with `weights={path.with_name('weights.safetensors')}` and another `out`"
             )
         trained.load_state_dict(contents["model"])
-        _load_optimizer(optimizer, contents["optimizer"])
+        settings = [dict(group) for group in optimizer.param_groups]
+        optimizer.load_state_dict(contents["optimizer"])
+        for group, own in zip(optimizer.param_groups, settings, strict=True):
+            group.update(own)  # of this training, not of the file
         for key, value in {} if average is None else average.items():
             value.copy_(contents["average"][key])
-        _check_finite([*trained.state_dict().values(), *(average or {}).values()])
+        _check_numbers(optimizer, [*trained.state_dict().values(), *(average or {}).values()])
         if type(contents["step"]) is not int or contents["step"] < 0:
             raise ValueError(f"its step is {contents['step']!r:.40} (expected an integer, 0 or more)")
         return contents["step"]
@@ -86,24 +90,13 @@ def load_checkpoint(
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
 
 
-def _load_optimizer(optimizer: torch.optim.AdamW, state: Any) -> None:
-    """Restore moments and steps; the settings stay those of this training. Raises ValueError for a wrong shape or NaN.
-
-    PyTorch itself checks neither.
-    """
-    groups = [{**group, "params": one["params"]} for group, one in
-              zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True)]  # fmt: skip
-    optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
+def _check_numbers(optimizer: torch.optim.AdamW, tensors: list[Tensor]) -> None:
+    """Raises ValueError for what PyTorch takes: moments of a wrong shape or sign, NaN in them or in `tensors`."""
     for parameter, own in optimizer.state.items():
-        moments = [own["exp_avg"], own["exp_avg_sq"]]
-        if any(moment.shape != parameter.shape for moment in moments) or own["step"].numel() != 1:
-            raise ValueError("the optimizer's moments have another shape than the weights")
-        if (moments[1] < 0).any() or own["step"] < 0:
-            raise ValueError("the optimizer's second moments or steps are negative")
-        _check_finite([*moments, own["step"]])
-
-
-def _check_finite(tensors: Iterable[Tensor]) -> None:
+        first, second, step = (own[name] for name in ("exp_avg", "exp_avg_sq", "step"))
+        if not first.shape == second.shape == parameter.shape or step.shape or min(step, second.min()) < 0:
+            raise ValueError("the optimizer's moments do not fit the weights")
+        tensors = [*tensors, first, second, step]
     if not all(torch.isfinite(tensor).all() for tensor in tensors):
         raise ValueError("some of its numbers are NaN or infinite")
 
@@ -186,26 +179,17 @@ def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
 
 
 def _read(path: Path) -> list[Row]:
-    """The rows of a file. Raises InputError."""
+    """The rows of a file, without damaged ones. Raises InputError."""
     if not path.is_file():
         return []
     text = read_text(path, LARGEST_CSV_BYTES)
-    lines = text.splitlines()
-    try:
-        rows = _rows(lines)
-    except _NO_ROW:
-        try:
-            rows = _rows(lines[:-1])  # a full disk may have cut the last row off
-        except _NO_ROW as error:
-            raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
+    rows: list[Row] = []
+    for row in csv.DictReader(io.StringIO(text)):
+        with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
+            rows.append({name: float(value) for name, value in row.items()})
     if rows and "step" not in rows[0]:
         raise InputError(f"{path}: has no column step: move it away, or start a new training")
     return rows
-
-
-def _rows(lines: list[str]) -> list[Row]:
-    """Raises one of _NO_ROW."""
-    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(lines)]
 
 
 def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:

@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import torch.distributed
@@ -210,21 +210,13 @@ class TrainingJob:
     def changed_settings(self) -> tuple[str, ...]:
         """A note where the settings differ from those of the training so far in this folder; stores them."""
         file, before = self.out / OWN / "training.json", None
-        settings = {"seed": str(self.seed), **_flat(asdict(self.config))}
+        settings = {"seed": self.seed, "steps": self.config.steps, **asdict(self.config.optimizer)}
         with contextlib.suppress(InputError):  # a new training, or one of an older version
             before = read_json(file) if (self.out / CHECKPOINT).exists() else None
         write_whole(file, json.dumps(settings).encode(), parents=True)
         old = before if isinstance(before, dict) else {}
         changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
         return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
-
-
-def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    """A table of tables as texts with names such as "optimizer.learning_rate"."""
-    found: dict[str, str] = {}
-    for name, value in table.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": str(value)}
-    return found
 
 
 def prepare_training(

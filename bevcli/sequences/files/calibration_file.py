@@ -15,15 +15,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import read_json
-from bevcli.printing import one_line
-from bevcli.sequences.files.json_fields import (
-    LONGEST_VALUE,
-    Report,
-    parse_numbers,
-    parse_transform,
-    quoted,
-    transform_to_json,
-)
+from bevcli.printing import one_line, quoted
+from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
@@ -178,9 +171,7 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
         report.error("camera-name", one_line(name, LONGEST_VALUE), "is not the name of a camera", expected=expected)
         return None
     if not isinstance(value, dict):
-        report.error(
-            "wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=quoted(value)
-        )
+        report.error("wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=value)
         return None
     width, height = _parse_size(value, "width", report), _parse_size(value, "height", report)
     intrinsics = parse_intrinsics(value, report)

@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion
-from bevcli.printing import one_line
+from bevcli.printing import one_line, quoted
 
 LARGEST_NUMBER = 1e12
 LONGEST_VALUE = 60  # characters of a value in a message
@@ -83,11 +83,6 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
         report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
         return None
     return array
-
-
-def quoted(value: object) -> object:
-    """A value of a file for a message: a text is in quotes."""
-    return f'"{value}"' if isinstance(value, str) else value
 
 
 def array_of_numbers(value: object) -> Array | None:

@@ -107,11 +107,13 @@ def _read_sensor_data(
     path = tables / "sample_data.json"
     lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
-    parts = []
+    parts, known = [], {token.decode() for token in sensor_tokens}
     for batch in read_batches(path):
         facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
         needed = batch.where(
-            (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
+            (owner in cameras and row.get("is_valid") is not False)
+            or (key and owner in lidars)
+            or owner not in known  # an error, which `places_of` raises
             for row, owner, key in facts
         )
         if len(needed):

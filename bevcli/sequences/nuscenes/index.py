@@ -40,14 +40,14 @@ class Dialect:
         class_of: a category -> its class, None for a category that is left out.
         visibilities: names of visibility levels -> visible fraction, besides names such as "v40-60".
         has_attributes: whether the attributes are those of nuScenes, which are scored.
-        ego_from_bev: (4, 4) metres; None for the frame of the lidar.
+        bev_is_lidar: whether the bev frame is that of the lidar.
     """
 
     lidars: tuple[str, ...]
     class_of: Callable[[str], str | None]
     visibilities: Mapping[str, float] = field(default_factory=dict)
     has_attributes: bool = True
-    ego_from_bev: Array | None = None
+    bev_is_lidar: bool = True
 
 
 # The published models predict in the frame of LIDAR_TOP.

@@ -83,12 +83,12 @@ class TableSequence(Sequence):
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
-        self.rig = self._rig(self.scenes[0])
+        self.rig = scene_rig(self.index, dialect, self.scenes[0], tables)
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
-        self.notes = ((note,) if note else ()) + tuple(self._table_notes())
+        self.notes = (*((note,) if note else ()), *rig_notes(self.rig, str(tables)), *self._table_notes())
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""
@@ -99,8 +99,6 @@ class TableSequence(Sequence):
                 f"{self.tables / 'sample_data.json'}: {without} of {len(own)} samples have no keyframe of "
                 f"{' or '.join(self.dialect.lidars)}: their pose is that of the image nearest in time"
             )
-        if self.dialect.ego_from_bev is None and self.rig.ego_from_bev_assumed:
-            yield from rig_notes(self.rig, str(self.tables))
         owners = np.searchsorted(samples.first_annotation, np.arange(len(annotations.categories)), side="right") - 1
         mine = np.isin(owners, own)
         lost = np.flatnonzero(mine & (annotations.categories == b""))
@@ -158,14 +156,8 @@ class TableSequence(Sequence):
 
     def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
         """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
-        motion = scene_motion(self.index, scene)
-        return self._rig(scene), motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
-
-    def _rig(self, scene: int) -> CameraRig:
-        try:
-            return scene_rig(self.index, self.dialect, scene)
-        except InputError as error:
-            raise InputError(f"{self.tables / 'sample_data.json'}: {error}") from None
+        rig, motion = scene_rig(self.index, self.dialect, scene, self.tables), scene_motion(self.index, scene)
+        return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
 
     def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
@@ -219,19 +211,18 @@ def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:
     return Pose(np.array(table.translations[row]), np.array(table.quaternions[row]))
 
 
-def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
-    """The rig of a scene. Raises InputError."""
+def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int, tables: Path) -> CameraRig:
+    """The rig of a scene. tables: for messages. Raises InputError."""
     first, last = index.scenes.first_image[scene : scene + 2]
     sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
-    cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
+    cameras = [_camera(index, int(sensor), first + row, tables) for sensor, row in zip(sensors, rows, strict=True)]
     cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
     lidars = index.samples.lidars[slice(*index.scenes.first_sample[scene : scene + 2])]
     lidar = next((int(one) for one in lidars if one >= 0), None)
-    if dialect.ego_from_bev is not None or lidar is None:
-        ego_from_bev = default_ego_from_bev() if dialect.ego_from_bev is None else dialect.ego_from_bev
-        return CameraRig(tuple(cameras), ego_from_bev, ego_from_bev_assumed=True)
+    if lidar is None or not dialect.bev_is_lidar:
+        return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
     return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)
 
 
@@ -260,12 +251,13 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
     return CanBus(times[order], *(values[order] for values in quantities))
 
 
-def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
+def _camera(index: NuScenesIndex, sensor: int, image: int, tables: Path) -> Camera:
     width, height = (int(value) for value in index.images.sizes[image])
     name = str(index.sensors.channels[sensor])
     if not is_file_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
         raise InputError(
-            f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
+            f'{tables / "sample_data.json"}: camera "{name:.60}": expected a name without a slash and an image size, '
+            f"found {width}x{height}"
         )
     intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
     return Camera(name, width, height, intrinsics, _pose_of(index.sensors, sensor).matrix, lens)
