@@ -55,7 +55,7 @@ def convert(
             left_out |= load(GROUP, written.form).left_out(frame)
             progress.advance()
         if not images:
-            raise no_image_error(sequence.name, *reasons[0])
+            raise no_image_error(sequence.name, reasons)
     if boxes:
         say(f"note: {boxes} boxes of the ground truth are left out: a size of 0 or less, or not finite", err=True)
     if left_out:

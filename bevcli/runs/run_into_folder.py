@@ -97,8 +97,7 @@ def run_into_folder(
         try:
             _write_steps(steps(state.runner), files, summary, saver, after_frame, should_stop)
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:
-                _, *first = summary.counts.dropped[0]
-                raise no_image_error(sequence.name, *first)
+                raise no_image_error(sequence.name, (each[1:] for each in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
 from bevcli.cli.stop_signals import StopSignals
+from bevcli.cli.train import _run
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
@@ -311,6 +312,12 @@ def test_a_resumed_training_names_other_settings(two_steps: Trainer, tmp_path: P
     (note,) = replace(job, seed=7, config=replace(job.config, optimizer=optimizer)).changed_settings()
     assert "seed 7 (before 0)" in note
     assert "learning_rate 0.5 (before 0.0002)" in note
+
+
+def test_a_training_beyond_its_steps_says_so(two_steps: Trainer, tmp_path: Path) -> None:
+    shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
+    with pytest.raises(InputError, match=r"its training has done 2 steps \(expected at most `steps=1`\)"):
+        _run(trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1)))
 
 
 def test_a_checkpoint_of_an_earlier_image_loss_is_rejected(tmp_path: Path) -> None:
