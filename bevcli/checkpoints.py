@@ -23,7 +23,7 @@ from bevcli.writing import check_output, write_whole
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
-PREFIXES = ("module.", "model.")  # of all names: DistributedDataParallel, Lightning
+PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
 AVERAGES = r"ema_|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
 _TENSOR = (StoredTensor, type(None))
 
@@ -134,15 +134,14 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str, Tensor]:
     """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
-    averages = [key for key in state if re.match(AVERAGES, key)]
-    if 0 < len(averages) < len(state):
-        left_out.append(f"{len(averages)} running averages, such as {averages[0]}")
-        state = {key: tensor for key, tensor in state.items() if key not in averages}
-    prefix = next((each for each in PREFIXES if state and all(key.startswith(each) for key in state)), None)
-    if prefix is None:
-        return state
+    kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
+    left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
+    prefixes = {found[0] for found in (re.match(PREFIXES, key) for key in kept) if found}
+    if len(prefixes) != 1 or "" in prefixes:
+        return kept
+    (prefix,) = prefixes
     left_out.append(f'the prefix "{prefix}" of all names')
-    return _unwrapped({key.removeprefix(prefix): tensor for key, tensor in state.items()}, left_out)
+    return {key.removeprefix(prefix): tensor for key, tensor in kept.items()}
 
 
 def bundled_weights(model: str) -> Path | None:

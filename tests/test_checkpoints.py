@@ -173,7 +173,7 @@ def test_saved_weights_are_loaded_again(tmp_path: Path, suffix: str) -> None:
         (lambda state: {"model": {f"module.{key}": value for key, value in state.items()}}, 'prefix "module."'),
         (
             lambda state: state | {f"ema_{key.replace('.', '_')}": 2 * value for key, value in state.items()},
-            "running averages, such as ema_",
+            "running averages (ema_*)",
         ),
     ],
 )

@@ -120,11 +120,8 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
     wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), deviations_deg.max() / WIDEST_DEG)
     width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
     height = round(camera.height * width / camera.width)
-    size = (
-        f"; its images are {camera.width} x {camera.height}: about {width} x {height} would do"
-        if width > camera.width
-        else ""
-    )
+    stated = f"{camera.width} x {camera.height}"
+    size = f"; its images are {stated}: about {width} x {height} would do" if width > camera.width else ""
     if matches < FEWEST_MATCHES:
         return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:

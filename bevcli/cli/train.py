@@ -78,9 +78,7 @@ def _run(trainer: "Trainer") -> None:
     job, first = trainer.job, trainer.done
     updates, steps = job.config.clips.updates, job.config.steps - first
     if steps < 0:
-        raise InputError(
-            f"{job.out}: its training has done {first} steps (expected at most `steps={job.config.steps}`)"
-        )
+        raise InputError(f"{job.out}: has done {first} steps already (expected at most `steps={job.config.steps}`)")
 
     def after_update(loss: float) -> None:
         progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"

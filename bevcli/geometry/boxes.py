@@ -59,11 +59,6 @@ class Boxes3D:
         chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
         return Boxes3D(**chosen)
 
-    def possible(self) -> NDArray[np.bool_]:
-        """(N,) True for the boxes with finite numbers and sizes above 0."""
-        numbers = np.concatenate([self.centers, self.sizes_lwh, self.yaws[:, None]], axis=1)
-        return np.isfinite(numbers).all(axis=1) & (self.sizes_lwh > 0).all(axis=1)
-
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
         return self if self.scores is None else self[self.scores >= least]

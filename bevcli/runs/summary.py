@@ -131,12 +131,11 @@ class RunSummary:
         if prediction.started_anew:
             counts.started_anew.append((index, str(prediction.started_anew)))
 
-    def _image_notes(self) -> list[str]:
+    def _rig_notes(self) -> list[str]:
         missing = Counter(camera for _, camera, _ in self.counts.dropped)
-        cameras = [name for name, count in self.counts.flat.items() if count == self.frames - missing[name]]
-        return [f"all images of {', '.join(cameras)} are nearly black or white: are they 12 bits in 16?"] * bool(
-            cameras
-        )
+        flat = [name for name, count in self.counts.flat.items() if count == self.frames - missing[name]]
+        notes = [f"all images of {name} are nearly black or white: are they 12 bits in 16?" for name in flat]
+        return [*self.input_errors, *self._model.rig_notes(self._sequence.rig), *notes]
 
     @property
     def frames(self) -> int:
@@ -175,12 +174,7 @@ class RunSummary:
             "skipped_frames": counts.skipped,
             "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
             "started_anew": _rows(counts.started_anew, "frame", "reason"),
-            "notes": [
-                *self._sequence.notes,
-                *self.input_errors,
-                *self._model.rig_notes(self._sequence.rig),
-                *self._image_notes(),
-            ],
+            "notes": [*self._sequence.notes, *self._rig_notes()],
             "files": [str(path) for path in self.files],
         }
 
@@ -211,9 +205,7 @@ class RunSummary:
             rows.append(("failed", f"{len(counts.not_finite)} frames: NaN or infinity, first in {where}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
-        rows += [("rig", note) for note in self.input_errors]
-        rows += [("rig", note) for note in self._model.rig_notes(self._sequence.rig)]
-        rows += [("images", note) for note in self._image_notes()]
+        rows += [("rig", note) for note in self._rig_notes()]
         rows += [("written", str(path)) for path in self.files]
         return "\n".join(f"{name:<8} {text}" for name, text in rows)
 

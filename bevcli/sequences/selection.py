@@ -69,7 +69,8 @@ class WithClassNames(DerivedSequence):
         truth = frame.ground_truth
         if truth is None:
             return frame
-        kept = truth if (possible := truth.possible()).all() else truth[possible]
+        possible = (truth.sizes_lwh > 0).all(axis=1) & np.isfinite(truth.to_numpy()[:, :7]).all(axis=1)
+        kept = truth if possible.all() else truth[possible]
         return replace(frame, ground_truth=self._names.renamed(kept), impossible_boxes=len(truth) - len(kept))
 
 

@@ -209,12 +209,11 @@ class TrainingJob:
 
     def changed_settings(self) -> tuple[str, ...]:
         """A note where the settings differ from those of the training so far in this folder; stores them."""
-        file, before = self.out / OWN / "training.json", None
+        file, old = self.out / OWN / "training.json", {}
         settings = {"seed": self.seed, "steps": self.config.steps, **asdict(self.config.optimizer)}
-        with contextlib.suppress(InputError):  # a new training, or one of an older version
-            before = read_json(file) if (self.out / CHECKPOINT).exists() else None
+        if (self.out / CHECKPOINT).exists() and file.exists():  # else a new training, or one of an older version
+            old = read_json(file)
         write_whole(file, json.dumps(settings).encode(), parents=True)
-        old = before if isinstance(before, dict) else {}
         changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
         return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
 

@@ -316,7 +316,7 @@ def test_a_resumed_training_names_other_settings(two_steps: Trainer, tmp_path: P
 
 def test_a_training_beyond_its_steps_says_so(two_steps: Trainer, tmp_path: Path) -> None:
     shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
-    with pytest.raises(InputError, match=r"its training has done 2 steps \(expected at most `steps=1`\)"):
+    with pytest.raises(InputError, match=r"has done 2 steps already \(expected at most `steps=1`\)"):
         _run(trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1)))
 
 

@@ -192,9 +192,8 @@ class Sample:
     def rig(self, others: Mapping[str, Record]) -> CameraRig:
         """The cameras in the order of the calibration. others: their images elsewhere, for sizes. Raises InputError."""
         images = {**others, **self.images()}
-        for name in images:
-            if name not in self.calibration.ego_from:
-                raise InputError(f'{images[name].where}: a sample\'s calibration has no sensor "{name}"')
+        if unknown := [name for name in images if name not in self.calibration.ego_from]:
+            raise InputError(f'{images[unknown[0]].where}: a calibration has no sensor "{unknown[0]}"')
         names = [name for name in self.calibration.ego_from if name in images]
         sizes = [(images[name].integer("width"), images[name].integer("height")) for name in names]
         cameras = tuple(map(self.calibration.camera, names, sizes))

@@ -41,10 +41,7 @@ def choose_version(root: object, versions: Sequence[str], version: str | None) -
 
 
 def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: str | None = None) -> list[int]:
-    """Indices of the scenes of a split (None: all), or of one scene. Raises InputError if there are none.
-
-    Scenes without samples or without images are left out.
-    """
+    """Indices of the scenes with images of a split (None: all), or of one scene. Raises InputError without any."""
     names = [str(name) for name in index.scenes.names]
     if split is not None and split not in SPLITS:
         raise InputError(f'`split` "{split}": expected one of {", ".join(SPLITS)}')

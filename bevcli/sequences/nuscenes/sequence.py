@@ -92,21 +92,21 @@ class TableSequence(Sequence):
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""
-        samples, annotations, scenes = self.index.samples, self.index.annotations, self.index.scenes
-        own = np.concatenate([np.arange(*scenes.first_sample[scene : scene + 2]) for scene in self.scenes])
-        if without := int((samples.lidars[own] < 0).sum()):
+        samples, spans = (
+            self.index.samples,
+            [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes],
+        )
+        lidars = np.concatenate([samples.lidars[slice(*span)] for span in spans])
+        if (lidars < 0).any():
             yield (
-                f"{self.tables / 'sample_data.json'}: {without} of {len(own)} samples have no keyframe of "
-                f"{' or '.join(self.dialect.lidars)}: their pose is that of the image nearest in time"
+                f"{self.tables / 'sample_data.json'}: {(lidars < 0).sum()} of {len(lidars)} samples have no keyframe "
+                f"of {' or '.join(self.dialect.lidars)}: their pose is that of the image nearest in time"
             )
-        owners = np.searchsorted(samples.first_annotation, np.arange(len(annotations.categories)), side="right") - 1
-        mine = np.isin(owners, own)
-        lost = np.flatnonzero(mine & (annotations.categories == b""))
-        if len(lost):
-            yield (
-                f"{self.tables / 'sample_annotation.json'}: {len(lost)} of {int(mine.sum())} boxes are left out: "
-                f'instance.json lacks their instance, such as token "{annotations.instances[lost[0]].decode()}"'
-            )
+        of_spans = [slice(*samples.first_annotation[span]) for span in spans]
+        names = np.concatenate([self.index.annotations.categories[span] for span in of_spans])
+        if (names == b"").any():
+            where = f"{self.tables / 'sample_annotation.json'}: {(names == b'').sum()} of {len(names)}"
+            yield f"{where} boxes are left out: instance.json lacks their instance"
 
     @property
     def input_files(self) -> tuple[Path, ...]:
