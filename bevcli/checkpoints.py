@@ -119,6 +119,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise WeightsError(f"{path}: weights file not found")
     not_read: tuple[str, ...] = ()
     left_out: list[str] = []
+    state: Mapping[str, Tensor]
     if path.suffix == ".safetensors":
         state, facts = read_safetensors(path, error=WeightsError)
     else:
