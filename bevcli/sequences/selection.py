@@ -78,13 +78,14 @@ def check_time_unit(sequence: Sequence, source: object) -> None:
     """Raise InputError where frames follow each other so fast that their times are no nanoseconds."""
     pairs = pairwise(sequence.stamps)
     periods = [after.timestamp_ns - before.timestamp_ns for before, after in pairs if before.scene == after.scene]
-    period = np.median(periods) if periods else np.inf
+    period = (np.median(periods) or np.mean(periods)) if periods else np.inf
     if period < SHORTEST_PERIODS_NS[0]:
-        units = {1000: "microseconds", 10**6: "milliseconds", 10**9: "seconds"}
+        # In place of nanoseconds, or of microseconds as in nuScenes' tables.
+        units = {10**3: "microseconds or milliseconds", 10**6: "milliseconds or seconds", 10**9: "seconds"}
         factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)
         raise InputError(
-            f"{source}: the timestamps are {factor} times too small, as if {units[factor]} were given for nanoseconds: "
-            f"the frames are {period:.0f} ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
+            f"{source}: the timestamps are {factor} times too small (in {units[factor]}?): the frames are {period:.0f} "
+            f"ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
         )
 
 

@@ -254,6 +254,14 @@ def test_one_sample_without_lidar_keeps_the_bev_frame(root):
     assert any("1 of 12 samples" in note for note in drive.notes)
 
 
+@pytest.mark.parametrize(("divisor", "said"), [(1000, "milliseconds"), (10**6, "milliseconds or seconds")])
+def test_tables_in_another_unit_of_time_are_refused(divisor, said, root):
+    for table in ("sample", "sample_data"):
+        edit_table(root, table, lambda rows: [{**row, "timestamp": row["timestamp"] // divisor} for row in rows])
+    with pytest.raises(InputError, match=f"the timestamps are {divisor} times too small .*{said}"):
+        open_sequence(root)
+
+
 def test_unknown_visibilities_and_points_are_unknown(root):
     edit_table(root, "visibility", lambda rows: [{**row, "level": "Not available"} for row in rows])
     edit_table(root, "sample_annotation", lambda rows: [{**row, "num_lidar_pts": None} for row in rows])

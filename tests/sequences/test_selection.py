@@ -121,7 +121,7 @@ def test_invalid_step_is_an_error(drive):
 
 @pytest.mark.parametrize(
     ("unit_ns", "said"),
-    [(1000, "1000 times too small, as if microseconds"), (10**6, "1000000 times too small, as if milliseconds")],
+    [(1000, r"1000 times too small \(in microseconds"), (10**6, r"1000000 times too small \(in milliseconds")],
 )
 def test_a_drive_in_another_unit_is_refused(unit_ns, said, drive):
     for file in ("frames.csv", "ego_motion.csv"):
