@@ -13,6 +13,7 @@ from bevcli.parsing.files import read_text
 
 LARGEST_BYTES = 256 << 20
 NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
+UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
@@ -69,11 +70,10 @@ def _advice(text: str, column: str) -> str:
         return "write digits only"
     if value.as_tuple().exponent > 0 or value.adjusted() > 40:  # type: ignore[operator]
         return "its last digits are lost, as spreadsheets round long numbers: write the table anew from its source"
-    if not column.endswith("timestamp_ns") or value.adjusted() >= NANOSECONDS_FROM:
+    power = next((power for power in (0, 3, 6) if value.adjusted() + power >= NANOSECONDS_FROM), 9)
+    if not column.endswith("timestamp_ns") or power == 0:
         return f"write {value:.0f}" if value == value.to_integral_value() else "write an integer"
-    power = next((power for power in (3, 6) if value.adjusted() + power >= NANOSECONDS_FROM), 9)
-    unit = {3: "microseconds", 6: "milliseconds", 9: "seconds"}[power]
-    return f"write nanoseconds; if it is in {unit}, {value.scaleb(power):.0f}"
+    return f"write nanoseconds: {value.scaleb(power):.0f}, if it is in {UNITS[power]}"
 
 
 def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> tuple[CsvRow, ...]:

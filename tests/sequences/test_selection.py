@@ -140,8 +140,8 @@ def test_a_drive_in_another_unit_is_refused(unit_ns, said, drive):
     [
         ("1.70000E+18", "its last digits are lost"),
         ("1.700000000500000000E+18", "write 1700000000500000000"),
-        ("1700000000.5", "if it is in seconds, 1700000000500000000"),
-        ("1700000000500.25", "if it is in milliseconds, 1700000000500250000"),
+        ("1700000000.5", "1700000000500000000, if it is in seconds"),
+        ("1700000000500.25", "1700000000500250000, if it is in milliseconds"),
         ("1700000000500000000.0", "write 1700000000500000000"),
         ("nan", "write digits only"),
     ],
@@ -149,5 +149,5 @@ def test_a_drive_in_another_unit_is_refused(unit_ns, said, drive):
 def test_advice_for_a_time_gives_the_right_number(cell, said, edit):
     with pytest.raises(InputError) as error:
         open_sequence(edit("frames.csv", "\n10,1000000000,", f"\n10,{cell},"))
-    assert str(error.value).endswith(said) or said in str(error.value)
+    assert said in str(error.value)
     assert "remove decimal point" not in str(error.value)

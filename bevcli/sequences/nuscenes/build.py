@@ -30,12 +30,15 @@ def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
         image_rows = image_rows[np.lexsort((data["times_us"][image_rows], sample_scenes[data["samples"][image_rows]]))]
         images = Images(**_rows(data, image_rows))
         starts = _starts(sample_scenes[images.samples], len(names))
-        nearest = image_rows[_nearest(sample_times, sample_scenes, images.times_us, starts)]
         lidar_rows = np.full(len(sample_tokens), -1)
         lidar_rows[data["samples"][lidar]] = np.flatnonzero(lidar)
+        pose_rows = lidar_rows.copy()
+        for sample in np.flatnonzero(lidar_rows < 0):  # the nearest image; any in a scene without images
+            rows = image_rows[slice(*starts[sample_scenes[sample] :][:2])]
+            distances = np.abs(data["times_us"][rows] - sample_times[sample])
+            pose_rows[sample] = rows[distances.argmin()] if len(rows) else 0
         annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
     scenes = Scenes(names, _starts(sample_scenes, len(names)), starts)
-    pose_rows = np.where(lidar_rows < 0, nearest, lidar_rows)
     translations, quaternions = data["translations"][pose_rows], data["quaternions"][pose_rows]
     lidars = np.where(lidar_rows < 0, -1, data["sensors"][lidar_rows])
     samples = Samples(sample_tokens, sample_times, translations, quaternions, lidars, first_annotation)
@@ -146,19 +149,6 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     places = places_of(wanted, found, path)
     chosen = rotations[places]
     return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
-
-
-def _nearest(times: Ints, scenes: Ints, image_times: Ints, starts: Ints) -> Ints:
-    """(N,) the image of its scene that is nearest in time to each sample; any image for a scene without images.
-
-    times, scenes: (N,) of the samples. image_times: (P,) by scene and time. starts: (S + 1,) first image of each scene.
-    """
-    rows = np.zeros(len(times), dtype=np.int64)
-    for scene in np.flatnonzero(np.diff(starts)):
-        own, among = scenes == scene, image_times[starts[scene] : starts[scene + 1]]
-        middles = (among[1:] + among[:-1]) / 2
-        rows[own] = starts[scene] + np.searchsorted(middles, times[own])
-    return rows
 
 
 def _starts(sorted_owners: Ints, count: int) -> Ints:
