@@ -10,6 +10,7 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
+from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
@@ -268,6 +269,11 @@ def test_unknown_visibilities_and_points_are_unknown(root):
     truth = open_sequence(root).load(0).ground_truth
     assert np.isnan(truth.visibilities).all()
     assert (truth.num_points == -1).all()
+    both = [{"num_lidar_pts": -1, "num_radar_pts": -1}, {"num_lidar_pts": 5, "num_radar_pts": 2}]
+    edit_table(root, "sample_annotation", lambda rows: [{**row, **both[k // 4 % 2]} for k, row in enumerate(rows)])
+    counts = open_sequence(root).load(0).ground_truth.num_points
+    written = boxes_from_json(boxes_to_json(open_sequence(root).load(0).ground_truth), "written").num_points
+    assert written.tolist() == [-1 if count < 0 else count for count in counts]
 
 
 def test_missing_or_broken_table_is_named(root):
