@@ -225,6 +225,14 @@ def test_boxes_of_missing_instances_are_left_out_with_a_number(root):
     assert any("96 of 96 boxes are left out" in note for note in open_sequence(root).notes)
 
 
+@pytest.mark.parametrize("size", [[0.0, 0.0, 0.0], [2.0, -4.0, 1.5]])
+def test_boxes_of_an_impossible_size_are_left_out(size, root):
+    edit_table(root, "sample_annotation", lambda rows: [{**rows[0], "size": size}, *rows[1:]])
+    frames = [open_sequence(root).load(place) for place in range(2)]
+    assert [len(frame.ground_truth) for frame in frames] == [3, 4]
+    assert [frame.impossible_boxes for frame in frames] == [1, 0]
+
+
 def test_scenes_without_frames_are_skipped(root):
     edit_table(root, "scene", lambda rows: [{**rows[0], "token": "e" * 32, "name": "empty"}, *rows])
     assert {stamp.scene for stamp in open_sequence(root).stamps} == {scene_name(number) for number in range(3)}
