@@ -39,8 +39,8 @@ def convert(
     if labels.labels is not None:
         sequence = WithLabels(sequence, labels.labels, labels)
     count = len(sequence.stamps)
-    reasons, boxes, left_out = list[tuple[str, str]](), 0, set[str]()
-    images = 0
+    gaps, left_out = 0, set[str]()
+    images, boxes, reasons = 0, 0, dict[str, str]()
     with (
         open_writer(out, sequence, written) as writer,
         Progress(count, "frames", sequence.notes) as progress,
@@ -49,17 +49,18 @@ def convert(
             frame = sequence.load(place)
             for camera, reason in frame.dropped.items():
                 progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
-            reasons += frame.dropped.items()
+            gaps += len(frame.dropped)
+            reasons |= frame.dropped
             images, boxes = images + len(frame.images), boxes + frame.impossible_boxes
             writer.write(frame)
             left_out |= load(GROUP, written.form).left_out(frame)
             progress.advance()
         if not images:
-            raise no_image_error(sequence.name, reasons)
+            raise no_image_error(sequence.name, reasons.items())
     if boxes:
         say(f"note: {boxes} boxes of the ground truth are left out: a size of 0 or less, or not finite", err=True)
     if left_out:
         name = load(GROUP, written.form).name
         say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)
-    missing = f", {len(reasons)} images missing" if reasons else ""
+    missing = f", {gaps} images missing" if gaps else ""
     say(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")
