@@ -145,6 +145,12 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
 def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
+    kinds: dict[str, Any] = {each.kind: each for each in typing.get_args(kind) if hasattr(each, "kind")}
+    if kinds and isinstance(value, dict):
+        chosen = value.get("kind", next(iter(kinds)))
+        if chosen not in kinds:
+            raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {chosen!r:.60}')
+        return _dataclass(value, kinds[chosen], file, f"{key}.")
     if typing.get_origin(kind) is Mapping and isinstance(value, dict):
         return {name: _value(each, typing.get_args(kind)[1], file, f"{key}.{name}") for name, each in value.items()}
     try:

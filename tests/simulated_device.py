@@ -23,12 +23,16 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+from bevcli.model.deformable_convolution import predicted_deformable_convolution
+
 CPU = torch.device("cpu")
 # Functions that read numbers back, to answer with a Python value or to find out a shape.
 READING = {
     torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.cpu, torch.Tensor.__bool__, torch.Tensor.__int__,
     torch.Tensor.__float__, torch.Tensor.__index__, torch.Tensor.nonzero, torch.nonzero, torch.equal,
-    torch.Tensor.equal, torch.masked_select, torch.unique, torch.allclose, torch.isin,
+    torch.Tensor.equal, torch.masked_select, torch.Tensor.masked_select, torch.unique, torch.Tensor.unique,
+    torch.unique_consecutive, torch.allclose, torch.isin, torch.argwhere, torch.bincount, torch.is_nonzero,
+    torch.linalg.solve, torch.linalg.inv, torch.inverse,
 }  # fmt: skip
 REPEATING = {torch.repeat_interleave, torch.Tensor.repeat_interleave}
 MAKING = {torch.tensor, torch.as_tensor, torch.Tensor.new_tensor}  # from Python numbers
@@ -53,12 +57,25 @@ class SimulatedDevice(TorchFunctionMode):
     Attributes:
         device: what its tensors claim.
         waits: each operation for which the CPU would wait for the device, in order.
+        tape: the operations since a capture began, with their arguments and results; None outside of one.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__()
         self.device = torch.device(name)
         self.waits: list[str] = []
+        self.tape: list[tuple[Any, Any, Any, Any]] | None = None
+
+    def wait(self, name: str) -> None:
+        """The CPU waits for the device, which a capture does not allow."""
+        if self.tape is not None:
+            raise RuntimeError(f"{name}: the CPU waits for {self.device} in a capture")
+        self.waits.append(name)
+
+    def record(self, function: Any, args: Any, kwargs: Any, found: Any) -> None:
+        """Keeps an operation for the replay, in a capture."""
+        if self.tape is not None:
+            self.tape.append((function, args, kwargs, found))
 
     def tensor(self, held: Tensor) -> Tensor:
         """A tensor of these numbers on the device."""
@@ -87,15 +104,19 @@ class SimulatedDevice(TorchFunctionMode):
             assert device is not None
             self.check(device)
             if function in MAKING:
-                self.waits.append(f"{function.__name__}(…, device=…)")
+                self.wait(f"{function.__name__}(…, device=…)")
             kwargs["device"] = CPU
-        found = function(*tree_map(_held, args), **tree_map(_held, kwargs))
+        args, kwargs = tree_map(_held, args), tree_map(_held, kwargs)
+        found = function(*args, **kwargs)
+        self.record(function, args, kwargs, found)
         if function is torch.Tensor.cpu:
             return found.clone()
 
         def on_device(value: Any) -> Any:
             if id(value) in ours:
                 return ours[id(value)]  # was changed in place
+            if any(value is tensor for tensor in tensors):
+                return value  # of the CPU, was changed in place
             return self.tensor(value) if isinstance(value, Tensor) else value
 
         return tree_map(on_device, found)
@@ -111,42 +132,121 @@ class SimulatedDevice(TorchFunctionMode):
         if function is torch.Tensor.numpy:
             raise TypeError(f"a tensor on {self.device} cannot become an array")
         if function is torch.Tensor.copy_:
-            if not kwargs.get("non_blocking") and len({isinstance(x, OnDevice) for x in args[:2]}) == 2:
-                self.waits.append(name)
+            on_cpu = [x for x in args[:2] if isinstance(x, Tensor) and not isinstance(x, OnDevice)]
+            if on_cpu and not (kwargs.get("non_blocking") and is_pinned(on_cpu[0])):
+                self.wait(name)
             return
         if function in INDEXING:
             parts = args[1] if isinstance(args[1], tuple) else (args[1],)
             if any(isinstance(x, list) or (isinstance(x, Tensor) and not isinstance(x, OnDevice)) for x in parts):
-                self.waits.append("index of the CPU")
+                self.wait("index of the CPU")
             if any(isinstance(x, Tensor) and x.dtype == torch.bool for x in parts):
-                self.waits.append("index of a mask")
-        elif any(not isinstance(x, OnDevice) and x.ndim for x in tensors):
+                self.wait("index of a mask")
+        elif any(not isinstance(x, OnDevice) and (x.ndim or self.tape is not None) for x in tensors):
             raise RuntimeError(f"{name}: tensors on {self.device} and on the CPU")
         by_tensor = function in REPEATING and isinstance(args[1], Tensor) and kwargs.get("output_size") is None
-        if function in READING or by_tensor:
-            self.waits.append(name)
+        by_condition = function in (torch.where, torch.Tensor.where) and len(tensors) == len(args) == 1
+        one_hot = function is torch.nn.functional.one_hot and len(args) == 1 and "num_classes" not in kwargs
+        if function in READING or by_tensor or by_condition or one_hot:
+            self.wait(name)
 
     def _to(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         kwargs.pop("copy", None)
         device, dtype, non_blocking, memory_format = torch._C._nn._parse_to(*args, **kwargs)
         held = _held(tensor)
-        changed = held.to(dtype=dtype or held.dtype, memory_format=memory_format or torch.preserve_format)
+        wanted = {"dtype": dtype or held.dtype, "memory_format": memory_format or torch.preserve_format}
+        changed = held.to(**wanted)
+        self.record(torch.Tensor.to, (held,), wanted, changed)
         there, comes = isinstance(tensor, OnDevice), device is not None and device.type == self.device.type
         if comes:
             self.check(device)
         if there and (device is None or comes):
             return tensor if changed is held else self.tensor(changed)
         if comes:
-            if not (non_blocking and getattr(tensor, "is_pinned_here", False)):
-                self.waits.append("upload")
+            if self.tape is not None or not (non_blocking and is_pinned(tensor)):
+                self.wait("upload")
             return self.tensor(changed.detach().clone())
         if there:
-            self.waits.append("copy to the CPU")
+            self.wait("copy to the CPU")
         return changed
 
 
 def _held(value: Any) -> Any:
     return value.held if isinstance(value, OnDevice) else value
+
+
+def pinned(tensor: Tensor) -> Tensor:
+    """A copy in memory that counts as pinned."""
+    copy = tensor.clone()
+    copy.is_pinned_here = True  # type: ignore[attr-defined]
+    return copy
+
+
+def is_pinned(tensor: Tensor) -> bool:
+    return getattr(tensor, "is_pinned_here", False)
+
+
+class Stream:
+    """A stream of the device, whose work is done at once."""
+
+    def __init__(self, device: SimulatedDevice) -> None:
+        self.device = device
+
+    def synchronize(self) -> None:
+        self.device.wait("synchronize")
+
+    def wait_stream(self, other: Stream) -> None:
+        assert other.device is self.device
+
+
+class Graph:
+    """A CUDA graph: the operations of a capture. A replay runs no Python of the model."""
+
+    def __init__(self) -> None:
+        self.tape: list[tuple[Any, Any, Any, Any]] = []
+
+    def replay(self) -> None:
+        for function, args, kwargs, found in self.tape:
+            again = function(*args, **kwargs)
+            for old, new in zip(tree_flatten(found)[0], tree_flatten(again)[0], strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+class Event:
+    """An event that takes no time."""
+
+    def __init__(self, *, enable_timing: bool) -> None:
+        assert enable_timing
+
+    def record(self, stream: Stream) -> None:
+        assert isinstance(stream, Stream)
+
+    def elapsed_time(self, later: Event) -> float:
+        assert isinstance(later, Event)
+        return 0.0
+
+
+class Kernel:
+    """A Triton kernel whose launch calls a plain function with the same arguments."""
+
+    def __init__(self, device: SimulatedDevice, plain: Callable[..., None]) -> None:
+        self.device, self.plain = device, plain
+
+    def __getitem__(self, _grid: tuple[int, ...]) -> Callable[..., None]:
+        return self.launch
+
+    def launch(self, *args: Any, **constants: Any) -> None:
+        self.plain(*args, **constants)
+        self.device.record(self.plain, args, constants, None)
+
+
+def add_and_relu(values, bias, shortcut, elements, channels, HAS_SHORTCUT, **constants):  # type: ignore[no-untyped-def]
+    """The numbers of the kernel of this name, from PyTorch's own operations."""
+    assert elements == values.held.numel()
+    assert values.held.shape[1] == channels
+    total = values.held.float() + bias.held.float()[:, None, None]
+    values.held.copy_((total + shortcut.held.float() if HAS_SHORTCUT else total).relu())
 
 
 def provide_triton(monkeypatch: Any) -> None:
@@ -168,31 +268,51 @@ def provide_triton(monkeypatch: Any) -> None:
 
 @contextlib.contextmanager
 def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Iterator[SimulatedDevice]:
-    """A simulated device. What only a real one has is replaced: pinned memory, events, streams, the Triton kernel.
+    """A simulated device. What only a real one has is replaced: pinned memory, events, streams, CUDA graphs, the Triton
+    kernel.
 
     sample: takes the place of the launch of the Triton kernel, see `sample_plainly`.
     """
     device = SimulatedDevice(name)
-
-    def pinned(tensor: Tensor) -> Tensor:
-        copy = tensor.clone()
-        copy.is_pinned_here = True  # type: ignore[attr-defined]
-        return copy
-
-    def on_cpu(tensors: list[Tensor]) -> list[Tensor]:
-        device.waits.append("results")
-        return [_held(tensor) for tensor in tensors]
-
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
-    monkeypatch.setattr("bevcli.inference.transfer._on_cpu", on_cpu)
-    monkeypatch.setattr("bevcli.inference.stage_clock.StageClock._now", lambda clock: 0.0)
-    monkeypatch.setattr("bevcli.inference.stage_clock.StageClock.read", lambda clock: {})
+    monkeypatch.setattr("bevcli.inference.transfer.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
+    monkeypatch.setattr(torch.mps, "synchronize", lambda: None)
     if device.device.type == "cuda":
+        _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention
+        from bevcli.model.kernels import triton_attention, triton_bottleneck, triton_convolution
 
-        launch = {"__getitem__": lambda kernel, grid: sample}
-        monkeypatch.setattr(triton_attention, "_sample", type("Kernel", (), launch)())
-        monkeypatch.setattr(torch.cuda, "device", lambda which: contextlib.nullcontext(device.check(which)))
+        monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
+        for module, name, plain in (
+            (triton_attention, "_sample", sample),
+            (triton_bottleneck, "_add_and_relu", add_and_relu),
+        ):
+            monkeypatch.setattr(module, name, Kernel(device, plain))
     with device:
         yield device
+
+
+def _provide_cuda(device: SimulatedDevice, monkeypatch: Any) -> None:
+    stream = Stream(device)
+
+    @contextlib.contextmanager
+    def capture(graph: Graph, *, pool: str, stream: Stream, capture_error_mode: str) -> Iterator[None]:
+        assert (pool, stream.device, capture_error_mode) == ("pool", device, "thread_local")
+        device.tape = graph.tape
+        try:
+            yield
+        finally:
+            device.tape = None
+
+    parts = {
+        "device": lambda which: contextlib.nullcontext(device.check(which)),
+        "stream": lambda which: contextlib.nullcontext(),
+        "Stream": lambda which: Stream(device),
+        "current_stream": lambda which: stream,
+        "Event": Event,
+        "CUDAGraph": Graph,
+        "graph_pool_handle": lambda: "pool",
+        "graph": capture,
+    }
+    for part, value in parts.items():
+        monkeypatch.setattr(torch.cuda, part, value)

@@ -51,7 +51,7 @@ def run_benchmark(
     drive = MadeUpDrive(run + 2 * RUNS * max(options.frames, RUN_FRAMES))
     stages = _time_stages(fast, drive, first, range(timed, run))
     frame_s, peak = tuple(fast.seconds), peak_memory(device)
-    run_frame_s, run_over_model = _time_runs(fast, drive, run, max(options.frames, MIN_RUN_FRAMES))
+    run_frame_s, run_over_model = time_runs(fast, drive, run, max(options.frames, MIN_RUN_FRAMES))
     preprocessor = Preprocessor(config)
     prepared = preprocessor(drive.load(0))
     if options.profile is not None:
@@ -106,15 +106,19 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
     return {stage: tuple(seconds) for stage, seconds in times.items()}
 
 
-def _time_runs(fast: Version, drive: MadeUpDrive, place: int, frames: int) -> tuple[float, float]:
+def time_runs(
+    fast: Version, drive: MadeUpDrive, place: int, frames: int, turns_s: float = TURNS_S
+) -> tuple[float, float]:
     """Median seconds of a frame in whole runs, and how many times as long that is as a frame of the model alone.
 
     Both take turns, because the speed of a machine that others use changes within seconds. The frames of the drive are
-    used once each, from `place` on; the model has seen those before. frames: of a run, at least.
+    used once each, from `place` on; the model has seen those before.
+
+    frames: of a run, at least. turns_s: of all turns if frames are short.
     """
     frame_s = median(fast.seconds)
-    frames = max(frames, min(RUN_FRAMES, round(TURNS_S / RUNS / 2 / frame_s)))
-    runs = max(1, min(RUNS, round(TURNS_S / (2 * frames * frame_s))))
+    frames = max(frames, min(RUN_FRAMES, round(turns_s / RUNS / 2 / frame_s)))
+    runs = max(1, min(RUNS, round(turns_s / (2 * frames * frame_s))))
     preprocessor = Preprocessor(fast.runner.config)
     fast.seconds = []
     in_runs: list[float] = []
@@ -132,12 +136,13 @@ def _time_run(
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
-    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> None:
-        made.append(time.perf_counter())  # recording begins as soon as the model has made the step
+    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
+        made.append(time.perf_counter())  # recording begins as soon as the model has made the step, or late
         recording.log(*step[:2])
-
-    for step, _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
         fast.state = step[2]
+        return True
+
+    write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state))
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 

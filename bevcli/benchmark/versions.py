@@ -67,6 +67,8 @@ class Version:
 def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
     """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
     stages = {module: stage.replace("_", " ") for module, stage in model.stages.items()}
+    if "" in stages:  # of the whole model, a CUDA graph
+        return stages, {}
     if not model.has_parts:
         return stages, dict.fromkeys(stages, "input")
     parts = {
@@ -76,7 +78,8 @@ def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
     }
     for layer in range(model.config.encoder.layers):
         stages |= {f"encoder.layers.{layer}.{part}": stage for part, stage in parts.items()}
-    # The last norm of the encoder counts as FFN; pillars and history are computed just before the encoder.
+    # The last norm of the encoder counts as FFN; the history is turned just before the encoder. Pillars
+    # are input.
     stages |= {"encoder": "FFN", "decoder": "decoder and head"}
     return stages, {"backbone": "input", "encoder": "projection"}
 

@@ -88,8 +88,8 @@ def _run(trainer: "Trainer") -> None:
     say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
     for note in (*job.notes, *job.changed_settings()):
         print_note(note)
-    if job.warm_start is not None:
-        say(job.warm_start.table())
+    for start in job.warm_starts:
+        say(start.table())
     with Progress(steps * updates, "updates") as progress:
         with StopSignals("step") as signals:
             trainer.run(

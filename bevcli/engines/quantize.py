@@ -59,7 +59,11 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
             per_channel=True,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
-            extra_options={"WeightSymmetric": True, "ActivationSymmetric": False},
+            extra_options={
+                "WeightSymmetric": True,
+                "ActivationSymmetric": False,
+                "OpTypesToExcludeOutputQuantization": _unrounded(proto.graph),
+            },
         )
         quantized = onnx.load(str(unfinished))
         onnx.helper.set_model_props(quantized, metadata | {"precision": "int8"})
@@ -79,6 +83,15 @@ def quantized_nodes(graph: Any) -> list[str]:
         if computes and parts[0] in QUANTIZED_PARTS and not DEFORMABLE.intersection(parts):
             found.append(node.name)
     return found
+
+
+def _unrounded(graph: Any) -> list[str]:
+    """Operators whose results are rounded only where another one in INT8 reads them.
+
+    Before a ReLU6 a convolution has results far outside of 0 to 6, and few steps of 8 bits would be left for these.
+    """
+    clips = [node for node in graph.node if node.op_type == "Clip" and node.name.startswith(QUANTIZED_PARTS)]
+    return ["Conv"] if clips else []
 
 
 def _reader(proto: Any, images: Iterable[np.ndarray]) -> Any:

@@ -87,7 +87,7 @@ def _results(figure: Figure, trace: Trace) -> None:
 
 
 def _flow(canvas: Axes, trace: Trace) -> None:
-    _block(canvas, (0.157, 0.29, 0.088, 0.19), "ResNet\nbackbone\n+\nFPN neck")
+    _block(canvas, (0.157, 0.29, 0.088, 0.19), f"{trace.config.backbone.title}\nbackbone\n+\nFPN neck")
     parts = "temporal self-attention\nspatial cross-attention\nfeed-forward network"
     _block(canvas, (0.42, 0.335, 0.205, 0.235), f"Encoder × {trace.config.encoder.layers}\n\n{parts}")
     _block(canvas, (0.778, 0.63, 0.082, 0.115), "Object\ndecoder", 11.5)

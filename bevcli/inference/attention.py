@@ -93,7 +93,7 @@ class AttentionProbe:
         hits: PillarHits = arguments[2]
         counts = torch.tensor(hits.hits_per_camera, device=hits.cell.device)
         camera = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-        chosen = torch.isin(hits.cell, self.cells)
+        chosen = torch.isin(hits.cell, self.cells) & hits.is_seen
         self.spatial = SpatialSamples(camera[chosen], hits.cell[chosen], self._locations[chosen], self._weights[chosen])
 
     def _see_layer(self, _module: object, arguments: tuple[Any, ...], _query: Tensor) -> None:

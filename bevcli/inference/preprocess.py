@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence as Items
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -33,19 +33,16 @@ class Preprocessor:
     def __init__(self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
         self.config = config
         self._chosen_cameras = chosen_cameras
-        self._rig: CameraRig | None = None
-        self._model_rig: CameraRig
-        self._assignment = CameraAssignment((), ())
-        self._image = config.image
+        self._of_rig: _OfRig | None = None  # replaced as a whole: frames may be prepared in several threads
         # In sequence, preparing the images takes longer than the model on a GPU.
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="preprocess")
         weakref.finalize(self, self._threads.shutdown, wait=False)
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
-        self._use_rig(frame.rig)
-        frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
-        image, names = self._image, self._assignment.cameras
+        known = self._facts_of(frame.rig)
+        frame = frame if frame.rig is known.model_rig else replace(frame, rig=known.model_rig)
+        image, names = known.image, known.assignment.cameras
         width, height = image.padded_size
         # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
         # here, and where it has more threads than there are processors, those of the model no longer spin.
@@ -62,21 +59,31 @@ class Preprocessor:
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(
             frame=frame,
-            assignment=self._assignment,
+            assignment=known.assignment,
             scales=scales,
             images=images,
             image_from_bev=torch.from_numpy(np.stack(projections))[None],
-            camera_index=torch.tensor([self.config.cameras.index(name) for name in self._assignment.embeddings]),
+            camera_index=torch.tensor([self.config.cameras.index(name) for name in known.assignment.embeddings]),
             has_image=torch.tensor([[name in frame.images for name in names]]),
         )
 
-    def _use_rig(self, rig: CameraRig) -> None:
-        if rig is self._rig:
-            return
-        self._rig, bev_frame = rig, self.config.bev_frame
-        self._model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
-        self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
-        self._image = image_for_rig(rig, self.config.image)
+    def _facts_of(self, rig: CameraRig) -> "_OfRig":
+        known = self._of_rig
+        if known is None or known.rig is not rig:
+            bev_frame = self.config.bev_frame
+            model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
+            assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
+            known = self._of_rig = _OfRig(rig, model_rig, assignment, image_for_rig(rig, self.config.image))
+        return known
+
+
+class _OfRig(NamedTuple):
+    """What all frames of a rig share. model_rig: the rig in the model's bev frame."""
+
+    rig: CameraRig
+    model_rig: CameraRig
+    assignment: CameraAssignment
+    image: ImageConfig
 
 
 def image_for_rig(rig: CameraRig, image: ImageConfig) -> ImageConfig:

@@ -1,6 +1,7 @@
 """The temporal run: frame by frame, with the memory that the model keeps, and the tracks of the boxes."""
 
 import contextlib
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
 from dataclasses import dataclass, replace
@@ -18,11 +19,14 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.inference.transfer import image_uploader, origin, read_back
+from bevcli.model.config import ImageConfig
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 
 Memory = TypeVar("Memory")
+AHEAD_BYTES = 1 << 29  # of network inputs that are prepared ahead of a GPU
+MOST_THREADS = 4  # that prepare frames for a GPU
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,7 @@ class Runner:
                 if not is_finite:
                     where = origin(self.model, lambda: self.model.step(prepared, state.memory, later))
                     return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
+            self.clock.waited()
             boxes = self.model.decode_boxes(found)
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)
@@ -144,7 +149,11 @@ class Runner:
         """
         ahead = self.config.later_frames if self.options.temporal else 0
         prepare = self.preparation(preprocessor)
-        source = read_ahead(lambda place: prepare(sequence.load(place)), places)
+        if self.device.type == "cuda":
+            depth, threads = frames_ahead(self.config.image, len(sequence.rig.cameras), os.cpu_count() or 1)
+            source = read_ahead(prepare, places, depth, threads, load=sequence.load)
+        else:  # the processor is busy with the model: one thread for both keeps up
+            source = read_ahead(lambda place: prepare(sequence.load(place)), places)
         waiting = deque(islice(source, ahead + 1))
         while waiting:
             prepared = waiting.popleft()
@@ -210,6 +219,18 @@ class Runner:
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
             **{"boxes": Boxes3D.empty(), "bev": None, **found},
         )
+
+
+def frames_ahead(image: ImageConfig, cameras: int, cores: int) -> tuple[int, int]:
+    """How many frames are prepared ahead of a GPU, and in how many threads.
+
+    Each of the frames holds its network input; together these take at most AHEAD_BYTES, but are never less than two.
+    A quarter of the cores prepares images; the others decode images, or record.
+    """
+    width, height = image.padded_size
+    affordable = AHEAD_BYTES // (cameras * 3 * width * height * 4)
+    threads = max(1, min(MOST_THREADS, cores // 4))
+    return max(2, min(threads + 2, affordable)), threads
 
 
 def paired_steps(

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -13,12 +14,14 @@ class StageClock:
     """Seconds of each stage of one step. The model has hooks inside the `with` block only:
 
         with clock:
-            model(inputs)
+            outputs = model(inputs)
+            results = outputs.cpu()
+            clock.waited()
             clock.mark("decoding")
         clock.read()
 
     Time is attributed by marks: the time since the last mark belongs to the stage of the new mark. On a GPU, marks are
-    events in its queue, and only `read` waits for the GPU. On "mps", every mark waits for it.
+    events in its queue, until the CPU has waited for it. On "mps", every mark waits for it.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class StageClock:
         """
         self._device = device
         self._marks: list[tuple[str, Any]] = []  # with seconds, or events of a GPU's queue
+        self._has_waited = False
         self._hooks = ExitStack()
         modules = dict(model.named_modules())
         ends = [(modules[name].register_forward_hook, stage) for name, stage in stages.items() if name in modules]
@@ -48,7 +52,7 @@ class StageClock:
         """A new step begins now."""
         for register, stage in self._marked:
             self._hooks.enter_context(register(lambda *_, stage=stage: self.mark(stage)))
-        self._marks = []
+        self._marks, self._has_waited = [], False
         self.mark("")
         return self
 
@@ -57,16 +61,20 @@ class StageClock:
 
     def mark(self, stage: str) -> None:
         """The time since the last mark belongs to this stage."""
-        self._marks.append((stage, self._now()))
+        self._marks.append((stage, time.perf_counter() if self._has_waited else self._now()))
+
+    def waited(self) -> None:
+        """The CPU has waited for the GPU, and only the CPU computes in the rest of the step."""
+        self._has_waited = True
+        self._marks.append(("", time.perf_counter()))
 
     def read(self) -> Mapping[str, float]:
-        """Stage -> seconds, of the last step."""
-        if self._device.type == "cuda":
-            torch.cuda.current_stream(self._device).synchronize()
+        """Stage -> seconds, of the last step. To call after `waited`, so that a GPU has passed its events."""
         seconds: dict[str, float] = {}
-        for (_, before), (stage, now) in zip(self._marks, self._marks[1:], strict=False):
-            took = now - before if isinstance(now, float) else before.elapsed_time(now) / 1000
-            seconds[stage] = seconds.get(stage, 0.0) + took
+        for (_, before), (stage, now) in pairwise(self._marks):
+            if stage:
+                took = now - before if isinstance(now, float) else before.elapsed_time(now) / 1000
+                seconds[stage] = seconds.get(stage, 0.0) + took
         return seconds
 
     def _now(self) -> Any:

@@ -1,15 +1,15 @@
 """Between CPU and GPU: images go up while the model computes, results come back with one wait and are checked."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.tensors import exchanged, tensors_in
 from bevcli.model.upload import upload
 
 
@@ -48,19 +48,8 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
     sums, *copies = _on_cpu([sums, *(tensor for _, tensor in tensors_in(list(moved.values())))])
     source = iter(copies)
-    on_cpu = replace(last, **{name: _exchanged(value, source) for name, value in moved.items()})
+    on_cpu = replace(last, **{name: exchanged(value, source) for name, value in moved.items()})
     return on_cpu, bool(torch.isfinite(sums).all())
-
-
-def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """The value with other tensors in the place of its own, in the order of `tensors_in`."""
-    if isinstance(value, Tensor):
-        return next(tensors)
-    if isinstance(value, tuple | list):
-        return type(value)(_exchanged(part, tensors) for part in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{part.name: _exchanged(getattr(value, part.name), tensors) for part in fields(value)})
-    return value
 
 
 def _on_cpu(tensors: list[Tensor]) -> list[Tensor]:
@@ -68,9 +57,14 @@ def _on_cpu(tensors: list[Tensor]) -> list[Tensor]:
     device = tensors[0].device
     if device.type != "cuda":
         return [tensor.cpu() for tensor in tensors]
-    copies = [torch.empty(x.shape, dtype=x.dtype, pin_memory=True).copy_(x, non_blocking=True) for x in tensors]
+    copies = [pinned_place(x).copy_(x, non_blocking=True) for x in tensors]
     torch.cuda.current_stream(device).synchronize()
     return copies
+
+
+def pinned_place(tensor: Tensor) -> Tensor:
+    """Memory for a copy of a tensor, to which a GPU writes by itself. Needs a CUDA GPU."""
+    return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
 
 
 def origin(model: nn.Module, step: Callable[[], object]) -> str:
@@ -101,15 +95,3 @@ def describe(name: str) -> str:
     layer = re.match(r"(encoder|decoder)\.layers\.(\d+)", name)
     part = f"{layer[1]} layer {layer[2]}" if layer else name.split(".")[0].replace("_", " ")
     return part if part == name else f"{part} ({name})"
-
-
-def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, tuple | list):
-        for part in value:
-            yield from tensors_in(part, name)
-    elif is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from tensors_in(getattr(value, field.name), field.name)

@@ -47,6 +47,8 @@ class CalibrationEmbedding(nn.Module):
         device = next(self.layers.parameters()).device
         # In float32: half precision is too coarse for rays.
         with torch.autocast(device.type, enabled=False):
+            if len(image_from_bev) > 1:  # training clips: the device computes so many rays faster
+                image_from_bev = upload(image_from_bev, device)
             rays = ray_features(image_from_bev.flatten(0, 1), level_shapes, image_size, self.height_m)
             scale, shift = self.layers(upload(rays, device)).chunk(2, dim=-1)
             return 1 + scale, shift
@@ -70,7 +72,7 @@ def ray_features(
     focal = torch.linalg.norm(columns[0], dim=-1).reciprocal() * determinant  # of the x axis, pixels
     levels = []
     for level_rows, level_columns in level_shapes:
-        pixels = _cell_centers(level_rows, level_columns, image_size).to(matrix)  # (S_l, 3)
+        pixels = _cell_centers(level_rows, level_columns, image_size, matrix.device)  # (S_l, 3)
         rays = (bev_from_image[:, None] * pixels[:, None]).sum(-1)  # (K, S_l, 3), of depth 1 m
         above_ground = (center[:, None, 2] + height_m).clamp(min=0.1)
         to_ground = (-rays[..., 2] / above_ground).clamp(0.0, 1 / _NEAREST_M)[..., None]  # inverse depth of the ground
@@ -82,10 +84,10 @@ def ray_features(
     return torch.cat(levels, dim=1)
 
 
-def _cell_centers(rows: int, columns: int, image_size: tuple[int, int]) -> Tensor:
+def _cell_centers(rows: int, columns: int, image_size: tuple[int, int], device: torch.device) -> Tensor:
     """(rows · columns, 3) float32 homogeneous pixels of the centres of a feature map's cells."""
     height, width = image_size
-    v = (torch.arange(rows, dtype=torch.float32) + 0.5) * (height / rows)
-    u = (torch.arange(columns, dtype=torch.float32) + 0.5) * (width / columns)
+    v = (torch.arange(rows, dtype=torch.float32, device=device) + 0.5) * (height / rows)
+    u = (torch.arange(columns, dtype=torch.float32, device=device) + 0.5) * (width / columns)
     vv, uu = torch.meshgrid(v, u, indexing="ij")
     return torch.stack([uu, vv, torch.ones_like(uu)], dim=-1).flatten(0, 1)

@@ -9,6 +9,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import ClassSettings, ObjectClass, object_classes
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
@@ -153,7 +154,7 @@ class ModelConfig:
         max_gap_s: after a longer time between two frames the history is dropped.
         channels: C, of all tokens and queries.
         heads: what is computed from the BEV map; "segmentation" adds the head that `segmentation` configures.
-        backbone: the ResNet.
+        backbone: the image backbone, of the kind that its key `kind` names.
         neck: the feature pyramid network.
         image_tokens: camera and level embeddings.
         ego_motion: can-bus numbers and alignment of the history.
@@ -177,7 +178,7 @@ class ModelConfig:
     max_gap_s: float = 2.0
     channels: int = 256
     heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
-    backbone: ResNetConfig = field(default_factory=ResNetConfig)
+    backbone: ResNetConfig | EfficientNetLiteConfig = field(default_factory=ResNetConfig)
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
@@ -225,7 +226,12 @@ class ModelConfig:
     def level_shapes(self) -> LevelShapes:
         """(height, width) of each of these levels."""
         width, height = self.image.padded_size
-        strides = [2 ** (stage + 1) for stage in sorted(self.backbone.output_stages)]
+        return self.level_shapes_of((height, width))
+
+    def level_shapes_of(self, image_size: tuple[int, int]) -> LevelShapes:
+        """(height, width) of each of these levels for images of another size (height, width), pixels."""
+        height, width = image_size
+        strides = sorted(self.backbone.output_strides())
         while len(strides) < self.neck.levels:
             strides.append(2 * strides[-1])
         return tuple((-(-height // stride), -(-width // stride)) for stride in strides[: self.encoder_levels])

@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.model.upload import upload
+
 LevelShapes = tuple[tuple[int, int], ...]
 """(height, width) of each feature level, fine to coarse."""
 
@@ -214,7 +216,8 @@ def sample_maps(values: Tensor, level_shapes: LevelShapes, locations: Tensor, we
 
 def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
     """(L, 2) float32 width and height of each level, on a device."""
-    return torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32, device=device)
+    sizes = torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32)
+    return upload(sizes, device)
 
 
 def sampling_locations(reference_points: Tensor, offsets: Tensor, sizes: Tensor) -> Tensor:

@@ -1,26 +1,48 @@
 """Modulated deformable convolution, DCNv2 (Zhu et al. 2019), with one deformable group."""
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+Convolve = Callable[[Tensor, Tensor, Tensor, Tensor | None, int], Tensor]
+"""A function with the arguments and the result of `predicted_deformable_convolution`."""
+
 
 class ModulatedDeformableConvolution(nn.Module):
-    """A 3x3 convolution without bias whose nine taps are moved by predicted offsets and weighted by a mask."""
+    """A 3x3 convolution whose nine taps are moved by predicted offsets and weighted by a mask.
+
+    Attributes:
+        bias: (O,), None until a batch norm is folded into the convolution.
+        convolve: computes the result from x and what is predicted; a faster function can take its place.
+    """
+
+    bias: nn.Parameter | None
+    convolve: Convolve
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
         self.stride = stride
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3))
+        self.register_parameter("bias", None)
         self.offset_and_mask = nn.Conv2d(in_channels, 27, 3, stride, padding=1)
+        self.convolve = predicted_deformable_convolution
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
         nn.init.zeros_(self.offset_and_mask.weight)
         nn.init.zeros_(self.offset_and_mask.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, out_channels, H', W')."""
-        offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
-        return modulated_deformable_convolution(x, offsets, mask, self.weight, self.stride)
+        return self.convolve(x, self.offset_and_mask(x), self.weight, self.bias, self.stride)
+
+
+def predicted_deformable_convolution(
+    x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor | None, stride: int
+) -> Tensor:
+    """`modulated_deformable_convolution` plus bias (O,), for what is predicted; see `split_offsets_and_mask`."""
+    result = modulated_deformable_convolution(x, *split_offsets_and_mask(predicted), weight, stride)
+    return result if bias is None else result + bias[:, None, None]
 
 
 def split_offsets_and_mask(predicted: Tensor) -> tuple[Tensor, Tensor]:

@@ -111,8 +111,13 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
         rotation_deg: (B,); on the CPU it needs no wait for the history's device.
         center: see `EgoMotionConfig.history_rotation_center`.
     """
+    return turned_history(history, upload(map_rotation(rotation_deg, grid, center), history.device), grid)
+
+
+def turned_history(history: Tensor, rotation: Tensor, grid: BevGrid) -> Tensor:
+    """The part of `rotate_history` on the history's device. rotation: (B, 2, 3) of `map_rotation`."""
     rows, columns = grid.rows, grid.columns
-    row, column = _source_cells(rotation_deg, grid, center, history.device)  # (B, Y, X) each
+    row, column = _source_cells(rotation, grid)  # (B, Y, X) each
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     source = (row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)).flatten(1)  # (B, Y·X)
     batch = torch.arange(len(history), device=history.device)[:, None]
@@ -128,10 +133,8 @@ def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
     return np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
 
 
-def _source_cells(
-    rotation_deg: Tensor, grid: BevGrid, center: RotationCenter, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Row and column (B, Y, X) int64, on a device, of the old cell that each cell takes its history from.
+def map_rotation(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
+    """(B, 2, 3) float32: the columns for x and y and the translation, that turn BEV maps by rotation_deg (B,).
 
     Computed in float32 and in halves of the map, as the released code's affine grid is, so that both choose the same
     cell where a source lies midway between two.
@@ -145,10 +148,14 @@ def _source_cells(
     pivot = torch.tensor(pivot_cells, device=half.device).double() - half
     translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
     scaled = rotation.float() / half[:, None]  # (B, 2, 2)
-    affine = upload(torch.cat([scaled, translation[..., None]], dim=-1), device)  # (B, 2, 3)
-    by_x, by_y, translation = affine.unbind(-1)  # (B, 2) each
-    x = torch.arange(grid.columns, device=device) + 0.5 - grid.columns / 2  # (X,)
-    y = torch.arange(grid.rows, device=device) + 0.5 - grid.rows / 2  # (Y,)
+    return torch.cat([scaled, translation[..., None]], dim=-1)
+
+
+def _source_cells(rotation: Tensor, grid: BevGrid) -> tuple[Tensor, Tensor]:
+    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from."""
+    by_x, by_y, translation = rotation.unbind(-1)  # (B, 2) each
+    x = torch.arange(grid.columns, device=rotation.device) + 0.5 - grid.columns / 2  # (X,)
+    y = torch.arange(grid.rows, device=rotation.device) + 0.5 - grid.rows / 2  # (Y,)
     turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
     source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
     row = (((source_y + 1) * grid.rows - 1) / 2).round().long()

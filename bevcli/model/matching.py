@@ -1,9 +1,15 @@
 """Focal loss and one-to-one matching, of which the losses of all heads that find things are made."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
+
+from bevcli.model.upload import upload
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
 UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
@@ -33,6 +39,34 @@ def hungarian_matching(costs: Tensor) -> tuple[Tensor, Tensor]:
 
     costs: (Q, G) of each query and ground truth. The K = min(Q, G) pairs are on their device, sorted by query.
     """
-    finite = costs.detach().double().cpu().nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST)
-    queries, truths = (torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(finite))
+    queries, truths = (
+        torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(_finite(costs))
+    )
     return queries, truths
+
+
+def hungarian_matchings(costs: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """The assignments of many matrices at once, with one copy to the CPU and one back.
+
+    Args:
+        costs: (..., B, Q, G) of each query and ground truth.
+        counts: B numbers of ground truths; the others, up to G, are padding.
+
+    Returns (..., B, Q) int64, the ground truth of each query, and (..., B, G) int64, the query of each ground truth;
+    -1 for none.
+    """
+    *leading, queries, truths = costs.shape
+    matrices = _finite(costs).reshape(-1, queries, truths)
+    pairs = torch.full((len(matrices), queries + truths), -1)
+    numbers = pairs.numpy()
+    for index, matrix in enumerate(matrices):
+        of_queries, of_truths = linear_sum_assignment(matrix[:, : counts[index % len(counts)]])
+        numbers[index, of_queries] = of_truths
+        numbers[index, queries + of_truths] = of_queries
+    truth_of_query, query_of_truth = upload(pairs, costs.device).split([queries, truths], dim=1)
+    return truth_of_query.view(*leading, queries), query_of_truth.view(*leading, truths)
+
+
+def _finite(costs: Tensor) -> NDArray[np.float64]:
+    finite = costs.detach().cpu().double()
+    return np.asarray(finite.nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST).numpy())

@@ -16,7 +16,6 @@ from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
-from bevcli.model.resnet import ResNet
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import ClipInputs, FrameTruth, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
@@ -38,7 +37,7 @@ class Network(TemporalModel):
         super().__init__(config)
         grid, channels, levels = config.bev_grid, config.channels, config.encoder_levels
         bev_shape = (grid.rows, grid.columns)
-        self.backbone = ResNet(config.backbone)
+        self.backbone = config.backbone.build()
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         embeds_rays = config.image_tokens.calibration_embedding
@@ -120,9 +119,8 @@ class Network(TemporalModel):
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
         yield "backbone: stem", "backbone.conv1", "backbone.bn1"
-        for stage, blocks in enumerate(config.backbone.blocks):
-            kind = "deformable bottleneck" if stage + 1 in config.backbone.deformable_stages else "bottleneck"
-            yield f"backbone: stage {stage + 1}, {blocks} {kind}{'s' * (blocks > 1)}", f"backbone.stages.{stage}"
+        for stage, name in enumerate(config.backbone.stage_names()):
+            yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
         yield "neck (FPN)", "neck"
         yield "level embeddings", "image_tokens.level_embedding"
         yield "camera embeddings", "image_tokens.camera_embedding"

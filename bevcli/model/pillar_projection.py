@@ -1,5 +1,6 @@
 """Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from bevcli.model.upload import upload
 
 # Metres. A point nearer than this, or behind the camera, is not visible and is projected as if it lay at this depth.
 MIN_DEPTH = 1e-5
+OUTSIDE = -1e4  # x and y of points that lie outside every image, whatever their offsets: samples there are zero
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,24 @@ class PillarHits:
     reference_points: Tensor
     hits_per_camera: tuple[int, ...]
     cameras_per_cell: Tensor
+
+    @property
+    def is_seen(self) -> Tensor:
+        """(M,) bool: false for the hits that `padded` has added."""
+        return (self.reference_points != OUTSIDE).flatten(1).any(-1)
+
+    def padded(self, sizes: Sequence[int]) -> "PillarHits":
+        """The same hits, and behind those of each camera as many as it lacks to `sizes`, which add zeros to cells.
+
+        The added ones are spread over the cells, so that a GPU does not add all of them up in one place.
+        """
+        cell = torch.arange(sum(sizes), device=self.cell.device) % len(self.cameras_per_cell)
+        points = self.reference_points.new_full((sum(sizes), *self.reference_points.shape[1:]), OUTSIDE)
+        for found, places in ((self.cell, cell), (self.reference_points, points)):
+            parts = zip(found.split(self.hits_per_camera), places.split(list(sizes)), strict=True)
+            for of_camera, of_places in parts:
+                of_places[: len(of_camera)] = of_camera
+        return PillarHits(cell, points, tuple(sizes), self.cameras_per_cell)
 
 
 class Pillars(nn.Module):

@@ -13,16 +13,19 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
+from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
+from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
+from bevcli.model.kernels.padded_pillars import PaddedPillars
 from bevcli.model.pillar_projection import Pillars
-from bevcli.model.resnet import ResNet
+from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
@@ -36,7 +39,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
-    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `LastCall`).
+    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `LastCall`). On a
+    CUDA GPU, `TemporalModel.device_parts` are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -46,27 +50,49 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     """
     network = copy.deepcopy(model).eval().requires_grad_(False)
     network.exchange_parts()
+    for module in network.modules() if device.type != "cpu" else ():
+        if isinstance(module, Pillars):
+            add_to_class(module, PaddedPillars)
+            vars(module).update(points_on_cpu=module.points, sizes={})
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
+    if has_triton(device):
+        from bevcli.model.kernels.triton_bottleneck import FusedBottleneck  # only where Triton is installed
+
+        for module in network.modules():
+            if isinstance(module, Bottleneck):
+                add_to_class(module, FusedBottleneck)
     dtype = DTYPES[precision]
     for part in network.image_parts:
         part.to(dtype)
+        if isinstance(part, Backbone) and part.by_image and device.type == "cpu":
+            add_to_class(part, ImageByImage)
     for part in network.image_parts[:1]:
         part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
+    rounds_attention = rounds or (precision != "fp32" and device.type == "cuda")
     rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
     for name, module in list(network.named_modules()):
         if isinstance(module, Pillars | CalibrationEmbedding):
             add_to_class(module, LastCall)
-        if rounds and isinstance(module, DecoderLayer) and isinstance(module.self_attention, nn.MultiheadAttention):
-            network.set_submodule(f"{name}.self_attention", RoundedAttention(module.self_attention))
+        if (
+            rounds_attention
+            and isinstance(module, DecoderLayer)
+            and isinstance(module.self_attention, nn.MultiheadAttention)
+        ):
+            network.set_submodule(f"{name}.self_attention", RoundedAttention(module.self_attention, dtype))
         if isinstance(module, rounded):
             module.attention.value_projection.to(dtype)
             module.attention.value_dtype = dtype
         if isinstance(module, ImageTokens) and device.type == "cpu":
             add_to_class(module, TokensInBlocks)
     _check_finite(network)
+    if device.type == "cuda":
+        network.stages = {"": "model"} if network.device_parts else network.stages  # a graph has no stages
+        for name in network.device_parts:
+            captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
+            setattr(network, name, captured)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)
         loaded = threading.Event()
@@ -86,6 +112,15 @@ def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
     module.__class__ = type(type(module).__name__, (addition, type(module)), {})
 
 
+class ImageByImage(nn.Module):
+    """Added to a backbone that runs on one image at a time."""
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """As `Backbone.forward`."""
+        each = [super(ImageByImage, self).forward(image) for image in images.split(1)]
+        return [torch.cat(maps) for maps in zip(*each, strict=True)]
+
+
 def _check_finite(model: nn.Module) -> None:
     """Raises WeightsError for a folded or cast weight with NaN or infinity: oneDNN's ReLU would turn it into zeros."""
     for name, parameter in model.named_parameters():
@@ -97,15 +132,15 @@ def _check_finite(model: nn.Module) -> None:
 
 
 class RoundedAttention(nn.Module):
-    """A multi-head attention that computes in bfloat16, for queries, keys and values in float32."""
+    """A multi-head attention that computes in a half precision, for queries, keys and values in float32."""
 
-    def __init__(self, attention: nn.MultiheadAttention) -> None:
+    def __init__(self, attention: nn.MultiheadAttention, dtype: torch.dtype) -> None:
         super().__init__()
-        self.attention = attention.to(torch.bfloat16)
+        self.attention, self.dtype = attention.to(dtype), dtype
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
         """As `nn.MultiheadAttention.forward` without weights."""
-        rounded = (tensor.to(torch.bfloat16) for tensor in (query, key, value))
+        rounded = (tensor.to(self.dtype) for tensor in (query, key, value))
         return self.attention(*rounded, need_weights=need_weights)[0].float(), None
 
 

@@ -1,12 +1,13 @@
 """ResNet (He et al. 2016) with bottlenecks: the image backbone."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.model.backbone import Backbone
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 
@@ -20,13 +21,17 @@ class ResNetConfig:
         output_stages: the stages (1 to 4) whose maps go to the neck.
         deformable_stages: the stages whose 3x3 convolutions are modulated deformable convolutions (DCNv2).
         width: channels of the stem; stage s has 4 · width · 2^(s - 1) output channels.
+        kind: chooses this backbone.
     """
+
+    title: ClassVar[str] = "ResNet"
 
     blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
     style: Literal["pytorch", "caffe"] = "pytorch"
     output_stages: tuple[int, ...] = (4,)
     deformable_stages: tuple[int, ...] = ()
     width: int = 64
+    kind: Literal["resnet"] = "resnet"
 
     def __post_init__(self) -> None:
         stages = self.output_stages + self.deformable_stages
@@ -39,20 +44,26 @@ class ResNetConfig:
         """Channels of the map of each output stage."""
         return tuple(4 * self.width * 2 ** (stage - 1) for stage in self.output_stages)
 
+    def output_strides(self) -> tuple[int, ...]:
+        """Pixels of the image per cell of the map of each output stage."""
+        return tuple(2 ** (stage + 1) for stage in self.output_stages)
 
-class ResNet(nn.Module):
-    """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32.
+    def stage_names(self) -> Iterator[str]:
+        """Each stage in words."""
+        for number, blocks in enumerate(self.blocks, 1):
+            kind = "deformable bottleneck" if number in self.deformable_stages else "bottleneck"
+            yield f"{blocks} {kind}{'s' * (blocks > 1)}"
 
-    Attributes:
-        output_stages: the stages (1 to 4) whose maps are returned.
-        frozen_maps: computes the maps of the first stages in place of the stem and these stages, during a training
-            that keeps their weights.
-    """
+    def build(self) -> "ResNet":
+        """The backbone, with random weights."""
+        return ResNet(self)
+
+
+class ResNet(Backbone):
+    """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32."""
 
     def __init__(self, config: ResNetConfig) -> None:
-        super().__init__()
-        self.output_stages = config.output_stages
-        self.frozen_maps: Callable[[Tensor], list[Tensor]] | None = None
+        super().__init__(config.output_stages)
         width = config.width
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
@@ -60,24 +71,10 @@ class ResNet(nn.Module):
         self.stages = nn.ModuleList(_stage(number, config) for number in range(1, max(config.output_stages) + 1))
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
-    def freeze(self, stages: int) -> None:
-        """Keeps the weights of the stem and of so many first stages in a training; with 0 nothing is frozen."""
-        for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else []:
-            part.requires_grad_(False)
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / 2^(s+1), W / 2^(s+1)) for each output stage."""
-        maps: list[Tensor] = []
-        if self.frozen_maps is not None:
-            maps = self.frozen_maps(images)
-            x = maps[-1]
-        else:
-            # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times the cells.
-            x = F.relu(self.pool(self.bn1(self.conv1(images))))
-        for blocks in self.stages[len(maps) :]:
-            x = blocks(x)
-            maps.append(x)
-        return [maps[stage - 1] for stage in self.output_stages]
+    def stem(self, images: Tensor) -> Tensor:
+        """images: (B, 3, H, W) -> (B, width, H / 4, W / 4)."""
+        # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times the cells.
+        return F.relu(self.pool(self.bn1(self.conv1(images))))
 
 
 class Bottleneck(nn.Module):

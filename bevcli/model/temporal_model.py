@@ -35,6 +35,8 @@ class TemporalModel(nn.Module):
         official_names: patterns of key names in the released weights file, and ours; see `from_official`.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
         has_parts: the network has the parts of `bevcli.model.network.Network`, which probes and figures look into.
+        device_parts: names of the methods that are pure functions of tensors on the device: no wait for it, no upload,
+            no shape that depends on a tensor's numbers. On a CUDA GPU each becomes a CUDA graph.
         figures: of `bevcli explain`, as texts "module:attribute", each of a dict of functions by step. () for none.
         config: of the model.
     """
@@ -44,6 +46,7 @@ class TemporalModel(nn.Module):
     official_names: ClassVar[tuple[tuple[str, Any], ...]] = ()
     stages: Mapping[str, str] = {}
     has_parts: bool = False
+    device_parts: ClassVar[tuple[str, ...]] = ()
     figures: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:

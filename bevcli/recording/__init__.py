@@ -8,6 +8,7 @@
     log_boxes       boxes and ground truth in 3D, from above and on the street map; misses and false positives
     log_tracks      a trail for each track
     log_bev         BEV features as images, segmentation, history, probed cells
+    components      the rows of all these as Arrow arrays
     colors          the colours of classes and states
 
 `bevcli.viewer` reads and shows recordings; nothing here imports it.

@@ -1,5 +1,6 @@
 """The edges of 3D boxes in a camera's image, and labels of boxes that do not overlap."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
+from bevcli.recording.components import Components, components, ui_points
 
 NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
@@ -23,7 +25,7 @@ class ImageLines:
 
     Attributes:
         segments: (M, 2, 2) start and end of each line, pixels, inside the image.
-        owners: (M,) the index of the box that each line belongs to.
+        owners: (M,) the index of the box that each line belongs to; the lines of a box follow each other.
     """
 
     segments: Array
@@ -35,22 +37,39 @@ def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> 
 
     camera_from_boxes: (4, 4) from the boxes' frame to the camera frame at the image's time.
     """
-    corners = apply(camera_from_boxes, boxes.corners())  # (N, 8, 3)
-    before = np.flatnonzero((corners[..., 2] >= NEAR_CLIP_M).any(-1))
-    edges = corners[before][:, _EDGES]  # (N', 14, 2, 3)
-    owners = np.repeat(before, len(_EDGES))
-    return cut_to_image(edges.reshape(-1, 2, 3), owners, camera)
+    return lines_in_images(boxes, [camera], [camera_from_boxes])[0]
 
 
-def cut_to_image(ends: Array, owners: NDArray[np.int64], camera: Camera) -> ImageLines:
-    """The parts inside the image of lines (M, 2, 3) in the camera frame, with their owners (M,)."""
+def lines_in_images(boxes: Boxes3D, cameras: Sequence[Camera], cameras_from_boxes: Sequence[Array]) -> list[ImageLines]:
+    """As `lines_in_image`, in the image of each of C cameras."""
+    corners = boxes.corners()
+    of_cameras = np.stack([apply(camera_from_boxes, corners) for camera_from_boxes in cameras_from_boxes])
+    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1))
+    edges = of_cameras[camera, before][:, _EDGES]  # (K, 14, 2, 3)
+    counts = np.bincount(camera, minlength=len(cameras)) * len(_EDGES)
+    return cut_to_images(edges.reshape(-1, 2, 3), np.repeat(before, len(_EDGES)), counts, cameras)
+
+
+def cut_to_images(
+    ends: Array, owners: NDArray[np.int64], counts: NDArray[np.int64], cameras: Sequence[Camera]
+) -> list[ImageLines]:
+    """The parts inside the images of lines (M, 2, 3) with their owners (M,).
+
+    counts: (C,) how many of the lines, one camera after the other, are in the frame of each camera.
+    """
     ends, kept = clip_near(ends)
-    ends, owners = ends[kept], owners[kept]
-    if camera.distortion is not None:
-        ends, owners = _cut(ends), np.repeat(owners, PIECES_PER_EDGE)
-    pixels, _ = camera.project(ends)
-    segments, inside = clip_to_image(pixels, camera.width, camera.height)
-    return ImageLines(segments[inside], owners[inside])
+    own_counts = np.bincount(np.repeat(np.arange(len(cameras)), counts)[kept], minlength=len(cameras))
+    places = np.cumsum(own_counts)[:-1]
+    own_ends, own_owners = np.split(ends[kept], places), np.split(owners[kept], places)
+    for i, camera in enumerate(cameras):
+        if camera.distortion is not None:
+            own_ends[i], own_owners[i] = _cut(own_ends[i]), np.repeat(own_owners[i], PIECES_PER_EDGE)
+    pixels = [camera.project(own)[0] for camera, own in zip(cameras, own_ends, strict=True)]
+    sizes = np.repeat([(camera.width, camera.height) for camera in cameras], [len(own) for own in pixels], axis=0)
+    segments, inside = clip_to_image(np.concatenate(pixels), *sizes.T)
+    places = np.cumsum([len(own) for own in pixels])[:-1]
+    parts = zip(*(np.split(whole, places) for whole in (segments, inside)), own_owners, strict=True)
+    return [ImageLines(own[shown], owner[shown]) for own, shown, owner in parts]
 
 
 def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -63,14 +82,14 @@ def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.where(before[..., None], ends, cut[:, None]), np.asarray(before.any(-1))
 
 
-def clip_to_image(segments: Array, width: int, height: int) -> tuple[Array, NDArray[np.bool_]]:
+def clip_to_image(segments: Array, width: ArrayLike, height: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Lines (M, 2, 2) in pixels, cut at the image's border, and which of them (M,) are inside (Liang and Barsky).
 
-    A line whose start or end is NaN counts as outside.
+    A line whose start or end is NaN counts as outside. width, height: of the image, or (M,) of the image of each line.
     """
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
     slope = np.concatenate([-step, step], axis=-1)  # (M, 4): against left, top, right, bottom
-    room = np.concatenate([start, np.array([width, height]) - start], axis=-1)
+    room = np.concatenate([start, np.stack([width, height], axis=-1) - start], axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = room / slope
     enter = np.max(np.where(slope < 0, share, 0.0), axis=-1, initial=0.0)
@@ -91,12 +110,13 @@ LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 # Of the image's width and height, for a view that is a third of the screen wide.
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
-UNSEEN = rr.Radius.ui_points(0.01)  # of a point that shows only its label
+UNSEEN = ui_points(0.01)  # of a point that shows only its label
 
 
-def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> rr.Points2D:
+def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> Components:
     """Texts at places (L, 2), in the units of their view. options: of `rr.Points2D`."""
-    return rr.Points2D(places, labels=texts, radii=UNSEEN, show_labels=True, **options)
+    positions = np.asarray(places)
+    return components(rr.Points2D, positions=positions, labels=texts, radii=UNSEEN, show_labels=True, **options)
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
@@ -140,10 +160,10 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
 
 def _by_height(lines: ImageLines) -> list[tuple[int, Array, Array]]:
     """Each box in the image with its bounding rectangle's corners (2,), (2,), the highest rectangle first."""
-    around = []
-    for owner in np.unique(lines.owners):
-        points = lines.segments[lines.owners == owner].reshape(-1, 2)
-        around.append((int(owner), points.min(0), points.max(0)))
+    owners, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
+    low = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
+    high = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
+    around = list(zip(owners.tolist(), low, high, strict=True))
     return sorted(around, key=lambda item: item[1][1] - item[2][1])
 
 

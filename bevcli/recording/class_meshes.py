@@ -14,6 +14,7 @@ from bevcli.geometry.object_classes import ObjectClass
 from bevcli.parsing.files import open_regular
 from bevcli.recording import entities
 from bevcli.recording.colors import Color, class_colors
+from bevcli.recording.components import components
 from bevcli.recording.log_boxes import quaternions
 from bevcli.recording.mesh_file import Mesh, read_mesh
 
@@ -60,7 +61,8 @@ def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mappin
     for name in (name for name, one in classes.items() if one.mesh):
         own = boxes[boxes.classes == name]
         # The last one has no size: an entity without poses would show its mesh at the origin.
-        poses = rr.InstancePoses3D(
+        poses = components(
+            rr.InstancePoses3D,
             translations=np.append(own.centers, [[0, 0, 0]], axis=0),
             quaternions=np.append(quaternions(own), [[0, 0, 0, 1]], axis=0),
             scales=np.append(own.sizes_lwh, [[0, 0, 0]], axis=0),

@@ -72,7 +72,7 @@ def line_colors(classes: Iterable[str]) -> dict[str, Color]:
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
     """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
     indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
-    return _table(name)[indices]
+    return _table(name).take(indices, axis=0)
 
 
 @cache

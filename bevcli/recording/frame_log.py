@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
@@ -15,6 +16,7 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.components import any_values, components, packed
 from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import CameraImages, PosedCamera
@@ -51,7 +53,8 @@ class FrameLog:
         self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
-        self._pillars: Array | None = None
+        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # positions (cells, Z, 3), and packed colours
+        self._object_classes = recorded.model.config.object_classes
         self._images = CameraImages(stream, as_video=self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
         self._bev_images = BevImages(self._options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
@@ -83,7 +86,8 @@ class FrameLog:
         self._log_results(prediction, cameras)
         if self._kept.world_from_ego is None:
             log_static.log_curve_names(self._stream, prediction.stage_seconds, self._recorded.classes)
-        self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
+        seconds = np.array(list(prediction.stage_seconds.values()))
+        self._stream.log(entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
         self._log_frame_events(frame, prediction)
         if self._options.shows_internals:
             self._log_internals(frame, prediction, cameras)
@@ -110,7 +114,7 @@ class FrameLog:
         self._stream.log(
             entities.EGO,
             log_cameras.transform(pose),
-            rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
+            any_values(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
         if self._recorded.drive.has_ego_motion:
             log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
@@ -120,8 +124,10 @@ class FrameLog:
             log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
             poses = (before, frame.world_from_ego)
-            piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
-            self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
+            piece = np.array([[self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]])
+            self._stream.log(
+                entities.TRAJECTORY, components(rr.LineStrips3D, strips=piece, colors=EGO_COLOR, radii=0.06)
+            )
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
@@ -157,17 +163,16 @@ class FrameLog:
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
-        log_class_meshes(stream, in_world, self._recorded.model.config.object_classes)
+        log_class_meshes(stream, in_world, self._object_classes)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
         log_tracks(stream, self._kept.tracks, in_world, frame.stamp, inverse(world_from_bev), names)
         if self._geo_origin is not None:
             in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
         colors, texts = log_boxes.box_colors(shown, names), box_labels(shown)
-        for posed in cameras:
-            log_cameras.log_boxes_in_image(stream, posed, in_world, colors, texts)
-        counts = [float((shown.classes == name).sum()) for name in names]
-        stream.log(entities.BOX_CURVES, rr.Scalars(counts))
+        log_cameras.log_boxes_in_images(stream, cameras, in_world, colors, texts)
+        counts = np.array([(shown.classes == name).sum() for name in names])
+        stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
     def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
         """Writes lines of the map, futures and planned paths of a model that has further results."""
@@ -189,8 +194,7 @@ class FrameLog:
         colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
         log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
-        for posed in cameras:
-            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
+        log_cameras.log_ground_truth_in_images(self._stream, cameras, in_world, colors)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in WARNINGS:
@@ -226,10 +230,11 @@ class FrameLog:
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
-            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
-        colors = log_static.pillar_colors(prediction.grid, len(self._pillars))
-        points = apply(self._world_from_bev(prediction), self._pillars.reshape(-1, 3))
+            drawn = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
+            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, drawn)
+            self._pillars = drawn, packed(log_static.pillar_colors(prediction.grid, len(drawn)))
+        pillars, colors = self._pillars
+        points = apply(self._world_from_bev(prediction), pillars.reshape(-1, 3))
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)

@@ -11,9 +11,10 @@ from bevcli.frame import FrameResult, Ground, MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import cut_to_image
+from bevcli.recording.box_lines import cut_to_images
 from bevcli.recording.colors import EGO_COLOR, Color, line_colors
-from bevcli.recording.log_boxes import box_colors, line_strips
+from bevcli.recording.components import components, line_strips, ui_points
+from bevcli.recording.log_boxes import box_colors
 from bevcli.recording.log_cameras import PosedCamera
 
 FUTURES = "futures"
@@ -127,23 +128,27 @@ def log_ground_lines(
     stream: rr.RecordingStream, lines: GroundLines, world_from_bev: Array, cameras: Sequence[PosedCamera]
 ) -> None:
     """Writes lines in the recording's world; without any, those of the frame before are cleared."""
-    colors, radii = list(lines.colors) or None, rr.Radius.ui_points(lines.width)
+    colors = np.array(lines.colors, np.uint8) if len(lines.colors) else None
+    radii = ui_points(lines.width)
     in_space = line_strips([strip + ABOVE_GROUND for strip in lines.strips], 3)
-    stream.log(f"{entities.WORLD}/{lines.kind}", rr.LineStrips3D(in_space, colors=colors, radii=radii))
+    solid = components(rr.LineStrips3D, strips=in_space, colors=colors, radii=radii)
+    stream.log(f"{entities.WORLD}/{lines.kind}", solid)
     bev_from_world = inverse(world_from_bev)
     flat = line_strips([apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in lines.strips], 2)
-    stream.log(f"{entities.BEV}/{lines.kind}", rr.LineStrips2D(flat, colors=colors, radii=radii, draw_order=24))
-    for posed in cameras:
-        _log_in_image(stream, lines, posed)
+    from_above = components(rr.LineStrips2D, strips=flat, colors=colors, radii=radii, draw_order=24)
+    stream.log(f"{entities.BEV}/{lines.kind}", from_above)
+    _log_in_images(stream, lines, cameras)
 
 
-def _log_in_image(stream: rr.RecordingStream, lines: GroundLines, posed: PosedCamera) -> None:
+def _log_in_images(stream: rr.RecordingStream, lines: GroundLines, cameras: Sequence[PosedCamera]) -> None:
     pieces = [np.stack([strip[:-1], strip[1:]], axis=1) for strip in lines.strips]
+    ends = np.concatenate([np.zeros((0, 2, 3)), *pieces])
     owners = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
-    ends = apply(posed.camera_from_world, np.concatenate([np.zeros((0, 2, 3)), *pieces]))
-    found = cut_to_image(ends, owners, posed.camera)
-    colors = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4)[found.owners]
-    strips = rr.LineStrips2D(
-        found.segments.astype(np.float32), colors=colors, radii=rr.Radius.ui_points(lines.width), draw_order=15
-    )
-    stream.log(entities.overlay(posed.name, lines.kind), strips)
+    of_cameras = np.concatenate([apply(posed.camera_from_world, ends) for posed in cameras])
+    counts = np.full(len(cameras), len(ends))
+    parts = cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, [posed.camera for posed in cameras])
+    own_colors, radii = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4), ui_points(lines.width)
+    for posed, found in zip(cameras, parts, strict=True):
+        colors = own_colors[found.owners]
+        strips = components(rr.LineStrips2D, strips=found.segments, colors=colors, radii=radii, draw_order=15)
+        stream.log(entities.overlay(posed.name, lines.kind), strips)

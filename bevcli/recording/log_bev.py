@@ -13,6 +13,7 @@ from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND, Color, colormap, map_colors
+from bevcli.recording.components import Components, blob, components, rgb_format, ui_points
 
 Features = NDArray[np.float32]
 FITTED_ON = 2  # frames
@@ -129,8 +130,9 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
 
     image: (rows, columns, 3) RGB; the first row has the largest y.
     """
-    stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid))
-    stream.log(entities.BEV_ON_GROUND, _on_ground(image, grid, ego_from_bev, GROUND_OPACITY))
+    painted = _Painted(image)
+    stream.log(entities.BEV_FEATURES, painted.flat(grid, draw_order=-10))
+    stream.log(entities.BEV_ON_GROUND, painted.on_ground(grid, ego_from_bev, GROUND_OPACITY))
 
 
 def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
@@ -139,9 +141,9 @@ def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_
     contents = replace(segmentation, cells=np.arange(256, dtype=np.uint8))
     for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
         palette[contents.layer(name)] = color
-    colors = palette[segmentation.cells]
-    stream.log(entities.BEV_SEGMENTATION, rr.Image(colors, draw_order=-5), _placed(colors, segmentation))
-    stream.log(entities.SEGMENTATION_ON_GROUND, _on_ground(colors, segmentation, ego_from_bev, 255))
+    painted = _Painted(palette.take(segmentation.cells, axis=0))
+    stream.log(entities.BEV_SEGMENTATION, painted.flat(segmentation, draw_order=-5))
+    stream.log(entities.SEGMENTATION_ON_GROUND, painted.on_ground(segmentation, ego_from_bev, 255))
 
 
 def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid) -> None:
@@ -152,8 +154,7 @@ def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid)
     if weight is None:
         stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
         return
-    image = colormap(weight[::-1], "viridis")
-    stream.log(entities.BEV_HISTORY, rr.Image(image, draw_order=-8), _placed(image, grid))
+    stream.log(entities.BEV_HISTORY, _Painted(colormap(weight[::-1], "viridis")).flat(grid, draw_order=-8))
 
 
 def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_bev: Array, grid: BevGrid) -> None:
@@ -161,7 +162,7 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     if not probes:
         return
     centers = np.array([probe.cell_center for probe in probes])
-    dots = rr.Points2D(centers * (1, -1), colors=PROBE_COLOR, radii=rr.Radius.ui_points(5.0), draw_order=50)
+    dots = components(rr.Points2D, positions=centers * (1, -1), colors=PROBE_COLOR, radii=ui_points(5.0), draw_order=50)
     stream.log(entities.BEV_PROBES, dots)
     low, high = grid.pillar_heights()[[0, -1]]
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
@@ -169,20 +170,30 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=PROBE_COLOR, radii=0.05))
 
 
-def _placed(image: NDArray[np.uint8], area: BevGrid | BevMap) -> rr.Transform3D:
-    (rows, columns), x_range, y_range = image.shape[:2], area.x_range_m, area.y_range_m
-    cell = [(x_range[1] - x_range[0]) / columns, (y_range[1] - y_range[0]) / rows, 1.0]
-    return rr.Transform3D(translation=[x_range[0], -y_range[1], 0], scale=cell)
+class _Painted:
+    """An image (rows, columns, 3) RGB of the bev frame, whose first row has the largest y, for several entities."""
 
+    def __init__(self, image: NDArray[np.uint8]) -> None:
+        self._rows, self._columns = image.shape[:2]
+        self._bytes, self._format = blob(image), rgb_format(self._columns, self._rows)
 
-def _on_ground(image: NDArray[np.uint8], area: BevGrid | BevMap, ego_from_bev: Array, opacity: int) -> rr.Mesh3D:
-    """An image of the bev frame, whose first row has the largest y, as a rectangle on the ground of the ego frame."""
-    corners = apply(ego_from_bev, rectangle(area.x_range_m, area.y_range_m))
-    corners[:, 2] = -BELOW_GROUND_M
-    return rr.Mesh3D(
-        vertex_positions=corners,
-        triangle_indices=[[0, 1, 2], [0, 2, 3]],
-        vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
-        albedo_texture=image,
-        albedo_factor=[255, 255, 255, opacity],
-    )
+    def flat(self, area: BevGrid | BevMap, draw_order: float) -> Components:
+        """The image in the BEV view."""
+        (left, right), (low, high) = area.x_range_m, area.y_range_m
+        cell = ((right - left) / self._columns, (high - low) / self._rows, 1.0)
+        placed = components(rr.Transform3D, translation=(left, -high, 0), scale=cell)
+        return components(rr.Image, buffer=self._bytes, format=self._format, draw_order=draw_order) + placed
+
+    def on_ground(self, area: BevGrid | BevMap, ego_from_bev: Array, opacity: int) -> Components:
+        """The image as a rectangle on the ground of the ego frame."""
+        corners = apply(ego_from_bev, rectangle(area.x_range_m, area.y_range_m))
+        corners[:, 2] = -BELOW_GROUND_M
+        return components(
+            rr.Mesh3D,
+            vertex_positions=corners,
+            triangle_indices=((0, 1, 2), (0, 2, 3)),
+            vertex_texcoords=((0, 1), (1, 1), (1, 0), (0, 0)),
+            albedo_texture_buffer=self._bytes,
+            albedo_texture_format=self._format,
+            albedo_factor=(255, 255, 255, opacity),
+        )

@@ -1,6 +1,6 @@
 """Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from bevcli.recording.colors import (
     Color,
     index_color,
 )
+from bevcli.recording.components import any_values, components, line_strips, ui_points
 
 MATCH_DISTANCE_M = DetectionConfig().error_distance_m
 
@@ -89,18 +90,8 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     return is_true, is_found
 
 
-def line_strips(strips: Sequence[Array], dimensions: int) -> pa.Array:
-    """Strips (points, 2 or 3) for `rr.LineStrips2D` or `rr.LineStrips3D`, which convert a list strip by strip."""
-    batch = rr.components.LineStrip2DBatch if dimensions == 2 else rr.components.LineStrip3DBatch
-    kind = batch._ARROW_DATATYPE
-    offsets = np.cumsum([0, *map(len, strips)], dtype=np.int32)
-    numbers = np.concatenate([np.zeros((0, dimensions)), *strips]).astype(np.float32).ravel()
-    points = pa.FixedSizeListArray.from_arrays(pa.array(numbers), type=kind.value_type)
-    return pa.ListArray.from_arrays(pa.array(offsets), points, type=kind)
-
-
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
-THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
+THIN, THICK = ui_points(0.8), ui_points(1.6)
 
 
 def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
@@ -116,24 +107,25 @@ def log_boxes_3d(
 
     boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
-    ids = [1 + list(classes).index(name) if name in classes else 0 for name in boxes.classes.tolist()]
+    places = {name: place for place, name in enumerate(classes, 1)}
+    ids = np.array([places.get(name, 0) for name in boxes.classes.tolist()])
     labels = labels_in_scene(boxes, ego_xy)
-    archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
+    row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
     track = {} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}
-    facts = rr.AnyValues(
+    facts = any_values(
         score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
         name=_names(boxes),
         **track,
     )
-    stream.log(entities.BOXES, archetype, facts)
+    stream.log(entities.BOXES, row, facts)
     moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
     vectors, colors = np.column_stack([moving.velocities, np.zeros(len(moving))]), box_colors(moving, classes)
-    arrows = rr.Arrows3D(vectors=vectors, origins=moving.centers, colors=colors, radii=rr.Radius.ui_points(1.2))
+    arrows = components(rr.Arrows3D, vectors=vectors, origins=moving.centers, colors=colors, radii=ui_points(1.2))
     stream.log(entities.VELOCITY, arrows)
     for entity, strips, color in zip((entities.FALSE_BOXES, entities.DUPLICATES), *_marks(boxes, marks), strict=True):
-        stream.log(entity, rr.LineStrips3D(strips, colors=color, radii=THICK))
+        stream.log(entity, components(rr.LineStrips3D, strips=strips, colors=color, radii=THICK))
 
 
 def other_classes(truth: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
@@ -157,30 +149,34 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
     """
     pale = _with_alpha(colors[found], 150)
     for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
-        archetype = rr.Boxes3D(**_shape(truth[chosen]), colors=color, radii=THIN)
-        stream.log(entity, archetype, rr.AnyValues(name=_names(truth[chosen])))
+        row = components(rr.Boxes3D, **_shape(truth[chosen]), colors=color, radii=THIN)
+        stream.log(entity, row, any_values(name=_names(truth[chosen])))
 
 
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, classes)
     doubled = np.concatenate([colors, colors])
-    stream.log(entities.BEV_BOXES, rr.LineStrips2D(footprints(boxes), colors=doubled, radii=THICK, draw_order=30))
+    outlines = components(rr.LineStrips2D, strips=footprints(boxes), colors=doubled, radii=THICK, draw_order=30)
+    stream.log(entities.BEV_BOXES, outlines)
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
     vectors, origins = boxes.velocities[moving] * (1, -1), boxes.centers[moving, :2] * (1, -1)
-    radius = rr.Radius.ui_points(1.0)
-    arrows = rr.Arrows2D(vectors=vectors, origins=origins, colors=colors[moving], radii=radius, draw_order=31)
+    radius = ui_points(1.0)
+    arrows = components(
+        rr.Arrows2D, vectors=vectors, origins=origins, colors=colors[moving], radii=radius, draw_order=31
+    )
     stream.log(entities.BEV_VELOCITY, arrows)
     for entity, strips, color in zip((entities.BEV_FALSE, entities.BEV_DUPLICATES), *_marks(boxes, marks), strict=True):
         flat = (strips[..., :2] * (1, -1)).astype(np.float32)
-        stream.log(entity, rr.LineStrips2D(flat, colors=color, radii=THIN, draw_order=32))
+        stream.log(entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
 def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
     """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        stream.log(entity, rr.LineStrips2D(footprints(truth[chosen]), colors=doubled, radii=THIN, draw_order=20))
+        strips = footprints(truth[chosen])
+        stream.log(entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
 def _with_alpha(colors: np.ndarray, alpha: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,12 +13,13 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_image
+from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_images
 from bevcli.recording.colors import colormap
+from bevcli.recording.components import Components, blob, components, ui_points
 from bevcli.recording.video_images import Av1Encoder
 
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
-POINT = rr.Radius.ui_points(2.0)
+POINT = ui_points(2.0)
 
 
 @dataclass(frozen=True)
@@ -37,15 +39,16 @@ class PosedCamera:
         """The camera's name."""
         return self.camera.name
 
-    @property
+    @cached_property
     def camera_from_world(self) -> Array:
         """(4, 4) from the recording's world."""
         return inverse(self.world_from_camera)
 
 
-def transform(parent_from_entity: Array) -> rr.Transform3D:
+def transform(parent_from_entity: Array) -> Components:
     """The pose (4, 4) of an entity in its parent, for a recording."""
-    return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
+    columns = parent_from_entity[:3, :3].T
+    return components(rr.Transform3D, translation=parent_from_entity[:3, 3], mat3x3=columns)
 
 
 class CameraImages:
@@ -78,50 +81,53 @@ class CameraImages:
             encoder.close()
 
 
-def _encoded(image: CameraImage) -> rr.EncodedImage:
+def _encoded(image: CameraImage) -> Components:
     contents, media_type = image.encoded, image.media_type
     if contents is None or media_type is None:
         _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         contents, media_type = data.tobytes(), "image/jpeg"
-    return rr.EncodedImage(contents=contents, media_type=media_type)
+    return components(rr.EncodedImage, blob=blob(contents), media_type=media_type)
 
 
-def log_boxes_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, colors: np.ndarray, texts: list[str]
+def log_boxes_in_images(
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], boxes: Boxes3D, colors: np.ndarray, texts: list[str]
 ) -> None:
-    """Draws predicted boxes (in the recording's world) into the image: lines and labels.
+    """Draws predicted boxes (in the recording's world) into the images: lines and labels.
 
     colors: (N, 3) uint8. texts: the label of each box.
     """
-    name = posed.name
-    lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
-    stream.log(entities.overlay(name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-    places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
-    labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-    stream.log(entities.overlay(name, "boxes/labels"), labels)
+    for posed, lines in zip(cameras, _lines_of(boxes, cameras), strict=True):
+        stream.log(entities.overlay(posed.name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
+        places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
+        labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
+        stream.log(entities.overlay(posed.name, "boxes/labels"), labels)
 
 
-def log_ground_truth_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, colors: np.ndarray
+def log_ground_truth_in_images(
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], truth: Boxes3D, colors: np.ndarray
 ) -> None:
-    """Draws ground-truth boxes (in the recording's world) into the image. colors: (M, 3) uint8."""
-    lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
-    stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
+    """Draws ground-truth boxes (in the recording's world) into the images. colors: (M, 3) uint8."""
+    for posed, lines in zip(cameras, _lines_of(truth, cameras), strict=True):
+        stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
 
 
-def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> rr.LineStrips2D:
-    segments, radii = lines.segments.astype(np.float32), rr.Radius.ui_points(width)
-    return rr.LineStrips2D(segments, colors=colors[lines.owners], radii=radii, draw_order=draw_order)
+def _lines_of(boxes: Boxes3D, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
+    return lines_in_images(boxes, [one.camera for one in cameras], [one.camera_from_world for one in cameras])
+
+
+def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:
+    own, radii = colors[lines.owners], ui_points(width)
+    return components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=radii, draw_order=draw_order)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
     """Draws the projections of 3D reference points into the image, where they are inside of it.
 
-    points_world: (K, 3) in the recording's world, metres. colors: (K, 3) uint8 RGB.
+    points_world: (K, 3) in the recording's world, metres. colors: (K,) of `packed`.
     """
     pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
     hits = posed.camera.contains(pixels, depth)
-    points = rr.Points2D(pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
+    points = components(rr.Points2D, positions=pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
     stream.log(entities.overlay(posed.name, "pillars"), points)
 
 

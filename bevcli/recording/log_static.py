@@ -27,6 +27,7 @@ from bevcli.recording.colors import (
     line_colors,
     map_colors,
 )
+from bevcli.recording.components import components
 from bevcli.recording.mesh_file import Mesh
 from bevcli.recording.recorded import Recorded
 from bevcli.recording.vehicle import VehicleMesh, default_vehicle
@@ -119,9 +120,9 @@ def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: 
 def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
     """Writes the vehicle's speed: a curve, and a label above the vehicle in the scene."""
     km_h = 3.6 * speed_m_s
-    stream.log(entities.SPEED_CURVE, rr.Scalars(km_h))
-    label = rr.Points3D([SPEED_LABEL_M], labels=f"{km_h:.0f} km/h", colors=EGO_COLOR, radii=UNSEEN, show_labels=True)
-    stream.log(entities.SPEED, label)
+    stream.log(entities.SPEED_CURVE, components(rr.Scalars, scalars=np.array([km_h])))
+    facts = {"labels": [f"{km_h:.0f} km/h"], "colors": EGO_COLOR, "radii": UNSEEN, "show_labels": True}
+    stream.log(entities.SPEED, components(rr.Points3D, positions=np.array([SPEED_LABEL_M]), **facts))
 
 
 def drawn_pillars(grid: BevGrid, *, all_cells: bool = False) -> Array:

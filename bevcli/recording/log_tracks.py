@@ -11,14 +11,15 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
 from bevcli.recording.colors import Color
-from bevcli.recording.log_boxes import THIN, box_colors, line_strips
+from bevcli.recording.components import Components, any_values, components, line_strips, ui_points
+from bevcli.recording.log_boxes import THIN, box_colors
 
 PAST_S = 5.0  # length of a trail
 AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
 LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
 PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
 ABOVE_GROUND_M = 0.05
-WIDTH = rr.Radius.ui_points(1.2)
+WIDTH = ui_points(1.2)
 
 
 @dataclass
@@ -79,7 +80,7 @@ def log_tracks(
     history.add(boxes, stamp)
     ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
     shown: set[str] = set()
-    flat, flat_colors = [], []
+    drawn, flat_colors = [], []
     for i, name in enumerate(track_names(boxes)):
         if not name:
             continue
@@ -87,15 +88,19 @@ def log_tracks(
         past = np.array(history.positions[name])  # (K, 3)
         trail = [past] if len(past) > 1 else []
         own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
-        style: tuple[rr.AsComponents, ...] = ()
+        style: Components = []
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
-            style = rr.LineStrips3D.from_fields(colors=own_colors, radii=WIDTH), rr.AnyValues(track=name)
+            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=WIDTH)
+            style = of_lines + any_values(track=name)
         strips = line_strips([ahead[i], outlines[i], *trail], 3)
-        stream.log(entity, rr.LineStrips3D.from_fields(strips=strips), *style)
+        stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)
         shown.add(entity)
-        flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
+        drawn += [ahead[i], *trail]
         flat_colors += own_colors[:: 2 if trail else 3]
-    trails = rr.LineStrips2D(line_strips(flat, 2), colors=flat_colors or None, radii=THIN, draw_order=25)
+    of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
+    flat = apply(bev_from_world, np.concatenate([np.zeros((0, 3)), *drawn]))[:, :2] * (1, -1)
+    strips = line_strips(np.split(flat, np.cumsum([len(strip) for strip in drawn])[:-1]) if drawn else (), 2)
+    trails = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
     stream.log(entities.BEV_TRACKS, trails)
     for entity in set(history.shown) - shown:
         stream.log(entity, rr.Clear(recursive=False))

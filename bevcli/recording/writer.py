@@ -23,6 +23,7 @@ from bevcli.recording.vehicle import load_vehicle
 
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
+ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
 INDEXED_FRAMES = 200  # a longer recording has no index, see `rrd_file`
 
 
@@ -83,7 +84,8 @@ class Recording:
         # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait
         # for a sink that hangs.
         threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
-        self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id)
+        batches = rr.ChunkBatcherConfig(flush_num_rows=ROWS_AT_ONCE)
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id, batcher_config=batches)
         self._frames = 0
         frames = None if resume is None else resume.frames
         self._frame_log = FrameLog(self._stream, self._recorded, frames)

@@ -55,9 +55,9 @@ def run_into_folder(
         force: remove the files that earlier runs wrote into `out`.
         resume: go on with an interrupted run of the same model, options and input; the files then equal those of a run
             without interruption. Where there is none, the run starts at the first frame.
-        after_frame: called after each frame has been written.
+        after_frame: called after each frame has been written, in the thread that writes.
         resumed: called once with the number of frames that an interrupted run had finished, if there are any.
-        should_stop: asked after each frame; True ends the run.
+        should_stop: asked after each frame, in the same thread; True ends the run.
 
     Raises:
         InputError: see `run`; or not one image of the drive could be read.
@@ -119,28 +119,25 @@ def _write_steps(
     after_frame: Callable[[Frame, Prediction], None],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Write frames as they are made, count them, and save the state."""
-    start, latest, is_whole = summary.frames, RunnerState[Any](), True
+    """Write frames as they are made, count them, and save the state, all in a thread of its own."""
+    start, latest, is_whole, began = summary.frames, RunnerState[Any](), True, time.perf_counter()
 
-    def write(step: tuple[Frame, Prediction, RunnerState[Any]]) -> float:
-        """The seconds that writing the frame took."""
-        nonlocal is_whole
+    def write(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
+        nonlocal latest, is_whole, began
+        frame, prediction, after = step
         is_whole, writing_began = False, time.perf_counter()
-        files.write(*step[:2])
-        return time.perf_counter() - writing_began
+        files.write(frame, prediction)
+        now = time.perf_counter()
+        summary.add(frame, prediction, recording_s=now - writing_began, whole_s=now - began)
+        latest, is_whole, began = after, True, now
+        if saver.is_due(latest):
+            saver.save(latest)
+        after_frame(frame, prediction)
+        return not should_stop()
 
     with files:
         try:
-            began = time.perf_counter()
-            for (frame, prediction, after), recording_s in write_behind(write, steps):
-                now = time.perf_counter()
-                summary.add(frame, prediction, recording_s=recording_s, whole_s=now - began)
-                latest, is_whole, began = after, True, now
-                if saver.is_due(latest):
-                    saver.save(latest)
-                after_frame(frame, prediction)
-                if should_stop():
-                    break
+            write_behind(write, steps)
         finally:
             if is_whole and summary.frames not in (start, saver.saved_frames):
                 saver.save(latest)

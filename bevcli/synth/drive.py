@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,10 +18,11 @@ from bevcli.synth.assets.mesh import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.synth.render.lens import lens_parts
 from bevcli.synth.render.rasteriser import ShadowMap
-from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_through_lens, render_view
-from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.synth.render.renderer import NO_PATTERN, RenderedView, WorldSnapshot, render_through_lens, render_view
+from bevcli.synth.rig import DrawnRig, nuscenes_like_rig
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
+from bevcli.synth.world.looks import Looks
 from bevcli.synth.world.scenery import Scenery
 from bevcli.synth.world.simulation import Actor, Simulation
 from bevcli.synth.world.traffic import ActorState
@@ -81,13 +82,13 @@ class RenderedDrive:
         seed: the drive; 0 or greater.
         frames: number of frames.
         rate_hz: frames per second.
-        rig: the cameras; default: `nuscenes_like_rig` at 400x225.
+        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s) and whether the looks are varied
+            (`Looks`); default: `nuscenes_like_rig` at 400x225.
         weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
         assets: the meshes, if they are built already.
         supersampling: samples per pixel along each axis (anti-aliasing).
         threads: number of cameras rendered in parallel.
         map_half_extent_m: from the origin of the bev frame to each side of the ground truth maps, metres.
-        camera_delays_s: camera name to the time of its images after that of the frame, 0 to 0.1 s; default: none.
     """
 
     def __init__(
@@ -95,29 +96,31 @@ class RenderedDrive:
         seed: int,
         frames: int = 20,
         rate_hz: float = 2.0,
-        rig: CameraRig | None = None,
+        rig: CameraRig | DrawnRig | None = None,
         weather: str | None = None,
         assets: Assets | None = None,
         supersampling: int = 1,
         threads: int = 1,
         map_half_extent_m: float = 32.0,
-        camera_delays_s: Mapping[str, float] | None = None,
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
-        self.rig = rig or nuscenes_like_rig(400, 225)
+        drawn = rig if isinstance(rig, DrawnRig) else DrawnRig(rig or nuscenes_like_rig(400, 225))
+        self.rig, self._delays_s = drawn.rig, drawn.delays_s
+        self._looks = Looks(seed) if drawn.varied else None
         self._lenses = {camera.name: lens_parts(camera) for camera in self.rig.cameras if camera.distortion}
         self._map_half_extent_m = map_half_extent_m
-        self._delays_s = camera_delays_s or {}
         self._supersampling, self._threads = supersampling, threads
         self._assets = assets or Assets.build()
         self._city = CityPlan(seed)
         names = self._city.stream("weather-name")
         name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
         self.weather = make_weather(name, self._city.stream("weather"))
+        if self._looks is not None:
+            self.weather = self._looks.weather(self.weather)
         self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
         self._ground = GroundPlan(self._city)
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
-        self._scenery = Scenery(self._city, self._assets.furniture)
+        self._scenery = Scenery(self._city, self._assets.furniture, self._looks)
         self._around = lru_cache(maxsize=1)(self._make_surroundings)
         self._template = lru_cache(maxsize=None)(self._make_template)
         self._placed = lru_cache(maxsize=500)(self._make_placed)  # an actor that stands still is placed once
@@ -194,7 +197,9 @@ class RenderedDrive:
         signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
-        snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
+        pattern = NO_PATTERN if self._looks is None else self._looks.pattern()
+        soup = TriangleSoup.gather([scenery, moving])
+        snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather, pattern)
 
         def render_one(name: str) -> RenderedView:
             pose = world_from_ego.matrix
@@ -212,6 +217,9 @@ class RenderedDrive:
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         scenery = self._scenery.around(center, SCENERY_M)
+        if self._looks is not None:
+            texture = replace(texture, texels=self._looks.ground(texture.texels))
+            scenery = self._looks.scenery(scenery)
         shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
         return scenery, texture, shadows
 
@@ -221,8 +229,10 @@ class RenderedDrive:
 
     def _make_template(self, body: Body, pose: int) -> TriangleSoup:
         """The mesh of a body in its size and colours."""
-        mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
-        return TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
+        mesh, paint = body.variant.poses[pose % len(body.variant.poses)], body.paint
+        if self._looks is not None:
+            mesh, paint = self._looks.body(mesh, body.instance), self._looks.paint(paint, body.instance)
+        return TriangleSoup.from_mesh(mesh.fitted(body.size_lwh)).painted(paint, body.dye)
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
         """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""

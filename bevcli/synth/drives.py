@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence as Items
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
@@ -54,6 +54,13 @@ class FolderDrives:
         self._options = SequenceOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
         self._of_thread = threading.local()  # a Sequence must be read from one thread
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what belongs to this process, so that other processes can open the drives."""
+        return {**vars(self), "_of_thread": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _of_thread=threading.local())
+
     def __len__(self) -> int:
         return len(self._folders)
 
@@ -99,6 +106,12 @@ class RenderedDrives(FolderDrives):
         self._rendering = threading.Lock()
         self._assets: Assets | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_rendering": None, "_assets": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "_rendering": threading.Lock()})
+
     def open(self, index: int) -> Sequence:
         """The drive at an index. It is rendered first, which takes seconds, if the cache does not hold it."""
         folder = self._folders[index]
@@ -113,8 +126,8 @@ class RenderedDrives(FolderDrives):
         grid = self._config.bev_grid
         half_extent = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
         drive = RenderedDrive(
-            seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn.rig, assets=self._assets,
-            supersampling=drawn.supersampling, map_half_extent_m=half_extent, camera_delays_s=drawn.delays_s,
+            seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn, assets=self._assets,
+            supersampling=drawn.supersampling, map_half_extent_m=half_extent,
         )  # fmt: skip
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)

@@ -65,7 +65,7 @@ _CENTER_X_M = 1.4  # middle of the vehicle, ahead of the rear axle
 Range = tuple[float, float]
 _LIMITS: dict[str, Range] = {
     **dict.fromkeys(("random_share", "front_share", "distorted_share", "delayed_share", "supersampled_share"), (0, 1)),
-    "coarse_share": (0, 1),
+    **dict.fromkeys(("coarse_share", "varied_share"), (0, 1)),
     "cameras": (1, 16),
     "fov_deg": (10, 140),
     "jpeg_quality": (1, 100),
@@ -105,6 +105,7 @@ class RigDistribution:
             `coarsest` to 1.
         coarsest: see `coarse_share`.
         jpeg_quality: range of the quality of the images.
+        varied_share: share of the drives whose looks are varied: shapes, colours, patterns, light, nameless objects.
     """
 
     random_share: float = 0.0
@@ -128,6 +129,7 @@ class RigDistribution:
     coarse_share: float = 0.15
     coarsest: float = 0.6
     jpeg_quality: tuple[int, int] = (60, 95)
+    varied_share: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
@@ -144,7 +146,8 @@ class RigDistribution:
     @property
     def digest(self) -> str:
         """Eight hexadecimal digits that differ between distributions."""
-        return hashlib.sha256(repr(astuple(self)).encode()).hexdigest()[:8]
+        stated = astuple(self) if self.varied_share else astuple(self)[:-1]  # older caches stay valid
+        return hashlib.sha256(repr(stated).encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
@@ -156,12 +159,14 @@ class DrawnRig:
         delays_s: camera name to the time of its images after that of the frame, seconds; empty for none.
         supersampling: samples per pixel along each axis.
         jpeg_quality: 1 to 100.
+        varied: whether the looks of the drive are varied.
     """
 
     rig: CameraRig
     delays_s: dict[str, float] = field(default_factory=dict)
     supersampling: int = 1
     jpeg_quality: int = 90
+    varied: bool = False
 
 
 def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:
@@ -180,7 +185,8 @@ def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) ->
     delays = {}
     if random.random() < distribution.delayed_share:
         delays = {name: round(float(random.uniform(0, distribution.delay_s)), 3) for name in rig.names}
-    return DrawnRig(rig, delays, samples, quality)
+    varied = np.random.default_rng([seed, _STREAM, 1]).random() < distribution.varied_share  # leaves the rest as it is
+    return DrawnRig(rig, delays, samples, quality, bool(varied))
 
 
 def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: float, random: Generator) -> CameraRig:

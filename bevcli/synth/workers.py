@@ -26,7 +26,7 @@ def shared_out(make: Make, count: int, workers: int) -> Generator[Iterator[Any],
     parts = [[k for k in range(count) if k // block % workers == worker] for worker in range(workers)]
     processes: list[SpawnProcess] = []
     try:
-        with _blocked_interrupts():
+        with blocked_interrupts():
             connections = [_started(make, part, processes) for part in filter(None, parts)]
         with closing(_in_order(dict(zip(connections, filter(None, parts), strict=True)))) as items:
             yield items
@@ -37,7 +37,7 @@ def shared_out(make: Make, count: int, workers: int) -> Generator[Iterator[Any],
 
 
 @contextmanager
-def _blocked_interrupts() -> Iterator[None]:
+def blocked_interrupts() -> Iterator[None]:
     """Processes that start in the block never see Ctrl-C: it reaches their parent, which ends them."""
     resource_tracker.ensure_running()  # it would be started with the first process, and unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

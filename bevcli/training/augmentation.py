@@ -4,7 +4,7 @@ Boxes and maps stay as they are.
 """
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from bevcli.geometry.cameras import CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
 from bevcli.synth import corruptions
 from bevcli.synth.corruptions import ImageCorruption
+from bevcli.training.randomisation import RandomisationConfig
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
 CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
@@ -40,6 +41,7 @@ class AugmentationConfig:
             motion blur or few colours, of any severity.
         lost_cameras_share: probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or
             black images.
+        randomisation: of the images that enter the network.
     """
 
     photometric: float = 0.5
@@ -52,10 +54,12 @@ class AugmentationConfig:
     calibration_noise: float = 4.0
     corrupted_share: float = 0.0
     lost_cameras_share: float = 0.0
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
         amounts = ("exposure", "white_balance", "noise", "calibration_noise")
-        wrong = [name for name, share in vars(self).items() if name not in amounts and not 0 <= share <= 1]
+        others = (*amounts, "randomisation")
+        wrong = [name for name, share in vars(self).items() if name not in others and not 0 <= share <= 1]
         if wrong:
             raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
         if min(vars(self)[name] for name in amounts) < 0 or self.white_balance >= 1:

@@ -14,7 +14,7 @@ from torch import Tensor
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.box_coding import encode
 from bevcli.model.config import ModelConfig
-from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching, hungarian_matchings
 
 VELOCITY_START = 8  # entries 8 and 9 of a box code are vx and vy
 MIN_MOVING_MPS = 0.5  # slower objects count as stationary
@@ -31,6 +31,53 @@ class DetectionTargets:
 
     labels: Tensor
     codes: Tensor
+
+
+@dataclass(frozen=True)
+class PaddedTargets:
+    """The ground truth boxes of B frames, padded to the G boxes of the frame with the most, at least 1.
+
+    Attributes:
+        labels: (B, G) int64, indices into the model's classes; 0 for padding.
+        codes: (B, G, 10) float32 box codes; 0 for padding.
+        exists: (B, G) bool, false for padding.
+        counts: B numbers of boxes.
+    """
+
+    labels: Tensor
+    codes: Tensor
+    exists: Tensor
+    counts: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __getitem__(self, frame: int) -> DetectionTargets:
+        """The boxes of one frame."""
+        count = self.counts[frame]
+        return DetectionTargets(self.labels[frame, :count], self.codes[frame, :count])
+
+
+AnyTargets = Sequence[DetectionTargets] | PaddedTargets  # of B frames
+
+
+def padded(targets: AnyTargets) -> PaddedTargets:
+    """The boxes of B frames as tensors."""
+    if isinstance(targets, PaddedTargets):
+        return targets
+    counts = tuple(len(one.labels) for one in targets)
+    labels, codes = (pad_rows([getattr(one, name) for one in targets]) for name in ("labels", "codes"))
+    exists = pad_rows([torch.ones_like(one.labels, dtype=torch.bool) for one in targets])
+    return PaddedTargets(labels, codes, exists, counts)
+
+
+def pad_rows(tensors: Sequence[Tensor]) -> Tensor:
+    """(B, G, ...) of B tensors (G_i, ...), padded with zeros to the largest of G_i, at least 1."""
+    rows = max(1, *map(len, tensors))
+    out = tensors[0].new_zeros(len(tensors), rows, *tensors[0].shape[1:])
+    for padded_rows, tensor in zip(out, tensors, strict=True):
+        padded_rows[: len(tensor)] = tensor
+    return out
 
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
@@ -87,11 +134,7 @@ class DetectionLossConfig:
 
 
 def detection_loss(
-    class_logits: Tensor,
-    box_codes: Tensor,
-    targets: Sequence[DetectionTargets],
-    config: DetectionLossConfig,
-    groups: int = 1,
+    class_logits: Tensor, box_codes: Tensor, targets: AnyTargets, config: DetectionLossConfig, groups: int = 1
 ) -> dict[str, Tensor]:
     """The weighted losses of classes and boxes, summed over L decoder layers.
 
@@ -104,56 +147,37 @@ def detection_loss(
         groups: number of query groups, stored one after another. Each is matched on its own (Group DETR); the
             loss is the mean over the groups.
     """
+    truth = padded(targets)
     logits, codes = (_groups_as_layers(tensor, groups) for tensor in (class_logits, box_codes))
-    layers = [
-        assigned_loss(*layer, targets, layer_matches(*layer, targets, config), config)
-        for layer in zip(logits, codes, strict=True)
-    ]
-    classes, boxes = torch.stack(layers).sum(0) / groups
+    objects, _ = hungarian_matchings(matching_costs(logits, codes, truth, config), truth.counts)
+    classes, boxes = assigned_loss(logits, codes, truth, objects, config).sum(0) / groups
     return {"classes": classes, "boxes": boxes}
 
 
 def layer_matches(
-    class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
+    class_logits: Tensor, box_codes: Tensor, targets: AnyTargets, config: DetectionLossConfig
 ) -> list[tuple[Tensor, Tensor]]:
     """The queries of each of B frames that a layer matches to boxes, and the indices of these, both (K,) int64.
 
     class_logits: (B, Q, classes). box_codes: (B, Q, 10).
     """
-    layer = zip(class_logits, box_codes, targets, strict=True)
-    return [hungarian_matching(matching_costs(*element, config)) for element in layer]
+    truth = padded(targets)
+    costs = matching_costs(class_logits, box_codes, truth, config)
+    return [hungarian_matching(of_frame[:, :count]) for of_frame, count in zip(costs, truth.counts, strict=True)]
 
 
 def matching_costs(
-    class_logits: Tensor, box_codes: Tensor, truth: DetectionTargets, config: DetectionLossConfig
+    class_logits: Tensor, box_codes: Tensor, truth: PaddedTargets, config: DetectionLossConfig
 ) -> Tensor:
-    """(Q, G) focal cost plus L1 distance of the box codes without velocity.
+    """(..., B, Q, G) focal cost plus L1 distance of the box codes without velocity. No gradient.
 
-    class_logits: (Q, classes). box_codes: (Q, 10). truth: G boxes.
+    class_logits: (..., B, Q, classes). box_codes: (..., B, Q, 10). truth: of B frames.
     """
-    classes = focal_cost(class_logits)[:, truth.labels]
-    boxes = torch.cdist(box_codes[:, :VELOCITY_START], truth.codes[:, :VELOCITY_START], p=1)
-    return config.class_weight * classes + config.box_weight * boxes
-
-
-def qualities_of(predicted: Tensor, truth: Tensor, quality_m: float) -> Tensor:
-    """(K,) the class targets of matched box codes (K, 10): see `DetectionLossConfig.quality_m`. No gradient."""
-    if not quality_m:
-        return torch.ones(len(predicted), device=predicted.device)
-    return torch.exp((truth[:, :2] - predicted[:, :2].detach().float()).norm(dim=-1) / -quality_m)
-
-
-def box_loss(predicted: Tensor, truth: Tensor, config: DetectionLossConfig) -> Tensor:
-    """() L1 loss of matched box codes, summed. Boxes of unknown velocity are left out entirely, as published.
-
-    predicted and truth: (K, 10).
-    """
-    known = truth.isfinite().all(-1)
-    predicted, truth = predicted[known], truth[known]
-    errors = F.l1_loss(predicted, truth, reduction="none")  # (K, 10)
-    moving = truth[:, VELOCITY_START:].norm(dim=-1) >= MIN_MOVING_MPS
-    weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)
-    return errors[:, :VELOCITY_START].sum() + (weights * errors[:, VELOCITY_START:].sum(-1)).sum()
+    with torch.no_grad():
+        labels = truth.labels[:, None].expand(*class_logits.shape[:-1], -1)
+        classes = focal_cost(class_logits).gather(-1, labels)
+        boxes = torch.cdist(box_codes[..., :VELOCITY_START], truth.codes[..., :VELOCITY_START], p=1)
+        return config.class_weight * classes + config.box_weight * boxes
 
 
 def _groups_as_layers(tensor: Tensor, groups: int) -> Tensor:
@@ -162,27 +186,45 @@ def _groups_as_layers(tensor: Tensor, groups: int) -> Tensor:
 
 
 def assigned_loss(
-    class_logits: Tensor,
-    box_codes: Tensor,
-    targets: Sequence[DetectionTargets],
-    assignments: Sequence[tuple[Tensor, Tensor]],
-    config: DetectionLossConfig,
+    class_logits: Tensor, box_codes: Tensor, truth: PaddedTargets, objects: Tensor, config: DetectionLossConfig
 ) -> Tensor:
-    """(2,) class loss of all queries and box loss of those with an object, divided by the number of the latter.
+    """(..., 2) class loss of all queries and box loss of those with an object, divided by the number of the latter.
+
+    Boxes of unknown velocity have no box loss, as published.
 
     Args:
-        class_logits: (B, Q, classes).
-        box_codes: (B, Q, 10).
-        targets: B.
-        assignments: B pairs: (K,) int64 indices of the queries with an object, and (K,) of their objects.
+        class_logits: (..., B, Q, classes).
+        box_codes: (..., B, Q, 10).
+        truth: of B frames.
+        objects: (..., B, Q) int64, the object of each query, -1 for none.
     """
-    class_targets = torch.zeros_like(class_logits)  # (B, Q, classes)
-    predicted, truths = [], []
-    for element, (truth, (queries, objects)) in enumerate(zip(targets, assignments, strict=True)):
-        predicted.append(box_codes[element, queries])
-        truths.append(truth.codes[objects])
-        qualities = qualities_of(predicted[-1], truths[-1], config.quality_m)
-        class_targets[element, queries, truth.labels[objects]] = qualities.to(class_targets.dtype)
-    classes = config.class_weight * focal_loss(class_logits, class_targets).sum()
-    boxes = config.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), config)
-    return torch.stack([classes, boxes]) / max(sum(map(len, predicted)), 1)
+    assigned, chosen = objects >= 0, objects.clamp(min=0)
+    leading = objects.shape[:-2]
+    labels = truth.labels.expand(*leading, -1, -1).gather(-1, chosen)  # (..., B, Q)
+    index = chosen[..., None].expand(*chosen.shape, box_codes.shape[-1])
+    codes = truth.codes.expand(*leading, -1, -1, -1).gather(-2, index)  # (..., B, Q, 10)
+    qualities = qualities_of(box_codes, codes, config.quality_m) * assigned
+    class_targets = torch.zeros_like(class_logits).scatter_(-1, labels[..., None], qualities[..., None])
+    classes = config.class_weight * focal_loss(class_logits, class_targets).sum((-3, -2, -1))
+    boxes = config.box_weight * box_losses(box_codes, codes, assigned, config).sum((-2, -1))
+    return torch.stack([classes, boxes], -1) / assigned.sum((-2, -1)).clamp(min=1)[..., None]
+
+
+def qualities_of(predicted: Tensor, truth: Tensor, quality_m: float) -> Tensor:
+    """(...) the class targets of box codes (..., 10): see `DetectionLossConfig.quality_m`. No gradient."""
+    if not quality_m:
+        return predicted.new_ones(predicted.shape[:-1])
+    return torch.exp((truth[..., :2] - predicted[..., :2].detach()).norm(dim=-1) / -quality_m)
+
+
+def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: DetectionLossConfig) -> Tensor:
+    """(...) L1 losses of box codes, 0 where `assigned` (...) is false, or the true velocity is not known.
+
+    predicted and truth: (..., 10).
+    """
+    known = (assigned & truth.isfinite().all(-1))[..., None]
+    predicted, truth = predicted.where(known, 0), truth.where(known, 0)
+    errors = F.l1_loss(predicted, truth, reduction="none")  # (..., 10)
+    moving = truth[..., VELOCITY_START:].norm(dim=-1) >= MIN_MOVING_MPS
+    weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)
+    return errors[..., :VELOCITY_START].sum(-1) + weights * errors[..., VELOCITY_START:].sum(-1)

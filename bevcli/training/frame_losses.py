@@ -1,13 +1,15 @@
 """All losses of a frame, and what exists in training only: auxiliary heads, and a teacher.
 
-The teacher sees the images and the calibration before they were augmented.
+The teacher sees the images and the calibration before they were augmented, or, where a model learns its features, the
+images that the model sees.
 """
 
 import contextlib
 import copy
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,20 +17,26 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.checkpoints import load_weights
+from bevcli.config import load_config
+from bevcli.errors import ConfigError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.kernels.choose import choose_kernels
-from bevcli.model.network import Network
-from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs
+from bevcli.model.network import Network, build_network
+from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.training.detection_loss import (
+    AnyTargets,
     DetectionLossConfig,
-    DetectionTargets,
+    PaddedTargets,
     assigned_loss,
     detection_loss,
     layer_matches,
+    padded,
 )
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
-from bevcli.training.samples import Targets
+from bevcli.training.randomisation import renormalised
+from bevcli.training.samples import Batch, Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 from bevcli.weights.fetch import weights_file
 
@@ -73,32 +81,28 @@ class DenseHead(nn.Module):
 
 
 def dense_loss(
-    head: DenseHead,
-    bev: Tensor,
-    targets: Sequence[DetectionTargets],
-    config: DenseLossConfig,
-    detection: DetectionLossConfig,
+    head: DenseHead, bev: Tensor, targets: AnyTargets, config: DenseLossConfig, detection: DetectionLossConfig
 ) -> dict[str, Tensor]:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
     bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
     """
+    truth = padded(targets)
     logits, codes = head(bev)
-    positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
-    classes, boxes = config.weight * assigned_loss(logits, codes, targets, positives, detection)
+    objects = _objects_in_reach(head.centers, truth, config.reach_m)
+    classes, boxes = config.weight * assigned_loss(logits, codes, truth, objects, detection)
     return {"cell classes": classes, "cell boxes": boxes}
 
 
-def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
-    """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
+def _objects_in_reach(cells: Tensor, truth: PaddedTargets, reach_m: float) -> Tensor:
+    """(B, Y·X) int64 the nearest object of each cell that is within reach of it, -1 for none.
 
-    cells: (Y·X, 2) cell centres, metres. objects: (G, 2) object centres, metres.
+    cells: (Y·X, 2) centres, metres.
     """
-    if not len(objects):
-        return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
-    distance, nearest = torch.cdist(cells, objects).min(dim=1)
-    positive = (distance <= reach_m).nonzero()[:, 0]
-    return positive, nearest[positive]
+    # Not by a product of matrices, which a GPU may round.
+    distances = torch.cdist(cells, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
+    distance, nearest = distances.where(truth.exists[:, None], torch.inf).min(dim=-1)
+    return nearest.where(distance <= reach_m, -1)
 
 
 @dataclass(frozen=True)
@@ -106,35 +110,95 @@ class DistillationLossConfig:
     """The [training.distillation_loss] table.
 
     Attributes:
-        weight: of the mean squared difference of the BEV maps; 0 disables the loss.
-        teacher: weights of the same model, a file or a model's name.
+        weight: of the mean squared difference of the BEV maps; 0 disables this part.
+        feature_weight: of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0
+            disables this part. With it the teacher sees the images that the model sees, with all augmentation.
+        teacher: weights of the teacher, a file or a model's name.
+        model: name or TOML file of the teacher's model, which may have another backbone and normalisation of images;
+            "" for the model that is trained.
     """
 
     weight: float = 0.0
+    feature_weight: float = 0.0
     teacher: str = ""
+    model: str = ""
 
     def __post_init__(self) -> None:
-        if self.weight < 0 or (self.weight > 0 and not self.teacher):
-            raise ValueError("weight must not be negative, and teacher must name weights where it is positive")
+        if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
+            raise ValueError(
+                "weight and feature_weight must not be negative, and teacher must name weights where one is positive"
+            )
+
+    @property
+    def active(self) -> bool:
+        """Some part of the loss is not disabled."""
+        return max(self.weight, self.feature_weight) > 0
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The results of a teacher for one frame of B clips with N cameras.
+
+    Attributes:
+        bev: (B, Y·X, C) float32; None where only the features are learned.
+        features: (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned.
+    """
+
+    bev: Tensor | None
+    features: tuple[Tensor, ...]
 
 
 class Teacher:
-    """A copy of a model with the teacher's weights, in evaluation mode."""
+    """The model that another one learns from, in evaluation mode."""
 
-    def __init__(self, model: Network, weights: str, device: torch.device) -> None:
-        """Raises WeightsError where the weights are missing or do not fit the model."""
-        self._network = copy.deepcopy(model)
-        load_weights(weights_file(Path(weights)), self._network)
+    def __init__(self, model: Network, config: DistillationLossConfig, device: torch.device) -> None:
+        """Raises BevcliError where the weights or the teacher's model are missing, or do not fit the model."""
+        self._config, self._taught = config, model.config
+        self._network = build_network(load_config(config.model)) if config.model else copy.deepcopy(model)
+        load_weights(weights_file(Path(config.teacher)), self._network, config.model)
+        own, other = _maps_of(model.config), _maps_of(self._network.config)
+        if own != other:
+            raise ConfigError(f"{config.model}: cannot teach {model.config.name}: it has {other} (expected {own})")
         self._network.eval().requires_grad_(False).to(device)
         choose_kernels(self._network, device)
 
-    def bev_maps(self, clip: ClipInputs) -> Iterator[Tensor]:
-        """The BEV map (B, Y·X, C) of each frame of clips that are not augmented."""
+    @torch.no_grad()
+    def lessons(self, clip: Batch) -> Iterator[Lesson]:
+        """The results for each frame of clips, lazily."""
+        image, own, network = self._taught.image, self._network.config.image, self._network
         memory: Any = None
-        for place in range(len(clip.inputs)):
-            with torch.no_grad():
-                outputs, memory = self._network.learn(clip, place, memory)
-            yield outputs.bev.float()
+        if image != own:
+            clip = replace(
+                clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
+            )
+        for place, inputs in enumerate(clip.inputs):
+            bev = None
+            with last_outputs(network.neck) as features:
+                if self._config.weight:
+                    outputs, memory = network.learn(clip, place, memory)
+                    bev = outputs.bev.float()
+                else:
+                    network.image_features(inputs.images, inputs.camera_index)
+            yield Lesson(bev, tuple(x.float() for x in features[0]) if self._config.feature_weight else ())
+
+
+def _maps_of(config: ModelConfig) -> str:
+    """What a teacher and the model have in common, in words."""
+    sizes = " and ".join(f"{height} x {width}" for height, width in config.level_shapes)
+    grid = config.bev_grid
+    maps = f"{config.neck.levels} maps of {config.channels} channels and {sizes} cells"
+    return f"{maps}, {grid.rows} x {grid.columns} BEV cells"
+
+
+@contextlib.contextmanager
+def last_outputs(part: nn.Module) -> Iterator[deque[Any]]:
+    """Inside, the only item is what the last forward pass of a part returned. No hook remains."""
+    kept = deque[Any](maxlen=1)
+    hook = part.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
+    try:
+        yield kept
+    finally:
+        hook.remove()
 
 
 @dataclass(frozen=True)
@@ -146,7 +210,7 @@ class LossConfigs:
         segmentation_loss: the segmentation head's, where the model has one.
         dense_loss: auxiliary, on the BEV map.
         perspective_loss: auxiliary, on the image features.
-        distillation_loss: auxiliary, against the BEV map of a teacher.
+        distillation_loss: auxiliary, against the BEV map or the image features of a teacher.
         RENAMED_KEYS: tables of earlier versions, and what replaces them.
     """
 
@@ -186,27 +250,17 @@ class FrameLosses:
 
     @contextlib.contextmanager
     def watching(self, model: Network) -> Iterator[None]:
-        """Inside, each forward pass of the model keeps its image features for the perspective loss. No hook remains."""
-        if self._perspective_head is None:
+        """Inside, each forward pass of the model keeps its image features for the losses on them. No hook remains."""
+        with last_outputs(model.neck) as self._feature_maps:
             yield
-            return
-
-        def keep(neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
-            self._feature_maps = maps
-
-        hook = model.neck.register_forward_hook(keep)
-        try:
-            yield
-        finally:
-            hook.remove()
 
     def __call__(
-        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Tensor | None = None
+        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Lesson | None = None
     ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
         Call it inside `watching`, right after the forward pass that made the outputs.
-        taught: (B, Y·X, C), the BEV map of the teacher.
+        taught: by the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
         losses = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
@@ -216,19 +270,23 @@ class FrameLosses:
         if self._perspective_head is not None:
             losses |= perspective_loss(
                 self._perspective_head,
-                [features.float() for features in self._feature_maps],
+                [features.float() for features in self._feature_maps[0]],
                 inputs.image_from_bev,
                 inputs.has_image,
                 inputs.image_size,
                 targets.perspective,
                 self.configs.perspective_loss,
             )
-        if taught is not None:
-            difference = nn.functional.mse_loss(outputs.bev.float(), taught)
+        if taught is not None and taught.bev is not None:
+            difference = nn.functional.mse_loss(outputs.bev.float(), taught.bev)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
+        if taught is not None and taught.features:
+            pairs = zip(self._feature_maps[0], taught.features, strict=True)
+            shares = [nn.functional.mse_loss(own.float(), other) / other.var() for own, other in pairs]
+            losses |= {"features": self.configs.distillation_loss.feature_weight * torch.stack(shares).mean()}
         if targets.truths:
             matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)
-        if outputs.segmentation is not None:
+        if outputs.segmentation is not None and targets.segmentation is not None:
             losses |= segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
         return losses

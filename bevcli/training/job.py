@@ -23,6 +23,7 @@ from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.synth.splits import split_of, training_drives, write_split
 from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.backbone_weights import start_backbone
 from bevcli.training.changes import with_changes
 from bevcli.training.drive_checks import check_training_drives
 from bevcli.training.files import require_tensorboard
@@ -54,10 +55,11 @@ class ProcessGroup:
     def average_gradients(self, trained: nn.Module) -> None:
         """Replaces each gradient by its mean over the processes; a missing gradient counts as zero."""
         if self.size > 1:
-            for parameter in trained.parameters():
+            learned = [parameter for parameter in trained.parameters() if parameter.requires_grad]
+            for parameter in learned:
                 if parameter.grad is None:
                     parameter.grad = torch.zeros_like(parameter)
-            self._average([parameter.grad for parameter in trained.parameters() if parameter.grad is not None])
+            self._average([parameter.grad for parameter in learned if parameter.grad is not None])
 
     def average_statistics(self, trained: nn.Module) -> None:
         """Replaces the running statistics of batch norms (all float buffers) by their mean over the processes."""
@@ -144,8 +146,10 @@ class TrainingConfig(LossConfigs):
         evaluate_every: steps between evaluations.
         checkpoint_every: steps between checkpoints.
         freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
-        frozen_stages: the backbone's stem and its first stages, so many, keep their weights; 0 trains all of it.
-        loaders: threads that read batches ahead, one step's batches each. Use several if a GPU waits for data.
+        frozen_stages: the backbone's stem and its first stages, so many, keep their weights and the statistics of their
+            batch norms; 0 trains all of it.
+        loaders: processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all
+            cores but two.
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
         augmentation: image augmentation.
@@ -159,7 +163,7 @@ class TrainingConfig(LossConfigs):
     checkpoint_every: int = 250
     freeze_batch_norm: bool = False
     frozen_stages: int = 0
-    loaders: int = 1
+    loaders: int = 0
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
@@ -167,12 +171,13 @@ class TrainingConfig(LossConfigs):
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
-            raise ValueError(
-                "steps, evaluate_every, checkpoint_every and loaders must be positive, held_out not negative"
-            )
-        if self.frozen_stages < 0:
-            raise ValueError("frozen_stages must not be negative")
+        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1:
+            raise ValueError("steps, evaluate_every and checkpoint_every must be positive")
+        if min(self.held_out, self.loaders, self.frozen_stages) < 0:
+            raise ValueError("held_out, loaders and frozen_stages must not be negative")
+
+
+CORES_OF_TRAINING = 2  # that make no batches, with a GPU
 
 
 @dataclass(frozen=True)
@@ -190,7 +195,7 @@ class TrainingJob:
         group: the processes that train together.
         notes: about the drives, for the user.
         log: where the learning curves are written, besides the CSV files; None for nowhere.
-        warm_start: what the training starts from; None for random weights, or if it is resumed.
+        warm_starts: what the training starts from; empty for random weights, or if it is resumed.
         lock: keeps other trainings out of the folder until it is closed; empty in other processes than the leader.
     """
 
@@ -204,8 +209,16 @@ class TrainingJob:
     group: ProcessGroup = field(default_factory=ProcessGroup)
     notes: tuple[str, ...] = ()
     log: Log | None = None
-    warm_start: WarmStart | None = None
+    warm_starts: tuple[WarmStart, ...] = ()
     lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+
+    @property
+    def loaders(self) -> int:
+        """The number of processes that make batches, 1 for a thread of this process."""
+        if self.config.loaders or self.device.type == "cpu":
+            return self.config.loaders or 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - CORES_OF_TRAINING)
 
     def changed_settings(self) -> tuple[str, ...]:
         """A note where the settings differ from those of the training so far in this folder; stores them."""
@@ -238,20 +251,23 @@ def prepare_training(
     check_training_seeds(data.rendered or ())
     if data.split is not None and options.held_out is not None:
         raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
-    rigs = config.rigs if config.rigs.random_share > 0 else None
+    rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     own = None if data.split is None and config.held_out == 0 else evaluated
     notes = check_training_drives(data, drives, own, config.clips, model_config)
     if data.rendered is not None and not (out / "drives").exists():
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
-    if config.freeze_batch_norm and options.weights is None and not options.resume:
+    if config.freeze_batch_norm and not (options.weights or options.backbone_weights or options.resume):
         notes += (
             "the model starts from random weights, but its file keeps the statistics of batch norms: pass `weights` or "
             '`changes={"freeze_batch_norm": "false"}`',
         )
-    model, started = build_network(model_config), None
+    model, started = build_network(model_config), []
     if options.weights is not None and not options.resume:
-        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
+        started += [warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)]
+    if options.backbone_weights is not None and not options.resume:
+        backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
+        started, notes = [*started, backbone], (*notes, *about)
     group, lock = join_process_group(device), contextlib.ExitStack()
     if group.leads and not (options.resume and not out.exists()):
         lock.enter_context(folder_lock(out))
@@ -259,7 +275,7 @@ def prepare_training(
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
         write_split(out / "split.toml", split)
-    rest = options.seed, group, notes, options.log, started, lock
+    rest = options.seed, group, notes, options.log, tuple(started), lock
     return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
 

@@ -127,6 +127,7 @@ class Cost:
     Attributes:
         config: its settings.
         machine: the device, in words.
+        loaders: processes or threads that make batches.
         update_s: time of an update of the weights, while another thread reads the next batch.
         reading_s: time until the first batch was read, at most.
         memory_bytes: the largest memory, of the process or of a GPU.
@@ -134,6 +135,7 @@ class Cost:
 
     config: TrainingConfig
     machine: str
+    loaders: int
     update_s: float
     reading_s: float
     memory_bytes: int
@@ -142,7 +144,7 @@ class Cost:
     def step_s(self) -> float:
         """Time of a step: of its updates, or of reading its batches where this takes longer."""
         clips = self.config.clips
-        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s / self.config.loaders)
+        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s / self.loaders)
 
     def __str__(self) -> str:
         """The cost on one line."""
@@ -177,4 +179,4 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0)
-    return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))
+    return Cost(job.config, machine, job.loaders, update_s, reading_s, peak_memory(job.device))

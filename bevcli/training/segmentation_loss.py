@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -15,9 +16,9 @@ from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
-from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.model.matching import focal_cost, focal_loss, hungarian_matchings
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
-from bevcli.training.detection_loss import has_points
+from bevcli.training.detection_loss import has_points, pad_rows
 
 # A cell belongs to a class that covers at least this share of it. Lines are thinner than a cell: their share is lower.
 MIN_SHARES = {"drivable_road": 0.4, "lane_boundary": 0.2, "pedestrian_crossing": 0.4}
@@ -38,6 +39,50 @@ class SegmentationTargets:
     stuff: Tensor | None
     things: Tensor
     locations: Tensor
+
+
+@dataclass(frozen=True)
+class PaddedMasks:
+    """The masks of B frames, padded with zeros to the G vehicles of the frame with the most, at least 1.
+
+    Attributes:
+        stuff: (B, S, Y·X) float32; 0 where a frame has no map.
+        has_stuff: (B,) bool, whether a frame has a map.
+        things: (B, G, Y·X) float32.
+        locations: (B, G, 4) float32.
+        counts: B numbers of vehicles.
+    """
+
+    stuff: Tensor
+    has_stuff: Tensor
+    things: Tensor
+    locations: Tensor
+    counts: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __getitem__(self, frame: int) -> SegmentationTargets:
+        """The masks of one frame."""
+        stuff, count = self.stuff[frame] if self.has_stuff[frame] else None, self.counts[frame]
+        return SegmentationTargets(stuff, self.things[frame, :count], self.locations[frame, :count])
+
+
+AnyMasks = Sequence[SegmentationTargets] | PaddedMasks  # of B frames
+
+
+def padded_masks(targets: AnyMasks) -> PaddedMasks:
+    """The masks of B frames as tensors."""
+    if isinstance(targets, PaddedMasks):
+        return targets
+    nothing = targets[0].things.new_zeros(len(STUFF_CLASSES), targets[0].things.shape[-1])
+    return PaddedMasks(
+        torch.stack([nothing if one.stuff is None else one.stuff for one in targets]),
+        torch.tensor([one.stuff is not None for one in targets]),
+        pad_rows([one.things for one in targets]),
+        pad_rows([one.locations for one in targets]),
+        tuple(len(one.things) for one in targets),
+    )
 
 
 def segmentation_targets(
@@ -61,15 +106,24 @@ def segmentation_targets(
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     """(S, Y·X): whether a class covers enough of a cell."""
     _check_map(bev_map, grid)
-    fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
-    rows, columns = bev_map.cells.shape
-    map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
-    map_cells = map_grid.cell_of(fine.cell_centers())  # (Y · SAMPLES, X · SAMPLES, 2)
-    on_map = np.stack([bev_map.layer(name)[::-1] for name in STUFF_CLASSES])  # the map's rows start at the largest y
-    layers = on_map[:, map_cells[..., 0], map_cells[..., 1]]
-    shares = layers.reshape(len(layers), grid.rows, SAMPLES, grid.columns, SAMPLES).mean((2, 4))
+    map_rows, map_columns = bev_map.cells.shape
+    map_grid = BevGrid(map_rows, map_columns, bev_map.x_range_m, bev_map.y_range_m)
+    rows, columns = _sampled_cells(grid, map_grid)
+    cells = bev_map.cells[::-1][rows[:, None], columns]  # the map's rows start at the largest y
+    sampled = replace(bev_map, cells=cells)
+    layers = np.stack([sampled.layer(name) for name in STUFF_CLASSES]).view(np.uint8)
+    counts = layers.reshape(-1, SAMPLES).sum(1, dtype=np.uint8).reshape(len(layers), grid.rows, SAMPLES, grid.columns)
+    shares = counts.sum(2, dtype=np.int64) / SAMPLES**2
     min_shares = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
     return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
+
+
+@lru_cache
+def _sampled_cells(grid: BevGrid, map_grid: BevGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(Y · SAMPLES,) rows and (X · SAMPLES,) columns of the map at the sampling points of a grid."""
+    fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
+    map_cells = map_grid.cell_of(fine.cell_centers())
+    return map_cells[:, 0, 0], map_cells[0, :, 1]
 
 
 def _check_map(bev_map: BevMap, grid: BevGrid) -> None:
@@ -129,41 +183,55 @@ class SegmentationLossConfig:
 
 
 def segmentation_loss(
-    outputs: SegmentationOutputs, targets: Sequence[SegmentationTargets], config: SegmentationLossConfig
+    outputs: SegmentationOutputs, targets: AnyMasks, config: SegmentationLossConfig
 ) -> dict[str, Tensor]:
     """The weighted losses of all layers for B frames. Things are matched once, by the outputs of the last layer.
 
     The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
     """
-    assignments = [_assign(outputs, element, truth, config) for element, truth in enumerate(targets)]
-    things = sum(len(locations) for *_, locations in assignments)
-    stuff = sum(len(queries) for queries, *_ in assignments) - things
-    shares = outputs.class_logits.new_full(outputs.class_logits.shape[-1:], 1 / max(things, 1))  # (Q,)
-    shares[: len(STUFF_CLASSES)] = 1 / max(stuff, 1)
-    classes = config.class_weight * (_class_losses(outputs.class_logits, assignments, targets) * shares).sum()
-    masks, locations = classes.new_zeros(()), classes.new_zeros(())
-    for element, (queries, target_masks, target_locations) in enumerate(assignments):
-        logits = outputs.mask_logits[:, element, queries]  # (M, K, Y·X)
-        truth = target_masks.expand_as(logits)
-        losses = config.dice_weight * dice_loss(logits, truth)
-        losses = losses + config.pixel_weight * focal_loss(logits, truth).mean(-1)
-        masks = masks + (losses * shares[queries]).sum()
-        of_things = queries[len(queries) - len(target_locations) :] - len(STUFF_CLASSES)  # from the first thing query
-        errors = outputs.locations[:, element, of_things] - target_locations
-        locations = locations + config.location_weight * errors.abs().sum() / max(things, 1)
-    return {"map classes": classes, "masks": masks, "locations": locations}
+    truth, first = padded_masks(targets), len(STUFF_CLASSES)
+    _, queries = hungarian_matchings(matching_costs(outputs, truth, config), truth.counts)  # (B, G)
+    assigned = torch.cat([truth.stuff.any(-1), queries >= 0], 1).float()  # (B, S + G)
+    queries = queries.clamp(min=0) + first
+    stuff, things = assigned[:, :first].sum().clamp(min=1), assigned[:, first:].sum().clamp(min=1)
+    layers = outputs.class_logits.shape[0]
+
+    class_targets = torch.zeros_like(outputs.class_logits)  # (M, B, Q)
+    class_targets[..., :first] = assigned[:, :first]
+    of_things = assigned[:, first:]
+    class_targets.scatter_add_(-1, *(x.expand(layers, -1, -1) for x in (queries, of_things)))
+    class_losses = focal_loss(outputs.class_logits, class_targets)
+    of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
+    classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
+
+    logits = _chosen(outputs.mask_logits, queries)  # (M, B, G, Y·X)
+    logits = torch.cat([outputs.mask_logits[:, :, :first], logits], 2)
+    masks = torch.cat([truth.stuff, truth.things], 1).expand_as(logits)
+    losses = config.dice_weight * dice_loss(logits, masks)
+    losses = (losses + config.pixel_weight * focal_loss(logits, masks).mean(-1)) * assigned
+    errors = (_chosen(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
+    return {
+        "map classes": config.class_weight * classes,
+        "masks": losses[..., :first].sum() / stuff + losses[..., first:].sum() / things,
+        "locations": config.location_weight * errors.sum() / things,
+    }
 
 
-def matching_costs(
-    outputs: SegmentationOutputs, element: int, truth: SegmentationTargets, config: SegmentationLossConfig
-) -> Tensor:
-    """(T, G) cost of assigning each thing query of a batch element to each vehicle, by the last layer."""
+def _chosen(tensor: Tensor, queries: Tensor) -> Tensor:
+    """(M, B, Q, ...) -> (M, B, G, ...), those of the queries (B, G)."""
+    index = queries[None, ..., None].expand(len(tensor), -1, -1, tensor.shape[-1])
+    return tensor.gather(2, index)
+
+
+def matching_costs(outputs: SegmentationOutputs, truth: PaddedMasks, config: SegmentationLossConfig) -> Tensor:
+    """(B, T, G) cost of assigning each thing query to each vehicle, by the last layer. No gradient."""
     first = len(STUFF_CLASSES)
-    classes = focal_cost(outputs.class_logits[-1, element, first:])[:, None]
-    locations = torch.cdist(outputs.locations[-1, element], truth.locations, p=1)
-    dice = dice_costs(outputs.mask_logits[-1, element, first:], truth.things)
-    return config.class_weight * classes + config.location_weight * locations + config.dice_weight * dice
+    with torch.no_grad():
+        classes = focal_cost(outputs.class_logits[-1, :, first:])[..., None]
+        locations = torch.cdist(outputs.locations[-1], truth.locations, p=1)
+        dice = dice_costs(outputs.mask_logits[-1, :, first:], truth.things)
+        return config.class_weight * classes + config.location_weight * locations + config.dice_weight * dice
 
 
 def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:
@@ -176,41 +244,14 @@ def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:
 
 
 def dice_costs(logits: Tensor, targets: Tensor) -> Tensor:
-    """(Q, G) dice loss of each predicted mask against each target mask.
+    """(..., Q, G) dice loss of each predicted mask against each target mask.
 
-    logits: (Q, cells). targets: (G, cells), 0 or 1.
+    logits: (..., Q, cells). targets: (..., G, cells), 0 or 1.
     """
     masks = logits.sigmoid()
-    return _dice(masks @ targets.T, masks.square().sum(-1)[:, None] + targets.square().sum(-1))
+    sums = masks.square().sum(-1)[..., None] + targets.square().sum(-1)[..., None, :]
+    return _dice(masks @ targets.mT, sums)
 
 
 def _dice(overlap: Tensor, sums: Tensor) -> Tensor:
     return 1 - (2 * overlap + DICE_SMOOTHING) / (sums + DICE_SMOOTHING)
-
-
-def _assign(
-    outputs: SegmentationOutputs, element: int, truth: SegmentationTargets, config: SegmentationLossConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The K queries of a batch element that have a target mask, (K,) stuff first, then T things; and their targets.
-
-    These are the masks (K, Y·X), and of the things the locations (T, 4).
-    """
-    things, objects = hungarian_matching(matching_costs(outputs, element, truth, config))
-    queries, masks = things + len(STUFF_CLASSES), truth.things[objects]
-    if truth.stuff is not None:
-        present = truth.stuff.any(-1)
-        queries = torch.cat([present.nonzero()[:, 0], queries])
-        masks = torch.cat([truth.stuff[present], masks])
-    return queries, masks, truth.locations[objects]
-
-
-def _class_losses(
-    class_logits: Tensor, assignments: Sequence[tuple[Tensor, ...]], targets: Sequence[SegmentationTargets]
-) -> Tensor:
-    """(M, B, Q) focal losses of class_logits (M, B, Q), 0 for the stuff queries of a frame without a map."""
-    class_targets, trained = torch.zeros_like(class_logits), torch.ones_like(class_logits)
-    for element, ((queries, *_), truth) in enumerate(zip(assignments, targets, strict=True)):
-        class_targets[:, element, queries] = 1
-        if truth.stuff is None:
-            trained[:, element, : len(STUFF_CLASSES)] = 0
-    return focal_loss(class_logits, class_targets) * trained

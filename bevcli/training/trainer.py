@@ -1,10 +1,15 @@
 """The training loop: clips in; updates of the weights, checkpoints and learning curves out."""
 
+from __future__ import annotations
+
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice, repeat
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice, product, repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,19 +17,20 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.inference.background import read_ahead
 from bevcli.inference.cpu_settings import trim_memory
 from bevcli.inference.load import choose_precision
 from bevcli.inference.runner import Runner, StepOptions
+from bevcli.model.backbone import Backbone
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
-from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
 from bevcli.training import files
-from bevcli.training.frame_losses import FrameLosses, Teacher
+from bevcli.training.frame_losses import FrameLosses, Lesson, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
-from bevcli.training.samples import Batch, draw_clips, load_batch
+from bevcli.training.loading import BatchMaker, loaded_batches
+from bevcli.training.randomisation import randomised_inputs
+from bevcli.training.samples import Batch
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -37,7 +43,7 @@ class FrozenStages:
     whose feature maps fit into the caches.
     """
 
-    def __init__(self, backbone: ResNet, stages: int, dtype: torch.dtype) -> None:
+    def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
         """stages: how many, from the first. dtype: of the computation and its results."""
         self._device = backbone.conv1.weight.device
         self._dtype = dtype
@@ -52,7 +58,7 @@ class FrozenStages:
         self._part = part
 
     @contextlib.contextmanager
-    def used_by(self, backbone: ResNet) -> Iterator[None]:
+    def used_by(self, backbone: Backbone) -> Iterator[None]:
         """Inside, the backbone takes the maps of its first stages from here."""
         backbone.frozen_maps = self._maps
         try:
@@ -107,7 +113,20 @@ def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerCon
     in_backbone = {id(parameter) for parameter in backbone.parameters()}
     others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
     groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
-    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
+    # On a GPU, fused: one kernel instead of hundreds.
+    fused = next(trained.parameters()).device.type == "cuda" or None
+    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=fused)
+
+
+@contextlib.contextmanager
+def rounded_products(rounds: bool) -> Iterator[None]:
+    """Inside, a CUDA GPU rounds the factors of float32 products to TF32 if it is to: several times as fast."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if rounds else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
@@ -119,11 +138,29 @@ def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
 @torch.no_grad()
 def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
     """Moves a running average of a state dict towards it, in place; integers are copied."""
-    for key, value in state.items():
-        if value.is_floating_point():
-            average[key].lerp_(value, 1 - decay)
-        else:
-            average[key].copy_(value)
+    moved = [key for key, value in state.items() if value.is_floating_point()]
+    torch._foreach_lerp_([average[key] for key in moved], [state[key] for key in moved], 1 - decay)
+    for key in state.keys() - set(moved):
+        average[key].copy_(state[key])
+
+
+class _Update:
+    """The numbers of an update, on their way from the device."""
+
+    def __init__(self, numbers: Mapping[str, Tensor]) -> None:
+        self._names = tuple(numbers)
+        values = torch.stack([value.detach() for value in numbers.values()])
+        self._values = values.to("cpu", non_blocking=True)
+        self._arrived: torch.cuda.Event | None = None
+        if values.device.type == "cuda":
+            self._arrived = torch.cuda.Event()
+            self._arrived.record()
+
+    def read(self) -> dict[str, float]:
+        """The numbers by name. Waits for a GPU to finish this update, but none after it."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return dict(zip(self._names, self._values.tolist(), strict=True))
 
 
 class Trainer:
@@ -136,6 +173,8 @@ class Trainer:
         trained: all modules that are trained: the model and the auxiliary heads.
         optimizer: of their parameters.
         done: the number of steps done.
+        maker: makes the batches.
+        waited_s: time for which the training had to wait for batches, seconds.
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
@@ -148,14 +187,19 @@ class Trainer:
         self._average: dict[str, Tensor] | None = None
         if job.config.optimizer.average > 0:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
-        self.done = 0
+        self.done, self.waited_s = 0, 0.0
         if resume:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
-        self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
+        self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
+        self.maker = BatchMaker(
+            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
+            in_bytes=job.device.type == "cuda",
+        )  # fmt: skip
         self._frozen: FrozenStages | None = None
-        if job.config.frozen_stages and job.config.freeze_batch_norm:
+        if job.config.frozen_stages:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
@@ -179,9 +223,24 @@ class Trainer:
             after_update: called after each update of the weights, with the loss.
         """
         job, config = self.job, self.job.config
-        remaining = range(self.done, config.steps)
-        for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
-            row = self._step(batches, after_update)
+        remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
+        places = product(remaining, range(config.clips.in_turn))
+        loaded = loaded_batches(self.maker, places, job.loaders, pin=gpu)
+        with contextlib.closing(loaded) as batches, rounded_products(gpu):
+            self._run(batches, after_step, after_validation, stop, after_update)
+        job.model.eval()
+
+    def _run(
+        self,
+        batches: Iterator[Batch],
+        after_step: Callable[[], None],
+        after_validation: Callable[[int, Validation], None],
+        stop: Callable[[], bool],
+        after_update: Callable[[float], None],
+    ) -> None:
+        job, config = self.job, self.job.config
+        while self.done < config.steps:
+            row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
             trim_memory()
             self.done += 1
             last, stopped = self.done == config.steps, stop()
@@ -194,30 +253,22 @@ class Trainer:
                 after_step()
             if stopped:
                 break
-        job.model.eval()
+
+    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """The same batches, with the time spent waiting for them added to `waited_s`."""
+        for _ in repeat(None):
+            begun = time.perf_counter()
+            batch = next(batches, None)
+            self.waited_s += time.perf_counter() - begun
+            if batch is None:
+                return
+            yield batch
 
     @property
     def _learn_all(self) -> bool:
         return self.job.config.clips.learn == "all"
 
-    def _seeds(self, step: int) -> list[int]:
-        """The seeds of a step's random draws; different for each process of a group."""
-        rank = self.job.group.rank
-        return [self.job.seed, step, rank] if rank else [self.job.seed, step]
-
-    def _load(self, step: int) -> list[Batch]:
-        """The batches of a step: `clips.in_turn` of them."""
-        job, config = self.job, self.job.config
-        random = np.random.default_rng(self._seeds(step))
-        model, augmentation, learn_all = job.model.config, config.augmentation, self._learn_all
-        batches, plain = [], self._teacher is not None
-        for _ in range(config.clips.in_turn):
-            clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
-            batch = load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all, plain=plain)
-            batches.append(batch)
-        return batches
-
-    def _step(self, batches: list[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
+    def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
         """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
         job, config = self.job, self.job.config
         rate = config.optimizer.learning_rate_at(self.done, config.steps)
@@ -225,46 +276,59 @@ class Trainer:
         gpus = [job.device] if job.device.type == "cuda" else []
         frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
-            torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
-            clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
+            seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
+            torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
             rows = []
-            for losses in alternated(clips):
-                rows.append(self._update(losses))
+            learned = alternated(self._clip_losses(self._uploaded(batch)) for batch in batches)
+            for update in delayed(map(self._update, learned), 1 if gpus else 0):
+                rows.append(self._read(update))
                 after_update(rows[-1]["loss"])
         job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
 
+    def _uploaded(self, batch: Batch) -> Batch:
+        """The batch on the device, with its images normalised."""
+        return batch.to(self.job.device).normalised(self.job.model.config.image)
+
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
         job, config = self.job, self.job.config
+        random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
+        batch = replace(batch, inputs=randomised_inputs(batch.inputs, *random))
         outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
         learned = len(batch.targets)
-        maps: Iterator[Tensor | None] = repeat(None)
-        if self._teacher is not None and batch.plain is not None:
-            maps = islice(self._teacher.bev_maps(batch.plain), len(batch.inputs) - learned, None)
+        lessons: Iterator[Lesson | None] = repeat(None)
+        if self._teacher is not None:
+            shown = batch if batch.plain is None else batch.plain
+            lessons = islice(self._teacher.lessons(shown), len(batch.inputs) - learned, None)
         for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                output, taught = next(outputs), next(maps)
+                output, taught = next(outputs), next(lessons)
             yield self._losses(inputs, output, targets, taught)
 
-    def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
+    def _update(self, losses: dict[str, Tensor]) -> _Update:
         """One update of the weights."""
         total = torch.stack(list(losses.values())).sum()
-        if not math.isfinite(total.item()):
-            raise BevcliError(
-                f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and `resume` "
-                f"from the last checkpoint in {self.job.out}"
-            )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.job.group.average_gradients(self.trained)
-        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm).item()
+        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
         if self._average is not None:
             update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
-        return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
+        return _Update({"loss": total, **losses, "gradient norm": norm})
+
+    def _read(self, update: _Update) -> dict[str, float]:
+        """The numbers of an update. Raises BevcliError if the loss is not finite."""
+        row = update.read()
+        if not math.isfinite(row["loss"]):
+            raise BevcliError(
+                f"step {self.done + 1}: the loss is {row['loss']}; lower the learning rate, and `resume` "
+                f"from the last checkpoint in {self.job.out}"
+            )
+        return row
 
     def _validate(self) -> Validation:
         """Scores the model, writes its weights and the learning curves."""
@@ -283,15 +347,26 @@ class Trainer:
         return scores
 
 
-def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:
+def delayed(items: Iterable[T], places: int) -> Iterator[T]:
+    """The items, each when so many later ones have been made."""
+    waiting = deque[T]()
+    for item in items:
+        waiting.append(item)
+        if len(waiting) > places:
+            yield waiting.popleft()
+    yield from waiting
+
+
+def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
     """The first item of each iterator, then the second of each, and so on until all are exhausted."""
-    remaining = list(iterators)
+    remaining: Iterable[Iterator[T]] = iterators
     while remaining:
-        for iterator in tuple(remaining):
-            try:
-                yield next(iterator)
-            except StopIteration:
-                remaining.remove(iterator)
+        going = []
+        for iterator in remaining:
+            for item in islice(iterator, 1):
+                yield item
+                going.append(iterator)
+        remaining = going
 
 
 def computes_in_bfloat16(device: torch.device) -> bool:

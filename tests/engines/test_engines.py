@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.cli.stop_signals import EndSignals
 from bevcli.config import load_config
+from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
@@ -28,6 +29,8 @@ from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import calibration_images
 from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig
+from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
+from bevcli.model.export_form import raw_images
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
 
@@ -85,6 +88,19 @@ def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file
     assert all(name.endswith("DequantizeLinear_Output") for node in readers for name in node.input[:2])
     weights = [value.name for value in proto.graph.initializer if value.name.endswith("weight_quantized")]
     assert len(weights) == len(readers)  # of the convolutions, and no others
+
+
+@pytest.mark.slow  # exports a model of its own
+def test_efficientnet_lite_runs_in_an_engine_and_in_int8(tmp_path):
+    model = model_for_engines(EfficientNetLiteConfig())
+    exact, rounded = tmp_path / "lite.onnx", tmp_path / "lite-int8.onnx"
+    export_onnx(model, exact, decode=True, untrained=True)
+    quantize(exact, [raw_images(small_inputs(seed).images, model.config).numpy() for seed in range(4)], rounded)
+    files = [load_exported(file, "onnxruntime") for file in (exact, rounded)]
+    with torch.inference_mode():
+        expected, found, close = model(small_inputs()).bev, *(step_of_file(file, small_inputs()).bev for file in files)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    assert 1e-5 < (close - expected).norm() / expected.norm() < 0.15  # of random weights
 
 
 def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, tmp_path):

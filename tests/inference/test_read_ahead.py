@@ -2,7 +2,9 @@ import threading
 
 import pytest
 
+from bevcli.config import load_config
 from bevcli.inference.background import read_ahead
+from bevcli.inference.runner import AHEAD_BYTES, frames_ahead
 
 
 def test_everything_comes_in_order():
@@ -43,3 +45,35 @@ def test_it_works_ahead_of_the_consumer_but_only_so_far():
     assert next(results) == 0
     assert reached.wait(5)
     assert max(started) == 3
+
+
+def test_items_are_loaded_in_order_in_one_thread_of_their_own():
+    loaded, threads = [], set()
+
+    def load(item):
+        loaded.append(item)
+        threads.add(threading.get_ident())
+        return item + 1
+
+    results = list(read_ahead(lambda x: (x, threading.get_ident()), range(12), depth=5, threads=3, load=load))
+    assert [x for x, _ in results] == list(range(1, 13))
+    assert loaded == list(range(12))
+    assert len(threads) == 1
+    assert threads.isdisjoint(thread for _, thread in results)
+
+
+def test_an_error_of_loading_is_raised_at_its_item():
+    results = read_ahead(lambda x: x, range(5), depth=4, threads=2, load=lambda x: 1 / (2 - x))
+    assert [next(results), next(results)] == [0.5, 1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+@pytest.mark.parametrize("cameras", [1, 6, 60])
+def test_frames_ahead_of_a_gpu_are_bounded_by_their_memory(cameras):
+    image = load_config("base").image
+    width, height = image.padded_size
+    depth, threads = frames_ahead(image, cameras, cores=16)
+    assert depth == 2 or depth * cameras * width * height * 3 * 4 <= AHEAD_BYTES
+    assert 1 <= threads <= 16
+    assert frames_ahead(image, cameras, cores=1)[1] == 1

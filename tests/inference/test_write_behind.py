@@ -5,53 +5,83 @@ import pytest
 from bevcli.inference.background import write_behind
 
 
-def test_every_item_comes_with_its_result_in_order():
-    assert list(write_behind(lambda x: x * x, range(5))) == [(x, x * x) for x in range(5)]
-    assert list(write_behind(lambda x: x, [])) == []
+def test_every_item_is_worked_on_in_order():
+    worked = []
+    write_behind(lambda item: worked.append(item) or True, range(20))
+    write_behind(lambda item: worked.append(item) or True, [])
+    assert worked == list(range(20))
 
 
-def test_an_item_is_worked_on_while_the_next_one_is_made():
-    making, working = threading.Event(), threading.Event()
+def test_items_are_made_while_the_first_one_is_worked_on():
+    made, all_made = [], threading.Event()
 
     def items():
-        yield 0
-        making.set()
-        assert working.wait(5)
-        yield 1
+        for item in range(4):
+            made.append(item)
+            yield item
+        all_made.set()
 
     def work(item):
-        assert making.wait(5)
-        working.set()
+        return all_made.wait(5)
 
-    assert [item for item, _ in write_behind(work, items())] == [0, 1]
+    write_behind(work, items(), depth=3)
+    assert made == list(range(4))
+    assert all_made.is_set()
 
 
-def test_the_next_work_begins_when_the_caller_asks_for_it():
-    """So the caller may read what the work changed."""
-    worked = []
-    for item, _ in write_behind(worked.append, range(4)):
-        assert worked == list(range(item + 1))
-        if item == 2:
-            break
+def test_no_more_items_are_made_than_may_wait():
+    made, most = [], []
+
+    def items():
+        for item in range(20):
+            made.append(item)
+            yield item
+
+    def work(item):
+        most.append(len(made) - item)
+        return True
+
+    write_behind(work, items(), depth=2)
+    assert max(most) <= 4  # the one worked on, two that wait, and one that was made meanwhile
+
+
+def test_no_item_is_worked_on_after_work_says_so():
+    worked, made = [], threading.Event()
+
+    def items():
+        yield from range(4)
+        made.set()
+        yield from range(4, 1000)
+
+    def work(item):
+        worked.append(item)
+        made.wait(5)
+        return item < 2
+
+    write_behind(work, items(), depth=4)
     assert worked == [0, 1, 2]
 
 
-def test_a_made_item_comes_before_the_failure_of_the_next():
+@pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
+def test_made_items_are_worked_on_before_the_failure_of_the_next(kind):
     worked = []
 
     def items():
-        yield 0
-        raise OSError("no image")
+        yield from range(3)
+        raise kind("no image")
 
-    steps = write_behind(worked.append, items())
-    assert next(steps)[0] == 0
-    with pytest.raises(OSError, match="no image"):
-        next(steps)
-    assert worked == [0]
+    with pytest.raises(kind, match="no image"):
+        write_behind(lambda item: worked.append(item) or True, items())
+    assert worked == [0, 1, 2]
 
 
-def test_an_error_in_the_work_is_raised_at_its_item():
-    steps = write_behind(lambda x: 1 / (1 - x), range(3))
-    assert next(steps) == (0, 1.0)
+def test_after_an_error_in_the_work_nothing_more_is_done():
+    worked = []
+
+    def work(item):
+        worked.append(item)
+        return bool(1 / (1 - item))
+
     with pytest.raises(ZeroDivisionError):
-        next(steps)
+        write_behind(work, range(1000))
+    assert worked == [0, 1]

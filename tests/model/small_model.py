@@ -13,6 +13,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bevformer.bevformer import BEVFormer, recurrent_feed
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
+from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
@@ -52,12 +53,15 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
     return model
 
 
-def model_for_engines() -> BEVFormer:
+FAST_BACKBONE = ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8)
+
+
+def model_for_engines(backbone: ResNetConfig | EfficientNetLiteConfig = FAST_BACKBONE) -> BEVFormer:
     """A small model without deformable convolutions, which OpenVINO lacks; duplicates of its boxes merge and fade."""
     return small_model(
         encoder=replace(small_config().encoder, layers=1),
         decoder=replace(small_config().decoder, layers=1, merge_duplicates=0.6, fade_duplicates=0.7),
-        backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
+        backbone=backbone,
         neck=FPNConfig(levels=2),
         image_tokens=ImageTokensConfig(level_embeddings=2, calibration_embedding=True),
     )

@@ -68,7 +68,8 @@ def test_a_fused_bottleneck_equals_a_bottleneck(style, in_channels, stride, defo
             elif isinstance(module, nn.Conv2d):
                 module.bias = nn.Parameter(torch.randn(len(module.weight)))
         if isinstance(block.conv2, ModulatedDeformableConvolution):
-            block.conv2 = CompiledDeformableConvolution(block.conv2, torch.randn(16))
+            block.conv2.bias = nn.Parameter(torch.randn(16))
+            block.conv2 = CompiledDeformableConvolution(block.conv2)
         block = block.to(dtype).to(memory_format=torch.channels_last).requires_grad_(False)
         x = torch.randn(2, in_channels, 12, 20, dtype=dtype).to(memory_format=torch.channels_last)
         before = x.clone()

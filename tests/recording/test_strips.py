@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from bevcli.recording.log_boxes import line_strips
+from bevcli.recording.components import line_strips
 
 
 @pytest.mark.parametrize("lengths", [[], [2], [5, 2, 3, 1], [2, 2]])

@@ -11,7 +11,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
-from bevcli.synth.rig import RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
+from bevcli.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
 
 SIZE = (512, 288)
 RANDOM = RigDistribution(random_share=1.0)
@@ -82,7 +82,7 @@ def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[R
     """A drive whose left front camera takes its images 50 ms late."""
     folder = tmp_path_factory.mktemp("delayed") / "drive"
     delays = {"CAM_FRONT_LEFT": 0.05}
-    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets, camera_delays_s=delays)
+    drive = RenderedDrive(5, frames=2, rig=DrawnRig(nuscenes_like_rig(160, 90), delays), assets=assets)
     export_drive(drive, folder)
     return drive, open_sequence(folder)
 

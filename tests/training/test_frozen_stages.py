@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from bevcli.model.resnet import ResNet, ResNetConfig
+from bevcli.training.job import ProcessGroup
 from bevcli.training.trainer import FrozenStages
 
 
@@ -52,3 +54,15 @@ def test_frozen_stages_add_nothing_to_the_state_of_the_backbone() -> None:
     names = set(backbone.state_dict())
     with FrozenStages(backbone, 1, torch.float32).used_by(backbone):
         assert set(backbone.state_dict()) == names
+
+
+def test_several_processes_leave_frozen_parts_without_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a gradient of zero, weight decay would change them."""
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda sums: sums.mul_(2))
+    layers = torch.nn.ModuleList(torch.nn.Linear(2, 2) for _ in range(3))
+    layers[0].requires_grad_(False)
+    layers[1].weight.grad = torch.ones(2, 2)
+    ProcessGroup(0, 2).average_gradients(layers)
+    assert [parameter.grad for parameter in layers[0].parameters()] == [None, None]
+    assert layers[1].weight.grad.equal(torch.ones(2, 2))
+    assert not layers[2].weight.grad.any()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from one_image import targets_of_image
 from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.config import TRAINING, load_table
@@ -25,7 +26,6 @@ from bevcli.training.perspective_loss import (
     PerspectiveLossConfig,
     feature_locations,
     perspective_loss,
-    perspective_targets,
 )
 from bevcli.training.samples import Batch, Clip, load_batch
 
@@ -92,11 +92,13 @@ def test_backbone_and_head_learn_the_depths_of_boxes() -> None:
     assert totals[-1] < totals[0] / 10
 
     logits, boxes = head(maps)
-    locations = feature_locations([(m.shape[-2], m.shape[-1]) for m in maps], inputs.image_size, torch.device("cpu"))
+    locations = feature_locations(
+        tuple((m.shape[-2], m.shape[-1]) for m in maps), inputs.image_size, torch.device("cpu")
+    )
     errors = []
     for image, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
         truth = data.targets[0].perspective[image // 2]
-        expected = perspective_targets(matrix, truth, locations, inputs.image_size)
+        expected = targets_of_image(matrix, truth, locations, inputs.image_size)
         errors.append((boxes[image, expected.locations, 2] - expected.boxes[:, 2]).exp() - 1)
         assert torch.equal(logits[image, expected.locations].argmax(-1), expected.labels)
     relative = torch.cat(errors).abs()
@@ -155,8 +157,8 @@ def test_ignored_pixels_have_no_class_loss() -> None:
     data, head = batch(1), make_head(layers=0)
     matrix = data.inputs[0].image_from_bev[0, 0]
     truck = DetectionTargets(torch.tensor([0]), torch.tensor([[2.5, -1, 1.1, 2.5, 0, 1.1, 0, -1, 0, 0]]))
-    locations = feature_locations([(12, 16), (6, 8)], data.inputs[0].image_size, torch.device("cpu"))
-    ignored = perspective_targets(matrix, truck, locations, data.inputs[0].image_size).ignored
+    locations = feature_locations(((12, 16), (6, 8)), data.inputs[0].image_size, torch.device("cpu"))
+    ignored = targets_of_image(matrix, truck, locations, data.inputs[0].image_size).ignored
     assert 0 < ignored.sum() < len(ignored)
     maps = random_maps(2)
     only_front = torch.tensor([[True, False]])
@@ -177,7 +179,7 @@ def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
     both, head, maps = batch(2), make_head(), random_maps(4)
     whole = loss_of(head, maps, both)
     inputs = both.inputs[0]
-    locations = feature_locations([(12, 16), (6, 8)], inputs.image_size, torch.device("cpu"))
+    locations = feature_locations(((12, 16), (6, 8)), inputs.image_size, torch.device("cpu"))
     total, count = 0.0, 0
     for frame in range(2):
         truth = both.targets[0].perspective[frame]
@@ -186,7 +188,7 @@ def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
             inputs.has_image[[frame]], inputs.image_size, [truth], WEIGHTS,
         )  # fmt: skip
         positives = sum(
-            len(perspective_targets(matrix, truth, locations, inputs.image_size).locations)
+            len(targets_of_image(matrix, truth, locations, inputs.image_size).locations)
             for matrix in inputs.image_from_bev[frame]
         )
         total, count = total + positives * sum(part.values()).item(), count + positives

@@ -8,16 +8,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from one_image import ImageTargets, objects_of_image, targets_of_image
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.box_coding import encode
 from bevcli.training.detection_loss import DetectionTargets
 from bevcli.training.perspective_loss import (
     OUTLINE_DEPTH_M,
-    PerspectiveTargets,
     feature_locations,
-    perspective_targets,
-    project_objects,
 )
 
 SIZE = (224, 384)  # height, width
@@ -45,9 +43,9 @@ def truth(*rows: tuple[float, ...]) -> DetectionTargets:
     return DetectionTargets(torch.arange(len(codes)), codes)
 
 
-def targets(*rows: tuple[float, ...], shapes: list[tuple[int, int]] = SHAPES) -> PerspectiveTargets:
-    locations = feature_locations(shapes, SIZE, torch.device("cpu"))
-    return perspective_targets(image_from_bev(), truth(*rows), locations, SIZE)
+def targets(*rows: tuple[float, ...], shapes: list[tuple[int, int]] = SHAPES) -> ImageTargets:
+    locations = feature_locations(tuple(shapes), SIZE, torch.device("cpu"))
+    return targets_of_image(image_from_bev(), truth(*rows), locations, SIZE)
 
 
 def cells(locations: torch.Tensor, shape: tuple[int, int] = SHAPES[0], start: int = 0) -> list[tuple[int, int]]:
@@ -73,7 +71,7 @@ def test_centers_depths_and_outlines_equal_opencv() -> None:
     )  # fmt: skip
     camera_from_bev = tilted_camera()
     intrinsics = INTRINSICS * [[1.2], [0.9], [1]]  # fx is not fy
-    objects = project_objects(image_from_bev(camera_from_bev, intrinsics), truth(*rows).codes, SIZE)
+    objects = objects_of_image(image_from_bev(camera_from_bev, intrinsics), truth(*rows).codes, SIZE)
 
     def project(points: np.ndarray) -> np.ndarray:
         rotation = cv2.Rodrigues(camera_from_bev[:3, :3])[0]
@@ -140,7 +138,7 @@ def test_a_box_smaller_than_a_pixel_has_one_positive_pixel() -> None:
 def test_of_two_boxes_a_pixel_detects_that_of_the_nearer_center() -> None:
     one, other = (0, 10, 1.5, 1, 1, 1, 0), (1, 10, 1.5, 1, 1, 1, 0)  # centres 20 pixels apart, at x 192 and 212
     found = targets(one, other)
-    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu")).pixels[found.locations]
+    pixels = feature_locations(tuple(SHAPES), SIZE, torch.device("cpu")).pixels[found.locations]
     assert set(found.labels.tolist()) == {0, 1}
     assert (pixels[found.labels == 0, 0] < 202).all()
     assert (pixels[found.labels == 1, 0] > 202).all()
@@ -162,7 +160,7 @@ def test_no_boxes_give_no_targets() -> None:
 
 def test_a_box_centered_just_outside_is_detected_at_the_border() -> None:
     found = targets((10.2, 10, 1.5, 4, 2, 2, 0))  # centre at x 396, the image ends at 384, the box begins at 341
-    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu"))
+    pixels = feature_locations(tuple(SHAPES), SIZE, torch.device("cpu"))
     assert len(found.locations) > 0
     strides = pixels.strides[pixels.levels[found.locations]]
     projected = pixels.pixels[found.locations] + found.boxes[:, :2] * strides
@@ -175,7 +173,7 @@ def test_a_truck_beside_a_camera_is_not_detected_nor_background() -> None:
     row = (3, -1, 1.5, 12, 2, 3, math.pi / 2)
     found = targets(row)
     assert not len(found.locations)
-    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu")).pixels[found.ignored]
+    pixels = feature_locations(tuple(SHAPES), SIZE, torch.device("cpu")).pixels[found.ignored]
     # Its front at y = 5 ends at x = 2 m: pixel 192 + 200 · 2 / 5 = 272. It reaches the right border.
     assert 272 <= pixels[:, 0].min() < 288
     assert pixels[:, 0].max() > 376
@@ -185,7 +183,7 @@ def test_a_box_partly_behind_has_the_outline_of_its_front_part() -> None:
     """A box from 4 m behind to 8 m ahead looks like the box from the cutting plane to 8 m ahead."""
     start, end = OUTLINE_DEPTH_M, 8.0
     whole, part = (1, 2, 1.0, 12, 1, 1, math.pi / 2), (1, (start + end) / 2, 1.0, end - start, 1, 1, math.pi / 2)
-    of_whole, of_part = (project_objects(image_from_bev(), truth(row).codes, SIZE).outlines for row in (whole, part))
+    of_whole, of_part = (objects_of_image(image_from_bev(), truth(row).codes, SIZE).outlines for row in (whole, part))
     torch.testing.assert_close(of_whole, of_part, atol=0.5, rtol=0)
 
 
@@ -194,7 +192,7 @@ def test_the_rotation_is_relative_to_the_viewing_ray() -> None:
     azimuths = np.radians([60, 90, 120])
     camera = np.linalg.inv(tilted_camera())[:3, 3]
     rows = [(camera[0] + 12 * math.cos(a), camera[1] + 12 * math.sin(a), 1, 4, 2, 1.6, a + 0.3) for a in azimuths]
-    rotations = project_objects(image_from_bev(tilted_camera()), truth(*rows).codes, SIZE).rotations
+    rotations = objects_of_image(image_from_bev(tilted_camera()), truth(*rows).codes, SIZE).rotations
     expected = torch.tensor([[math.sin(0.3), math.cos(0.3)]]).expand(3, 2)
     torch.testing.assert_close(rotations, expected, atol=1e-4, rtol=0)
 
@@ -203,9 +201,9 @@ def test_the_depth_target_ignores_scaling_of_image_and_focal() -> None:
     """The features of an image do not tell its focal length: the same pixels must have the same target."""
     half = np.diag([0.5, 0.5, 1]) @ INTRINSICS
     box = truth((2, 10, 1.5, 4, 1, 2, 0.2))
-    whole_locations = feature_locations(SHAPES, SIZE, torch.device("cpu"))
-    half_locations = feature_locations(SHAPES, (112, 192), torch.device("cpu"))
-    whole = perspective_targets(image_from_bev(), box, whole_locations, SIZE)
-    halved = perspective_targets(image_from_bev(intrinsics=half), box, half_locations, (112, 192))
+    whole_locations = feature_locations(tuple(SHAPES), SIZE, torch.device("cpu"))
+    half_locations = feature_locations(tuple(SHAPES), (112, 192), torch.device("cpu"))
+    whole = targets_of_image(image_from_bev(), box, whole_locations, SIZE)
+    halved = targets_of_image(image_from_bev(intrinsics=half), box, half_locations, (112, 192))
     assert torch.equal(whole.locations, halved.locations)
     torch.testing.assert_close(whole.boxes, halved.boxes)

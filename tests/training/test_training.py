@@ -29,6 +29,7 @@ from bevcli.training.frame_losses import DenseLossConfig
 from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.training.options import TrainOptions
 from bevcli.training.perspective_loss import PerspectiveLossConfig
+from bevcli.training.randomisation import RandomisationConfig
 from bevcli.training.samples import ClipConfig
 from bevcli.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
 
@@ -151,7 +152,7 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
         return Trainer(job, resume=resume)
 
     whole = with_all_options(tmp_path / "whole")
-    assert [len(batch.inputs) for batch in whole._load(0)] == [2, 2]
+    assert [len(whole.maker(0, place).inputs) for place in range(2)] == [2, 2]
     whole.run()
     assert parameters_without_gradient(whole) == []
     # These keys are part of the checkpoint format.
@@ -182,13 +183,22 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(two_steps: Trainer
     assert parameters_without_gradient(two_steps) == []
 
 
-def test_frozen_stages_keep_their_weights(tmp_path: Path) -> None:
+def test_frozen_stages_keep_weights_and_statistics(tmp_path: Path) -> None:
     trained = trainer(tmp_path, settings=replace(SHORT, frozen_stages=1))
-    before = {name: value.clone() for name, value in trained.job.model.backbone.named_parameters()}
+    before = {name: value.clone() for name, value in trained.job.model.backbone.state_dict().items()}
     trained.run()
-    changed = {name for name, value in trained.job.model.backbone.named_parameters() if not value.equal(before[name])}
+    changed = {name for name, value in trained.job.model.backbone.state_dict().items() if not value.equal(before[name])}
     assert not [name for name in changed if name.startswith(("conv1", "bn1", "stages.0."))]
-    assert [name for name in changed if name.startswith("stages.1.")]
+    assert {"stages.1.0.conv1.weight", "stages.1.0.bn1.running_mean"} <= changed
+
+
+def test_randomised_images_are_drawn_anew_but_by_the_seed(two_steps: Trainer, tmp_path: Path) -> None:
+    augmentation = AugmentationConfig(randomisation=RandomisationConfig(convolution=0.5, noise=0.5))
+    runs = [trainer(tmp_path / str(run), settings=replace(TWO_STEPS, augmentation=augmentation)) for run in range(2)]
+    for one in runs:
+        one.run()
+    assert_same_weights(*runs)
+    assert_same_weights(runs[0], two_steps, same=False)
 
 
 def test_training_and_validation_leave_no_hooks_on_the_model(tmp_path: Path) -> None:

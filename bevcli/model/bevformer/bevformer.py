@@ -2,20 +2,21 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from bevcli.geometry.transforms import Pose
 from bevcli.model.config import ModelConfig
-from bevcli.model.ego_motion import rotate_history
+from bevcli.model.ego_motion import map_rotation, rotate_history, turned_history
 from bevcli.model.encoder import EncoderLayer
 from bevcli.model.export_form import ExportForm, Port, camera_feed, camera_ports
 from bevcli.model.export_step import ExportedStep
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.upload import upload
 
 
 @dataclass(frozen=True)
@@ -31,30 +32,86 @@ class BevHistory:
     pose: Pose
 
 
+@dataclass(frozen=True)
+class EncoderInputs:
+    """All that the device part of a step reads, on the device.
+
+    Attributes:
+        images: see `ModelInputs`, as for camera_index, can_bus and shift.
+        hits: the cells that each camera sees.
+        rays: scale and shift of the image features, of the calibration embedding; None without one.
+        history: (B, Y·X, C), the BEV map of the previous frame; None without history.
+        rotation: (B, 2, 3), of the history, see `map_rotation`; None without history.
+    """
+
+    images: Tensor
+    camera_index: Tensor
+    can_bus: Tensor
+    shift: Tensor
+    hits: PillarHits
+    rays: tuple[Tensor, Tensor] | None
+    history: Tensor | None
+    rotation: Tensor | None
+
+
 class BEVFormer(Network):
     """The whole model: a recurrence, in which the BEV map of a frame is the history of the next."""
 
     memory_type: ClassVar[type] = BevHistory
+    device_parts: ClassVar[tuple[str, ...]] = ("device_part",)
     figures: ClassVar[tuple[str, ...]] = ("bevcli.explain.overview:FIGURES",)
 
     def forward(self, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
         """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""
-        return self.detect(self.bev_map(inputs, history))
+        found: ModelOutputs = self.device_part(self.host_part(inputs, history))
+        return found
 
     def bev_map(self, inputs: ModelInputs, history: Tensor | None) -> Tensor:
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
-        image_features = self.image_features(inputs.images, inputs.camera_index)
+        return self.encode(self.host_part(inputs, history))
+
+    def host_part(self, inputs: ModelInputs, history: Tensor | None) -> "EncoderInputs":
+        """What a step needs of calibration and poses, as tensors on the device. Arguments as for `forward`."""
+        size, device = inputs.image_size, self.device
+        rays = rotation = None
         if self.calibration_embedding is not None:
-            rays = inputs.image_from_bev, image_features.level_shapes, inputs.image_size
-            image_features = image_features.scaled(*self.calibration_embedding(*rays))
-        return self.encoder(
+            rays = self.calibration_embedding(inputs.image_from_bev, self.config.level_shapes_of(size), size)
+        if history is not None:
+            center = self.config.ego_motion.history_rotation_center
+            rotation = upload(map_rotation(inputs.rotation_deg, self.config.bev_grid, center), device)
+        return EncoderInputs(
+            images=inputs.images,
+            camera_index=inputs.camera_index,
+            can_bus=inputs.can_bus,
+            shift=inputs.shift,
+            hits=self.pillars(inputs.image_from_bev, size, inputs.has_image),
+            rays=rays,
+            history=history,
+            rotation=rotation,
+        )
+
+    def device_part(self, inputs: "EncoderInputs") -> Any:
+        """The outputs of a step: a function of tensors without a wait for the device, of the same shapes every time."""
+        return self.detect(self.encode(inputs))
+
+    def encode(self, inputs: "EncoderInputs") -> Tensor:
+        """The BEV map (B, Y·X, C)."""
+        image_features = self.image_features(inputs.images, inputs.camera_index)
+        if inputs.rays is not None:
+            image_features = image_features.scaled(*inputs.rays)
+        history = inputs.history
+        if history is not None:
+            assert inputs.rotation is not None
+            history = turned_history(history, inputs.rotation, self.config.bev_grid)
+        bev: Tensor = self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),
             image_features=image_features,
-            hits=self.pillars(inputs.image_from_bev, inputs.image_size, inputs.has_image),
-            history=None if history is None else self.align_history(history, inputs.rotation_deg),
+            hits=inputs.hits,
+            history=history,
             shift=inputs.shift,
         )
+        return bev
 
     def align_history(self, history: Tensor, rotation_deg: Tensor) -> Tensor:
         """The history map (B, Y·X, C), rotated by rotation_deg (B,) to the current heading."""

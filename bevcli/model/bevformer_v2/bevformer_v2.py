@@ -94,6 +94,7 @@ class BEVFormerV2(Network):
     config: BEVFormerV2Config
     config_class = BEVFormerV2Config
     memory_type = FeatureWindow
+    device_parts = ("image_features", "device_part")
     stages: Mapping[str, str] = STAGES | {"fusion": "fusion"}
     official_names = (
         (r"^pts_bbox_head\.transformer\.fusion\.layers\.", "fusion.blocks."),
@@ -114,31 +115,38 @@ class BEVFormerV2(Network):
         A frame that does not exist, such as before the scene's first, is None. Its BEV map is that of the nearest frame
         towards the current one.
         """
-        return self.detect(self.bev_map(window))
+        found: ModelOutputs = self.device_part(*self.host_part(window))
+        return found
 
-    def bev_map(self, window: Sequence[WindowFrame | None]) -> Tensor:
-        """The fused BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
+    def host_part(
+        self, window: Sequence[WindowFrame | None]
+    ) -> tuple[tuple[tuple[FeatureMaps, PillarHits], ...], tuple[int, ...]]:
+        """The image features and hits of the frames that exist, and for each of the window the index of its frame."""
         sources = fill_window(self.config.frames, [frame is not None for frame in window])
         current = self.config.frames.index(0)
-        maps: dict[int, Tensor] = {}
-        # One frame after the other: as a batch they would need the memory of all at once and, on a CPU, as much time.
         # The current frame is the last, so that observers of the encoder see it.
-        for place in [*(place for place in sorted(set(sources)) if place != current), current]:
-            frame = window[place]
-            assert frame is not None
-            maps[place] = self.encode(frame)
-        if self.fusion is None:
-            return maps[current]
-        return self.fusion([maps[place] for place in sources])
+        places = [*(place for place in sorted(set(sources)) if place != current), current]
+        frames = [frame for frame in (window[place] for place in places) if frame is not None]
+        hits = [self.pillars(frame.image_from_bev, frame.image_size, frame.has_image) for frame in frames]
+        seen = tuple((frame.image_features, found) for frame, found in zip(frames, hits, strict=True))
+        return seen, tuple(places.index(place) for place in sources)
 
-    def encode(self, frame: WindowFrame) -> Tensor:
+    def device_part(self, frames: Sequence[tuple[FeatureMaps, PillarHits]], sources: Sequence[int]) -> ModelOutputs:
+        """The outputs of a step: a function of tensors without a wait for the device. Arguments: see `host_part`."""
+        # One frame after the other: as a batch they would need the memory of all at once and, on a CPU, as much time.
+        maps = [self.encode(*frame) for frame in frames]
+        return self.detect(maps[-1] if self.fusion is None else self.fusion([maps[place] for place in sources]))
+
+    def encode(self, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
         """The BEV map (B, Y·X, C) of one frame's images, in the current frame's BEV grid."""
-        return self.encoder(
-            bev_query=self.bev_queries.embedding.expand(len(frame.has_image), -1, -1),
+        batch = len(hits.cameras_per_cell) // len(self.bev_queries.embedding)
+        bev: Tensor = self.encoder(
+            bev_query=self.bev_queries.embedding.expand(batch, -1, -1),
             position=self.bev_queries.position(),
-            image_features=frame.image_features,
-            hits=self.pillars(frame.image_from_bev, frame.image_size, frame.has_image),
+            image_features=image_features,
+            hits=hits,
         )
+        return bev
 
     def step(
         self, prepared: PreparedFrame, memory: FeatureWindow | None, upcoming: Sequence[PreparedFrame] = ()

@@ -1,6 +1,6 @@
 """The fastest parts for a device, in the place of the plain ones: kernels, memory layout, folded batch norms."""
 
-from functools import lru_cache
+from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
 
@@ -9,41 +9,55 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes
-from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.deformable_convolution import (
+    Convolve,
+    ModulatedDeformableConvolution,
+    predicted_deformable_convolution,
+)
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.temporal_model import TemporalModel
 
-KEPT_TABLES = 32  # of level sizes, for images of several sizes
 VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
 
 
 def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: bool = False) -> None:
-    """Gives a model, in place, the memory layout and the deformable attention that are fastest on a device.
+    """Gives a model, in place, the memory layout and the deformable operations that are fastest on a device.
 
     gradients: whether the model is trained; then only kernels with gradients are used.
     """
     if model.has_parts:
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    kept_sizes = lru_cache(KEPT_TABLES)(level_sizes)
+    kept_sizes = cache(level_sizes)  # all: CUDA graphs hold their addresses
     for module in model.modules():
         if isinstance(module, DeformableAttention):
-            module.sampling = fastest_sampling(device, gradients=gradients)
+            module.sampling = fastest_sampling(device)
             if not gradients:
                 module.level_sizes = kept_sizes
             if not gradients and device.type == "cpu":
                 module.softmax, module.sample_hits = softmax_of_few, sample_hits
+        elif isinstance(module, ModulatedDeformableConvolution):
+            module.convolve = fastest_convolution(device)
 
 
-def fastest_sampling(device: torch.device, *, gradients: bool = False) -> nn.Module:
-    """The fastest module for `DeformableAttention.sampling` on a device.
+def has_triton(device: torch.device) -> bool:
+    """Whether Triton's kernels run on the device."""
+    return device.type == "cuda" and find_spec("triton") is not None
 
-    Args:
-        device: CPU, GPU or another one, such as "mps", which gets the plain module.
-        gradients: whether the module needs them.
-    """
+
+def fastest_convolution(device: torch.device) -> Convolve:
+    """The fastest function for `ModulatedDeformableConvolution.convolve` on a device, with gradients."""
+    if has_triton(device):
+        from bevcli.model.kernels.triton_convolution import deformable_convolution  # only where Triton is installed
+
+        return deformable_convolution
+    return predicted_deformable_convolution
+
+
+def fastest_sampling(device: torch.device) -> nn.Module:
+    """The fastest module for `DeformableAttention.sampling` on a device. Devices such as "mps" get the plain module."""
     if device.type == "cpu":
         return CompiledSampling()
-    if device.type == "cuda" and find_spec("triton") and not gradients:
+    if has_triton(device):
         from bevcli.model.kernels.triton_attention import TritonSampling  # only where Triton is installed
 
         return TritonSampling()
@@ -71,21 +85,6 @@ def fold_batch_norms(model: nn.Module, device: torch.device) -> None:
                 convolution.weight, None, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
             )
             parent.set_submodule(norm_name, nn.Identity())
-            if isinstance(convolution, nn.Conv2d):
-                convolution.bias = bias
-            else:
-                biased = CompiledDeformableConvolution if device.type == "cpu" else BiasedDeformableConvolution
-                parent.set_submodule(name, biased(convolution, bias))
-
-
-class BiasedDeformableConvolution(nn.Module):
-    """A deformable convolution with the bias that is left of a batch norm folded into it."""
-
-    def __init__(self, convolution: ModulatedDeformableConvolution, bias: Tensor) -> None:
-        super().__init__()
-        self.convolution = convolution
-        self.bias = nn.Parameter(bias.detach(), requires_grad=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """x: (B, C, H, W) -> (B, O, H', W')."""
-        return self.convolution(x) + self.bias[:, None, None]
+            convolution.bias = bias
+            if device.type == "cpu" and isinstance(convolution, ModulatedDeformableConvolution):
+                parent.set_submodule(name, CompiledDeformableConvolution(convolution))

@@ -112,15 +112,16 @@ class CompiledDeformableConvolution(nn.Module):
     product with the weight of all nine taps gives the result.
     """
 
-    def __init__(self, convolution: ModulatedDeformableConvolution, bias: Tensor) -> None:
-        """bias: (O,), the rest of a batch norm that was folded into the convolution."""
+    def __init__(self, convolution: ModulatedDeformableConvolution) -> None:
+        """The convolution has a bias, the rest of a batch norm that was folded into it."""
         super().__init__()
         self.stride, self.out_channels = convolution.stride, len(convolution.weight)
         self.offset_and_mask = convolution.offset_and_mask
+        assert convolution.bias is not None
         weight = convolution.weight.detach()  # (O, C, 3, 3)
         self.product = nn.Linear(9 * weight.shape[1], len(weight), device="meta")
         self.product.weight = nn.Parameter(weight.permute(0, 2, 3, 1).flatten(1).contiguous(), requires_grad=False)
-        self.product.bias = nn.Parameter(bias.detach(), requires_grad=False)
+        self.product.bias = nn.Parameter(convolution.bias.detach(), requires_grad=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, O, H', W'), channels last."""

@@ -13,10 +13,18 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.model.decoder import RegressionBranch
+from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
+Activation = Literal["none", "relu", "relu6"]
+# What oneDNN calls an activation, with its numbers.
+ACTIVATIONS: dict[Activation, tuple[str, list[float]]] = {
+    "none": ("none", []),
+    "relu": ("relu", []),
+    "relu6": ("hardtanh", [0.0, 6.0]),
+}
 OPERATORS = (
     "_convolution_pointwise",
     "_convolution_pointwise_",
@@ -72,13 +80,14 @@ class PackedLinear(nn.Module):
 
 
 class PackedConvolution(nn.Module):
-    """A convolution with its weight in the layout that oneDNN wants for the size of its input, and a ReLU if wanted."""
+    """A convolution with its weight in the layout that oneDNN wants for the size of its input, and an activation."""
 
     packed: Tensor
 
-    def __init__(self, convolution: nn.Conv2d, activation: Literal["none", "relu"] = "none") -> None:
+    def __init__(self, convolution: nn.Conv2d, activation: Activation = "none") -> None:
         super().__init__()
-        self.weight, self.bias, self.activation = convolution.weight, convolution.bias, activation
+        self.weight, self.bias, self.activation = convolution.weight, convolution.bias, ACTIVATIONS[activation]
+        self.after_sum = None if activation == "none" else activation
         geometry = convolution.padding, convolution.stride, convolution.dilation
         self.geometry = (*map(list, geometry), convolution.groups)
         self.packed_for: torch.Size | None = None
@@ -86,18 +95,47 @@ class PackedConvolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, in, H, W) -> (B, out, H', W'), channels last."""
         arguments = x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise(*arguments, self.activation, [], "")
+        return torch.ops.mkldnn._convolution_pointwise(*arguments, *self.activation, "")
 
     def add_to(self, shortcut: Tensor, x: Tensor) -> Tensor:
         """activation(convolution(x) + shortcut), (B, out, H', W'), in the memory of the shortcut."""
         arguments = shortcut, x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise_.binary(*arguments, "add", 1.0, self.activation, [], "")
+        return torch.ops.mkldnn._convolution_pointwise_.binary(*arguments, "add", 1.0, self.after_sum, [], "")
 
     def _packed(self, input_size: torch.Size) -> Tensor:
         if self.packed_for != input_size:
             pack = torch.ops.mkldnn._reorder_convolution_weight
             self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(input_size)), input_size
         return self.packed
+
+
+class PackedSameConvolution(PackedConvolution):
+    """A `SameConvolution` in oneDNN."""
+
+    def __init__(self, convolution: SameConvolution, activation: Activation = "none") -> None:
+        super().__init__(convolution, activation)
+        self.padding_for = convolution.padding_for
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H / 2, W / 2), rounded up, channels last."""
+        padding, rows, columns = self.padding_for(x)
+        self.geometry = (padding, *self.geometry[1:])
+        return super().forward(x)[..., rows:, columns:]
+
+
+class FusedInvertedResidual(nn.Module):
+    """An `InvertedResidual` whose batch norms are folded."""
+
+    def __init__(self, block: InvertedResidual) -> None:
+        super().__init__()
+        wide = [layer for layer in (block.expand, block.depthwise) if layer is not None]
+        self.wide = nn.Sequential(*(_packed(layer, "relu6") for layer in wide))
+        self.project, self.adds = PackedConvolution(block.project), block.adds
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As the block's own `forward`. Where it adds x, the result is written over x."""
+        y = self.wide(x)
+        return self.project.add_to(x, y) if self.adds else self.project(y)
 
 
 class FusedBlock(nn.Module):
@@ -114,6 +152,12 @@ class FusedBlock(nn.Module):
         """As the block's own `forward`. Without a `downsample` the result is written over x."""
         y = self.first(x)
         return self.last.add_to(self.downsample(x), y)
+
+
+def _packed(convolution: nn.Conv2d, activation: Activation = "none") -> PackedConvolution:
+    if isinstance(convolution, SameConvolution):
+        return PackedSameConvolution(convolution, activation)
+    return PackedConvolution(convolution, activation)
 
 
 def _with_relu(convolution: nn.Module) -> nn.Module:
@@ -144,10 +188,12 @@ def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
         return layer
     if isinstance(layer, Bottleneck | BasicBlock):
         return FusedBlock(layer)
+    if isinstance(layer, InvertedResidual):
+        return FusedInvertedResidual(layer)
     if isinstance(layer, FeedForward):  # dropout has no effect in inference
         expand = PackedLinear(layer.expand, layer.activation, rounds=rounds)
         return nn.Sequential(expand, PackedLinear(layer.reduce, rounds=rounds))
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
     if type(layer) is nn.Linear:
         return PackedLinear(layer, rounds=rounds)
-    return PackedConvolution(layer) if type(layer) is nn.Conv2d else layer
+    return _packed(layer) if isinstance(layer, nn.Conv2d) else layer

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 from itertools import accumulate
+from typing import Any
 
 import torch
 import triton
@@ -12,14 +13,14 @@ import triton.language as tl
 from torch import Tensor, nn
 
 from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.kernels.triton_bilinear import corner_of
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
-KEPT_TABLES = 32  # those of the sampling of all layers of a model, and of some frames' hits
 
 
 class TritonSampling(nn.Module):
-    """Takes the place of `GridSampling` on a GPU, without gradients."""
+    """Takes the place of `GridSampling` on a GPU."""
 
     def forward(
         self,
@@ -30,32 +31,69 @@ class TritonSampling(nn.Module):
         queries_per_map: Sequence[int],
     ) -> Tensor:
         """Arguments and result as for `GridSampling`."""
-        maps, cells, heads, depth = values.shape
-        queries, _, levels, points, _ = locations.shape
+        sums = _WeightedSums.apply(values, locations, weights, level_shapes, tuple(queries_per_map))
+        return sums.flatten(1)
+
+
+class _WeightedSums(torch.autograd.Function):
+    """The sums (M, heads, D) float32, and their gradients."""
+
+    @staticmethod
+    def forward(
+        context: Any,
+        values: Tensor,
+        locations: Tensor,
+        weights: Tensor,
+        level_shapes: LevelShapes,
+        queries_per_map: tuple[int, ...],
+    ) -> Tensor:
+        read = (values.contiguous(), locations.float().contiguous(), weights.float().contiguous())
+        context.save_for_backward(*read)
+        context.dtypes = (values.dtype, locations.dtype, weights.dtype)
         ends = _table(tuple(accumulate(queries_per_map)), values.device)
-        shapes = _table(level_shapes, values.device)
-        out = values.new_empty(queries, heads, depth, dtype=torch.float32)
-        if queries:
-            # Triton launches on the current GPU, which need not be that of the tensors.
-            with torch.cuda.device(values.device):
-                _sample[(triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)](
-                    values.contiguous(),
-                    shapes,
-                    locations.float().contiguous(),
-                    weights.float().contiguous(),
-                    ends,
-                    out,
-                    queries,
-                    maps,
-                    cells,
-                    **constants(heads, depth, levels, points),
-                )
-        return out.flatten(1)
+        context.tables = (_table(level_shapes, values.device), ends)
+        out = values.new_empty(len(locations), *values.shape[2:], dtype=torch.float32)
+        _launch(_sample, *read, context.tables, out)
+        return out
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        read = context.saved_tensors
+        results = (torch.zeros_like(read[0], dtype=torch.float32), *map(torch.empty_like, read[1:]))
+        _launch(_sample_backward, *read, context.tables, gradients[0].contiguous(), *results)
+        learned = (result.to(dtype) for result, dtype in zip(results, context.dtypes, strict=True))
+        return *learned, None, None
 
 
-@lru_cache(KEPT_TABLES)
+def _launch(
+    kernel: Any, values: Tensor, locations: Tensor, weights: Tensor, tables: tuple[Tensor, Tensor], *others: Tensor
+) -> None:
+    maps, cells, heads, depth = values.shape
+    queries, _, levels, points, _ = locations.shape
+    shapes, ends = tables
+    if queries:
+        # Triton launches on the current GPU, which need not be that of the tensors.
+        with torch.cuda.device(values.device):
+            kernel[(triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)](
+                values,
+                shapes,
+                locations,
+                weights,
+                ends,
+                *others,
+                queries,
+                maps,
+                cells,
+                **constants(heads, depth, levels, points),
+            )
+
+
+@cache
 def _table(rows: tuple[int, ...] | LevelShapes, device: torch.device) -> Tensor:
-    """The rows as int32 on a device. Equal tables, as all layers of a model need them, are uploaded once."""
+    """The rows as int32 on a device. Equal tables, as all layers and frames need them, are uploaded once.
+
+    None is given up, because CUDA graphs hold their addresses.
+    """
     return upload(torch.tensor(rows, dtype=torch.int32), device)
 
 
@@ -93,33 +131,94 @@ def _sample(  # type: ignore[no-untyped-def]
     channel = tl.arange(0, PADDED_DEPTH)
     exists = query < queries
     has_channel = channel < DEPTH
-    map_of_query = tl.zeros((BLOCK,), tl.int64)
-    for index in range(maps - 1):
-        map_of_query += (query >= tl.load(ends + index)).to(tl.int64)
-    first_cell = map_of_query * cells
+    first_cell = _map_of(query, ends, maps, BLOCK) * cells
     total = tl.zeros((BLOCK, PADDED_DEPTH), tl.float32)
     for level in range(LEVELS):
         height = tl.load(shapes + 2 * level)
         width = tl.load(shapes + 2 * level + 1)
         for point in range(POINTS):
             sample = ((query * HEADS + head) * LEVELS + level) * POINTS + point
-            # Locations more than a cell outside the map contribute nothing; the clamp keeps them within an int32.
-            x = tl.load(locations + 2 * sample, exists, -1.0) * width - 0.5
-            y = tl.load(locations + 2 * sample + 1, exists, -1.0) * height - 0.5
-            x = tl.minimum(tl.maximum(x, -2.0), width + 1.0)
-            y = tl.minimum(tl.maximum(y, -2.0), height + 1.0)
+            y, x = _position(locations, sample, exists, height, width)
             weight = tl.load(weights + sample, exists, 0.0)
-            left = tl.floor(x)
-            top = tl.floor(y)
             for corner in tl.static_range(4):
-                column = left + corner % 2
-                row = top + corner // 2
-                share = (1.0 - tl.abs(x - column)) * (1.0 - tl.abs(y - row)) * weight
-                inside = exists & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-                cell = first_cell + row.to(tl.int64) * width + column.to(tl.int64)
+                cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
                 address = values + (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
                 value = tl.load(address, inside[:, None] & has_channel[None, :], 0.0)
-                total += share[:, None] * value.to(tl.float32)
+                total += (of_columns * of_rows * weight)[:, None] * value.to(tl.float32)
         first_cell += height * width
     target = out + (query[:, None] * HEADS + head) * DEPTH + channel[None, :]
     tl.store(target, total, exists[:, None] & has_channel[None, :])
+
+
+@triton.jit
+def _sample_backward(  # type: ignore[no-untyped-def]
+    values,
+    shapes,
+    locations,
+    weights,
+    ends,
+    out_gradient,
+    values_gradient,
+    locations_gradient,
+    weights_gradient,
+    queries,
+    maps,
+    cells,
+    HEADS: tl.constexpr,
+    DEPTH: tl.constexpr,
+    PADDED_DEPTH: tl.constexpr,
+    LEVELS: tl.constexpr,
+    POINTS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """As `_sample`: adds to values_gradient, and writes the other gradients, all float32."""
+    query = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    head = tl.program_id(1)
+    channel = tl.arange(0, PADDED_DEPTH)
+    exists = query < queries
+    has_channel = channel < DEPTH
+    first_cell = _map_of(query, ends, maps, BLOCK) * cells
+    source = out_gradient + (query[:, None] * HEADS + head) * DEPTH + channel[None, :]
+    gradient = tl.load(source, exists[:, None] & has_channel[None, :], 0.0)
+    for level in range(LEVELS):
+        height = tl.load(shapes + 2 * level)
+        width = tl.load(shapes + 2 * level + 1)
+        for point in range(POINTS):
+            sample = ((query * HEADS + head) * LEVELS + level) * POINTS + point
+            y, x = _position(locations, sample, exists, height, width)
+            weight = tl.load(weights + sample, exists, 0.0)
+            of_y = tl.zeros((BLOCK,), tl.float32)
+            of_x = tl.zeros((BLOCK,), tl.float32)
+            of_weight = tl.zeros((BLOCK,), tl.float32)
+            for corner in tl.static_range(4):
+                cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
+                place = (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
+                read = inside[:, None] & has_channel[None, :]
+                share = of_columns * of_rows
+                tl.atomic_add(values_gradient + place, (share * weight)[:, None] * gradient, read, "relaxed")
+                product = tl.sum(tl.load(values + place, read, 0.0).to(tl.float32) * gradient, 1)
+                of_weight += share * product
+                of_y += (corner // 2 * 2 - 1) * of_columns * product
+                of_x += (corner % 2 * 2 - 1) * of_rows * product
+            tl.store(weights_gradient + sample, of_weight, exists)
+            tl.store(locations_gradient + 2 * sample, of_x * weight * width, exists)
+            tl.store(locations_gradient + 2 * sample + 1, of_y * weight * height, exists)
+        first_cell += height * width
+
+
+@triton.jit
+def _map_of(query, ends, maps, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Index of the map that each query samples."""
+    map_of_query = tl.zeros((BLOCK,), tl.int64)
+    for index in range(maps - 1):
+        map_of_query += (query >= tl.load(ends + index)).to(tl.int64)
+    return map_of_query
+
+
+@triton.jit
+def _position(locations, sample, exists, height, width):  # type: ignore[no-untyped-def]
+    """y and x of samples, in cells of a level."""
+    # Locations more than a cell outside the map contribute nothing; the clamp keeps them within an int32.
+    x = tl.load(locations + 2 * sample, exists, -1.0) * width - 0.5
+    y = tl.load(locations + 2 * sample + 1, exists, -1.0) * height - 0.5
+    return tl.minimum(tl.maximum(y, -2.0), height + 1.0), tl.minimum(tl.maximum(x, -2.0), width + 1.0)

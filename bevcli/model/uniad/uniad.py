@@ -12,7 +12,7 @@ from bevcli.errors import BevcliError, ConfigError
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
 from bevcli.model.box_coding import boxes_of_codes
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import ObjectQueries
@@ -142,10 +142,14 @@ class UniAD(BEVFormer):
             tracks: of the previous frame; None for the first frame of all.
             motion: since the previous frame; needed with tracks.
         """
-        bev = self.bev_map(inputs, history)
+        bev = self.device_part(self.host_part(inputs, history))
         outputs = self.track(bev, tracks, motion)
         with torch.autocast(bev.device.type, enabled=False):
             return replace(outputs, map=self.map_head(bev.float()))
+
+    def device_part(self, inputs: EncoderInputs) -> Tensor:
+        """The BEV map (B, Y·X, C): the number of tracks changes, and the CPU chooses them."""
+        return self.encode(inputs)
 
     def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
         """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
@@ -201,7 +205,7 @@ class UniAD(BEVFormer):
         frame, device = prepared.frame, self.device
         is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
         previous_pose = memory.pose if memory is not None and is_known else None
-        inputs = model_inputs([prepared], [previous_pose], self.config).to(device)
+        inputs = model_inputs([prepared], [previous_pose], self.config).to(device, keep_geometry=True)
         history = tracks = motion = None
         if memory is not None:
             history = None if memory.bev is None else memory.bev.to(device)

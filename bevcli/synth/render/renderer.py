@@ -22,6 +22,8 @@ from bevcli.synth.render.rasteriser import ShadowMap, VisibilityBuffer, rasteris
 from bevcli.synth.render.shading_kernels import LIGHT_LIMIT, shade_pixels
 from bevcli.synth.world.weather import Weather
 
+NO_PATTERN = (0.0, 1.0, 0.0)
+
 
 @dataclass(frozen=True)
 class WorldSnapshot:
@@ -33,6 +35,7 @@ class WorldSnapshot:
         ground: texture of the ground.
         shadows: shadow map.
         weather: light, sky and haze.
+        pattern: strength, waves per metre and hardness of a pattern on all surfaces but the ground.
     """
 
     soup: TriangleSoup
@@ -40,6 +43,7 @@ class WorldSnapshot:
     ground: GroundTexture
     shadows: ShadowMap
     weather: Weather
+    pattern: tuple[float, float, float] = NO_PATTERN
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,7 @@ def shade(
     image = np.zeros((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
         (buffer.triangles, buffer.inverse_depth),
-        (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades),
+        (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades, snapshot.pattern),
         (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
         (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.kind.shadow_softness_m),
         (w.light, w.to_sun, w.clouds, w.kind.haze_m, w.kind.lamps),

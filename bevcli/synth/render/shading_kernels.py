@@ -24,7 +24,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
     """Colour the pixels of `image` (H, W, 3) uint8 BGR, in place.
 
     buffer: triangles and inverse depths of `VisibilityBuffer`.
-    surfaces: normals, albedo, material, facade, facades of `TriangleSoup`.
+    surfaces: normals, albedo, material, facade, facades of `TriangleSoup`, pattern of `WorldSnapshot`.
     ground: texels, offsets, roughness, x and y of the origin, texel size and size of `GroundTexture`.
     shadows: heights, x and y of the origin, texel size and shear of `ShadowMap`, softness in metres.
     weather: light (7, 3) with rows sun, sky, bounce, zenith, horizon, haze, cloud; to_sun; clouds; haze_m; lamps.
@@ -35,7 +35,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
     The function is long because its parts would exchange a dozen numbers for every pixel.
     """
     triangles, inverse_depth = buffer
-    normals, albedo, material, facade, facades = surfaces
+    normals, albedo, material, facade, facades, pattern = surfaces
     light, to_sun, clouds, haze_m, lamps = weather
     ray_from_image, eye, pixel_angle = view
     sun, sky, bounce, haze = light[0], light[1], light[2], light[5]
@@ -76,6 +76,8 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                     kind = GLASS
             else:
                 a[0], a[1], a[2] = albedo[t, 0], albedo[t, 1], albedo[t, 2]
+            if pattern[0] > 0 and kind != GROUND:
+                grain = _pattern(pattern, ground[2], px, py, pz, footprint)
             if kind == GLOW:
                 for c in range(3):
                     a[c] *= 0.35 + 0.65 * lamps
@@ -243,6 +245,17 @@ def _ground(ground, x, y, across, along, rx, ry, out):
         fine = _hash(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
         grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
     return grain
+
+
+@njit(nogil=True, error_model="numpy")
+def _pattern(pattern, texture, x, y, z, footprint):
+    """Relative brightness around 0 of the pattern at a point. footprint: size of the pixel, metres; it fades out."""
+    strength, waves, hardness = pattern
+    scale = waves * 4.0  # texels of `roughness` per metre
+    value = 4.0 * _repeated(texture, (x + 0.61 * z) * scale, (y - 0.73 * z) * scale)
+    if hardness > 0:
+        value = 0.5 if value > 0 else -0.5
+    return strength * min(max(value, -1.0), 1.0) * min(1.0, 0.5 / (waves * footprint))
 
 
 @njit(nogil=True, error_model="numpy")

@@ -13,6 +13,7 @@ from bevcli.synth.assets.mesh import Mesh, TriangleSoup, from_faces, joined, pri
 from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
 from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle, side_of
+from bevcli.synth.world.looks import Looks
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
 from bevcli.synth.world.traffic import Signals
 
@@ -174,8 +175,8 @@ SIGNALS_REACH_M = 110.0  # traffic signals are drawn within this distance
 class Scenery:
     """The scenery of a city. Blocks are made when they are first needed, and kept."""
 
-    def __init__(self, city: CityPlan, furniture: StreetFurniture) -> None:
-        self.city, self.furniture = city, furniture
+    def __init__(self, city: CityPlan, furniture: StreetFurniture, looks: Looks | None = None) -> None:
+        self.city, self.furniture, self._looks = city, furniture, looks
         self._block = lru_cache(maxsize=None)(self._make_block)
 
     def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
@@ -231,6 +232,9 @@ class Scenery:
         if rng.random() < 0.25:
             spot = start + way * length * rng.uniform(0.3, 0.7) + inward * 1.9
             yield self._put(self.furniture.shelter, spot, outward)
+        if self._looks is not None:
+            for mesh, along, away in self._looks.clutter(length, land.column, land.row, side):
+                yield self._put(mesh, start + way * along + inward * away, outward + along)
 
     def _put(self, template: TriangleSoup, point: Array, yaw: float) -> TriangleSoup:
         x, y = self.city.bend(point)

@@ -1,0 +1,132 @@
+"""A program for Triton's interpreter (TRITON_INTERPRET=1): the kernels compared with the plain versions on the CPU.
+
+It prints one line for each case. The results and the gradients of the two versions have to be equal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.config import known_models, load_config
+from bevcli.model.config import ModelConfig
+from bevcli.model.deformable_attention import GridSampling
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
+from bevcli.model.resnet import ResNet
+
+LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
+FAR = 1e6  # where positions have no gradients
+SCALE = 32  # channels are divided by it
+
+
+def attention_shapes(config: ModelConfig) -> set[tuple[int, int, int, int, bool]]:
+    """(heads, channels of a head, levels, points, whether the values are image features) of a model's attentions."""
+    encoder, decoder, segmentation = config.encoder, config.decoder, config.segmentation
+    found = {
+        (encoder.attention_heads, 1, encoder.temporal_points, False),
+        (encoder.attention_heads, config.encoder_levels, encoder.spatial_points, True),
+        (decoder.attention_heads, 1, decoder.points, False),
+    }
+    if "segmentation" in config.heads:
+        found.add((segmentation.attention_heads, 1, segmentation.points, False))
+    return {(heads, config.channels // heads, levels, points, images) for heads, levels, points, images in found}
+
+
+def convolution_shapes(config: ModelConfig) -> set[tuple[int, int, int]]:
+    """(input channels, output channels, stride) of a model's deformable convolutions."""
+    with torch.device("meta"):
+        modules = list(ResNet(config.backbone).modules())
+    found = [module for module in modules if isinstance(module, ModulatedDeformableConvolution)]
+    return {(each.weight.shape[1], each.weight.shape[0], each.stride) for each in found}
+
+
+def attention_case(heads: int, depth: int, levels: int, points: int, counts: Sequence[int]) -> list[Tensor]:
+    """Values, locations inside a map, on its rim and far outside, and weights."""
+    random = torch.Generator().manual_seed(heads)
+    cells, queries = sum(height * width for height, width in LEVEL_SHAPES[:levels]), sum(counts)
+    locations = torch.rand(queries, heads, levels, points, 2, generator=random) * 1.6 - 0.3
+    for xy, query in zip((6.7e6, -6.7e6, 0.0, 1.0), range(queries), strict=False):
+        locations[query] = xy
+    values = torch.randn(len(counts), cells, heads, depth, generator=random)
+    return [values, locations, torch.rand(queries, heads, levels, points, generator=random)]
+
+
+def convolution_case(
+    channels: int, outputs: int, stride: int, size: tuple[int, int] = (4, 5), batch: int = 2
+) -> list[Tensor]:
+    """Values, offsets and masks, weight and bias; some offsets lead far outside."""
+    random = torch.Generator().manual_seed(channels)
+    height, width = ((length - 1) // stride + 1 for length in size)
+    predicted = 2 * torch.randn(batch, 27, height, width, generator=random)
+    predicted[:, :4, :1], predicted[:, 4:8, :1] = 6.7e6, -6.7e6
+    weight = torch.randn(outputs, channels, 3, 3, generator=random)
+    return [
+        torch.randn(batch, channels, *size, generator=random),
+        predicted,
+        weight,
+        torch.randn(outputs, generator=random),
+    ]
+
+
+def compare(name: str, inputs: list[Tensor], plain: Callable[..., Tensor], kernel: Callable[..., Tensor]) -> None:
+    """Compare the results and the gradients for all inputs, after the results of one direction."""
+    found = []
+    for function in (plain, kernel):
+        learned = [each.clone().requires_grad_() for each in inputs]
+        result = function(*learned)
+        direction = torch.randn(result.shape, generator=torch.Generator().manual_seed(1))
+        found.append([result, *torch.autograd.grad((result * direction).sum(), learned)])
+    half = inputs[0].dtype != torch.float32
+    for expected, equal in zip(*found, strict=True):
+        assert equal.dtype == expected.dtype
+        near = expected.abs() < FAR
+        if half:  # the plain version rounds more often
+            assert (equal[near] - expected[near]).float().norm() <= 5e-3 * expected[near].float().norm()
+        else:
+            torch.testing.assert_close(equal[near], expected[near], rtol=1e-4, atol=1e-4)
+    print(name, flush=True)
+
+
+def main() -> None:
+    """Run all cases."""
+    import bevcli.model.kernels.triton_convolution as convolution
+    from bevcli.model.kernels.triton_attention import TritonSampling
+
+    torch.cuda.device = lambda which: contextlib.nullcontext()  # type: ignore[assignment,misc]
+    configs = [load_config(name) for name in known_models()]
+
+    def sampling(module: nn.Module, levels: int, counts: Sequence[int]) -> Callable[..., Tensor]:
+        return lambda values, locations, weights: module(values, LEVEL_SHAPES[:levels], locations, weights, counts)
+
+    samplings = {(*shape[:1], 6, *shape[2:4], (0, 5, 0, 2)) for each in configs for shape in attention_shapes(each)}
+    for heads, depth, levels, points, counts in [*sorted(samplings), (2, 8, 1, 4, (1,)), (2, 8, 1, 4, (0, 0))]:
+        inputs = attention_case(heads, depth, levels, points, counts)
+        both = [sampling(module, levels, counts) for module in (GridSampling(), TritonSampling())]
+        compare(f"attention {heads, depth, levels, points, counts}", inputs, *both)
+    inputs = attention_case(2, 8, 1, 4, (3,))
+    inputs[0] = inputs[0].half()
+    compare(
+        "attention in half precision", inputs, *(sampling(each(), 1, (3,)) for each in (GridSampling, TritonSampling))
+    )
+
+    def convolutions(stride: int) -> list[Callable[..., Tensor]]:
+        versions = (predicted_deformable_convolution, convolution.deformable_convolution)
+        return [lambda *inputs, each=each: each(*inputs, stride) for each in versions]
+
+    shapes = sorted({(c // SCALE, o // SCALE, s) for each in configs for c, o, s in convolution_shapes(each)})
+    cases = [*shapes, (6, 5, 1), (20, 17, 2), (3, 4, 1, (1, 1)), (3, 4, 2, (4, 4), 0)]
+    convolution._has_matrix_units = lambda device: False
+    halves = [each.half() for each in convolution_case(16, 16, 1)]
+    for kernel in ("columns", "one kernel"):
+        if kernel == "one kernel":
+            convolution._by_columns = convolution._in_one_kernel  # in float32 its products are exact too
+        for case in cases:
+            compare(f"convolution {case}, {kernel}", convolution_case(*case), *convolutions(case[2]))
+        compare(f"convolution in half precision, {kernel}", halves, *convolutions(1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Varied looks change what is seen, and nothing that is labelled."""
+
+import numpy as np
+
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
+from bevcli.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
+from bevcli.synth.world.looks import bent, recoloured
+
+
+def drive(varied: bool, seed: int = 5) -> RenderedDrive:
+    return RenderedDrive(seed, 2, rig=DrawnRig(nuscenes_like_rig(96, 54), varied=varied))
+
+
+def test_varied_looks_keep_the_boxes_and_change_the_images() -> None:
+    plain, varied = drive(varied=False).frame(1), drive(varied=True).frame(1)
+
+    np.testing.assert_array_equal(varied.boxes.centers, plain.boxes.centers)
+    np.testing.assert_array_equal(varied.boxes.sizes_lwh, plain.boxes.sizes_lwh)
+    np.testing.assert_array_equal(varied.boxes.classes, plain.boxes.classes)
+    for name, image in plain.images.items():
+        assert np.abs(varied.images[name].astype(int) - image).mean() > 5
+
+
+def test_varied_looks_of_a_seed_are_the_same_each_time() -> None:
+    first, second = drive(varied=True).frame(0), drive(varied=True).frame(0)
+
+    for name, image in first.images.items():
+        np.testing.assert_array_equal(second.images[name], image)
+
+
+def test_individuals_of_a_drive_look_different() -> None:
+    random, mesh = np.random.default_rng(0), Assets.build().by_class["car"][0].poses[0]
+    one, other = bent(mesh, random), bent(mesh, random)
+
+    assert np.abs(one.faces - other.faces).max() > 0.02
+    assert (recoloured(mesh, random).albedo != recoloured(mesh, random).albedo).any()
+
+
+def test_a_bent_mesh_stays_symmetric_and_near_its_cuboid() -> None:
+    mesh = Assets.build().by_class["car"][0].poses[0]
+    size = mesh.extents
+
+    for seed in range(20):
+        points = bent(mesh, np.random.default_rng(seed)).faces.reshape(-1, 3)
+        mirrored = points * (1, -1, 1)
+        assert abs(points[:, 1].max() + points[:, 1].min()) < 1e-5
+        assert np.ptp(points, axis=0).max() < 1.2 * size.max()
+        np.testing.assert_allclose(np.sort(mirrored[:, 1]), np.sort(points[:, 1]), atol=1e-5)
+
+
+def test_a_share_of_varied_drives_leaves_the_rigs_as_they_are() -> None:
+    plain, varied = RigDistribution(random_share=0.5), RigDistribution(random_share=0.5, varied_share=0.5)
+    drawn = [(draw_rig(plain, seed, (96, 54)), draw_rig(varied, seed, (96, 54))) for seed in range(40)]
+
+    assert not any(one.varied for one, _ in drawn)
+    assert 10 < sum(other.varied for _, other in drawn) < 30
+    for one, other in drawn:
+        assert one.rig.names == other.rig.names
+        assert one.jpeg_quality == other.jpeg_quality
+    assert RigDistribution().digest != RigDistribution(varied_share=0.5).digest
