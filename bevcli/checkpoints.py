@@ -1,5 +1,6 @@
 """Weights files: reads the official .pth and our .safetensors into the state dict of our model."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -22,6 +23,9 @@ from bevcli.writing import check_output, write_whole
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
+PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
+AVERAGES = r"ema_|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
+_TENSOR = (StoredTensor, type(None))
 
 
 @dataclass(frozen=True)
@@ -114,15 +118,31 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found")
     not_read: tuple[str, ...] = ()
+    left_out: list[str] = []
+    state: Mapping[str, Tensor]
     if path.suffix == ".safetensors":
         state, facts = read_safetensors(path, error=WeightsError)
     else:
-        state, facts, not_read = _read_pth(path)
+        state, facts, not_read = _read_pth(path, left_out)
+    state = _unwrapped(state, left_out)
     _check_numbers(path, state)
-    official, left_out = is_official(state), ""
+    official = is_official(state)
     if official:
-        state, left_out = from_official(state)
-    return Checkpoint(path, state, official, facts, left_out, not_read)
+        state, parts = from_official(state)
+        left_out += [parts] if parts else []
+    return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)
+
+
+def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str, Tensor]:
+    """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
+    kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
+    left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
+    prefixes = {found[0] for found in (re.match(PREFIXES, key) for key in kept) if found}
+    if len(prefixes) != 1 or "" in prefixes:
+        return kept
+    (prefix,) = prefixes
+    left_out.append(f'the prefix "{prefix}" of all names')
+    return {key.removeprefix(prefix): tensor for key, tensor in kept.items()}
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -160,21 +180,24 @@ def expected_state(config: ModelConfig) -> dict[str, Tensor]:
         return build_model(config).state_dict()
 
 
-def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
+def _read_pth(path: Path, left_out: list[str]) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
     file = read_pth(path)
-    contents = file.contents
-    state = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
+    contents = state = file.contents
+    if isinstance(contents, dict):
+        wrapper = next((key for key in ("state_dict", "model") if not isinstance(contents.get(key), _TENSOR)), "")
+        state = contents[wrapper] if wrapper else contents
+        left_out += ['everything but "model"'] if wrapper == "model" else []
     named = state if isinstance(state, dict) else {"": state}
     hidden = [f"{key}: {each.made_by}".removeprefix(": ") for key, each in named.items() if type(each) is Placeholder]
     if hidden:
         raise WeightsError(
             f"{path}: is not safe to read: its tensors are hidden behind code ({hidden[0]:.100}), which was not run "
-            "(expected tensors by name, at the top level or under state_dict)"
+            "(expected tensors by name, at the top level or under state_dict or model)"
         )
     is_named = isinstance(state, dict) and all(isinstance(key, str) for key in named)
     if not (state and is_named and all(isinstance(each, StoredTensor) for each in named.values())):
         raise WeightsError(
-            f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
+            f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict or model)"
         )
     meta = contents.get("meta")
     facts = {key: _fact(meta.get(key)) for key in ("epoch", "iter", "time")} if isinstance(meta, dict) else {}

@@ -144,6 +144,7 @@ class Frame:
         ground_truth_map: a map in the bev frame.
         ground_truth_lines: lines of the map in the bev frame, of LINE_CLASSES.
         sample_token: nuScenes' name of the frame.
+        impossible_boxes: number of ground-truth boxes that were left out: a size of 0 or less, or not finite.
     """
 
     stamp: FrameStamp
@@ -157,6 +158,7 @@ class Frame:
     ground_truth_map: BevMap | None = None
     ground_truth_lines: "MapLines | None" = None
     sample_token: str | None = None
+    impossible_boxes: int = 0
 
 
 @dataclass(frozen=True)

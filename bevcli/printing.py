@@ -59,3 +59,8 @@ def duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def quoted(value: object) -> object:
+    """A value of a file for a message: a text is in quotes."""
+    return f'"{value}"' if isinstance(value, str) else value

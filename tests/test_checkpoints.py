@@ -7,6 +7,7 @@ import json
 import math
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -161,6 +162,28 @@ def test_saved_weights_are_loaded_again(tmp_path: Path, suffix: str) -> None:
     load_weights(path, model)
     for key, tensor in model.state_dict().items():
         assert torch.equal(tensor, state[key]), key
+
+
+@pytest.mark.parametrize(
+    ("wrap", "said"),
+    [
+        (lambda state: {"state_dict": {f"module.{key}": value for key, value in state.items()}}, 'prefix "module."'),
+        (lambda state: {"state_dict": {f"model.{key}": value for key, value in state.items()}}, 'prefix "model."'),
+        (lambda state: {"model": state, "optimizer": {"lr": 1.0}}, 'everything but "model"'),
+        (lambda state: {"model": {f"module.{key}": value for key, value in state.items()}}, 'prefix "module."'),
+        (
+            lambda state: state | {f"ema_{key.replace('.', '_')}": 2 * value for key, value in state.items()},
+            "running averages (ema_*)",
+        ),
+    ],
+)
+def test_weights_of_other_programs_are_read_with_a_note(wrap: Callable, said: str, tmp_path: Path) -> None:
+    state = small_model(seed=1).state_dict()
+    torch.save(wrap(state), tmp_path / "w.pth")
+    found = read_checkpoint(tmp_path / "w.pth")
+    assert found.state.keys() == state.keys()
+    assert all(torch.equal(found.state[key], value) for key, value in state.items())
+    assert said in found.left_out
 
 
 def test_half_precision_weights_are_loaded_as_float32(tmp_path: Path) -> None:

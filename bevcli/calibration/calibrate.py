@@ -16,10 +16,11 @@ from bevcli.calibration.residuals import values
 from bevcli.calibration.result import CalibrationResult, corrected_rig
 from bevcli.calibration.solve import Solution
 from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_RIG, Unknowns
-from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, read_views
+from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, WIDTH, read_views
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.frame import Sequence
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 
@@ -87,7 +88,7 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     deviations = np.sqrt(np.diag(covariance))
     mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
     count, pairs = int(mine.sum()), len(np.unique(groups[mine]))
-    reason = _reason(count, pairs, np.degrees(deviations[:3]))
+    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index])
     enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
@@ -113,14 +114,20 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     )
 
 
-def _reason(matches: int, pairs: int, deviations_deg: Array) -> str:
-    """Why a camera is not measurable; "" where it is."""
+def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> str:
+    """Why a camera is not measurable; "" where it is. Of small images, with the size that would do."""
+    # Matches grow with the area of an image, deviations shrink with its width.
+    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), deviations_deg.max() / WIDEST_DEG)
+    width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
+    height = round(camera.height * width / camera.width)
+    stated = f"{camera.width} x {camera.height}"
+    size = f"; its images are {stated}: about {width} x {height} would do" if width > camera.width else ""
     if matches < FEWEST_MATCHES:
-        return f"{matches} matches"
+        return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:
         return f"matches in {pairs} frame pairs"
     if deviations_deg.max() > WIDEST_DEG:
-        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only"
+        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only{size}"
     return ""
 
 

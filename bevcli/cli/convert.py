@@ -28,6 +28,7 @@ def convert(
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
     from bevcli.registry import load
+    from bevcli.sequences.images import no_image_error
     from bevcli.sequences.labels.sequence import WithLabels
     from bevcli.sequences.open import open_sequence
     from bevcli.sequences.output import GROUP, open_writer
@@ -39,6 +40,7 @@ def convert(
         sequence = WithLabels(sequence, labels.labels, labels)
     count = len(sequence.stamps)
     gaps, left_out = 0, set[str]()
+    images, boxes, reasons = 0, 0, dict[str, str]()
     with (
         open_writer(out, sequence, written) as writer,
         Progress(count, "frames", sequence.notes) as progress,
@@ -48,9 +50,15 @@ def convert(
             for camera, reason in frame.dropped.items():
                 progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
             gaps += len(frame.dropped)
+            reasons |= frame.dropped
+            images, boxes = images + len(frame.images), boxes + frame.impossible_boxes
             writer.write(frame)
             left_out |= load(GROUP, written.form).left_out(frame)
             progress.advance()
+        if not images:
+            raise no_image_error(sequence.name, reasons.items())
+    if boxes:
+        say(f"note: {boxes} boxes of the ground truth are left out: a size of 0 or less, or not finite", err=True)
     if left_out:
         name = load(GROUP, written.form).name
         say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)

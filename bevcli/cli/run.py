@@ -137,6 +137,8 @@ def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
 
     where = f"frame {frame.stamp.index}"
     found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
+    if frame.impossible_boxes:
+        found.append(f"{where}: {frame.impossible_boxes} true boxes are left out: a size of 0 or less, or not finite")
     if prediction.skipped:
         found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
     if prediction.not_finite:

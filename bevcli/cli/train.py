@@ -60,12 +60,13 @@ def train(
         raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
     torch.manual_seed(options.seed)
     job = prepare_training(model, choose_device(model_options.device), drives, options)
-    trainer = Trainer(job, resume=options.resume)
-    if job.group.leads:
-        _run(trainer)
-    else:
-        with StopSignals("step") as signals:
-            trainer.run(stop=signals.received)
+    with job.lock:
+        trainer = Trainer(job, resume=options.resume)
+        if job.group.leads:
+            _run(trainer)
+        else:
+            with StopSignals("step") as signals:
+                trainer.run(stop=signals.received)
     leave_process_group(job.group)
 
 
@@ -76,6 +77,8 @@ def _run(trainer: "Trainer") -> None:
 
     job, first = trainer.job, trainer.done
     updates, steps = job.config.clips.updates, job.config.steps - first
+    if steps < 0:
+        raise InputError(f"{job.out}: has done {first} steps already (expected at most `steps={job.config.steps}`)")
 
     def after_update(loss: float) -> None:
         progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
@@ -83,7 +86,7 @@ def _run(trainer: "Trainer") -> None:
 
     counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
     say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
-    for note in job.notes:
+    for note in (*job.notes, *job.changed_settings()):
         print_note(note)
     for start in job.warm_starts:
         say(start.table())

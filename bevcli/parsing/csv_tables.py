@@ -4,6 +4,7 @@ import csv
 import io
 import re
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from bevcli.errors import InputError
@@ -11,6 +12,8 @@ from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import read_text
 
 LARGEST_BYTES = 256 << 20
+NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
+UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
@@ -42,7 +45,7 @@ class CsvRow:
         text = self.cells[column]
         digits = text.removeprefix("-")
         if not (digits.isascii() and digits.isdigit()):
-            raise self.error(column, f'expected an integer, found "{text:.40}": remove decimal point and exponent')
+            raise self.error(column, f'expected an integer, found "{text:.40}": {_advice(text, column)}')
         if len(digits) > 19 or int(digits) > LARGEST_INTEGER:
             raise self.error(column, f'the integer "{text:.24}" is too large (expected at most 62 bits)')
         return int(text)
@@ -57,6 +60,20 @@ class CsvRow:
         if not abs(value) < LARGEST_NUMBER:
             raise self.error(column, f'expected a finite number, found "{text:.24}": correct or remove the row')
         return value
+
+
+def _advice(text: str, column: str) -> str:
+    """The way to an integer from a cell that is none: the right number, or that it is lost."""
+    try:
+        value = Decimal(text if re.fullmatch("[-+.0-9eE]+", text) else "")
+    except InvalidOperation:
+        return "write digits only"
+    if value.as_tuple().exponent > 0 or value.adjusted() > 40:  # type: ignore[operator]
+        return "its last digits are lost, as spreadsheets round long numbers: write the table anew from its source"
+    power = next((power for power in (0, 3, 6) if value.adjusted() + power >= NANOSECONDS_FROM), 9)
+    if not column.endswith("timestamp_ns") or power == 0:
+        return f"write {value:.0f}" if value == value.to_integral_value() else "write an integer"
+    return f"write nanoseconds: {value.scaleb(power):.0f}, if it is in {UNITS[power]}"
 
 
 def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> tuple[CsvRow, ...]:

@@ -22,6 +22,7 @@ from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.runs.state import START_ANEW, RunState, StateSaver, run_facts, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
+from bevcli.sequences.images import no_image_error
 
 Steps = Iterator[tuple[Frame, Prediction, RunnerState[Any]]]  # of `Runner.run`
 
@@ -59,7 +60,7 @@ def run_into_folder(
         should_stop: asked after each frame, in the same thread; True ends the run.
 
     Raises:
-        InputError: see `run`.
+        InputError: see `run`; or not one image of the drive could be read.
         OutputError: the folder holds something already, is in use by another run, cannot be written or was deleted; or
             the run to resume was another one.
     """
@@ -95,6 +96,8 @@ def run_into_folder(
 
         try:
             _write_steps(steps(state.runner), files, summary, saver, after_frame, should_stop)
+            if summary.is_complete and len(summary.counts.skipped) == summary.frames:
+                raise no_image_error(sequence.name, (each[1:] for each in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())

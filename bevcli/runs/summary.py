@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bevcli._version import __version__
 from bevcli.frame import Frame, Prediction
+from bevcli.inference.image_repair import BLACK_SHARE, WHITE_SHARE, grey_levels, sampled
 from bevcli.inference.load import Model
 from bevcli.printing import duration
 from bevcli.rig.sequence_checks import CheckedDrive
@@ -16,6 +17,7 @@ from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
 from bevcli.writing import write_whole
 
+NEARLY_BLACK, NEARLY_WHITE = 24, 231  # grey levels that no image reaches whose numbers are stored in too many bits
 RATIO = 1.01  # of two neighbouring bins of a `RunningMedian`
 LAST_BIN = 5000  # 1e21 seconds
 
@@ -72,6 +74,7 @@ class Counts:
         not_finite: (frame, where) of frames whose numbers stopped being finite.
         started_anew: (frame, reason) of frames without history.
         embeddings: camera of the rig -> camera of the model.
+        flat: camera -> number of images that are nearly black or white.
     """
 
     seconds: dict[str, RunningMedian] = field(default_factory=dict)
@@ -83,6 +86,7 @@ class Counts:
     not_finite: list[tuple[int, str]] = field(default_factory=list)
     started_anew: list[tuple[int, str]] = field(default_factory=list)
     embeddings: dict[str, str] = field(default_factory=dict)
+    flat: dict[str, int] = field(default_factory=dict)
 
 
 class RunSummary:
@@ -114,6 +118,10 @@ class RunSummary:
                 owners = zip(shown.instances.tolist(), shown.classes.tolist(), strict=True)
                 counts.tracks = counts.tracks or {}
                 counts.tracks.update({instance: name for instance, name in owners if instance})
+        for name, image in frame.images.items():
+            black, white = grey_levels(sampled(image.pixels_bgr), (BLACK_SHARE, WHITE_SHARE))
+            if white < NEARLY_BLACK or black > NEARLY_WHITE:
+                counts.flat[name] = counts.flat.get(name, 0) + 1
         index = frame.stamp.index
         counts.dropped += [(index, camera, reason) for camera, reason in frame.dropped.items()]
         if prediction.skipped:
@@ -122,6 +130,12 @@ class RunSummary:
             counts.not_finite.append((index, prediction.not_finite))
         if prediction.started_anew:
             counts.started_anew.append((index, str(prediction.started_anew)))
+
+    def _rig_notes(self) -> list[str]:
+        missing = Counter(camera for _, camera, _ in self.counts.dropped)
+        flat = [name for name, count in self.counts.flat.items() if count == self.frames - missing[name]]
+        notes = [f"all images of {name} are nearly black or white: are they 12 bits in 16?" for name in flat]
+        return [*self.input_errors, *self._model.rig_notes(self._sequence.rig), *notes]
 
     @property
     def frames(self) -> int:
@@ -160,7 +174,7 @@ class RunSummary:
             "skipped_frames": counts.skipped,
             "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
             "started_anew": _rows(counts.started_anew, "frame", "reason"),
-            "notes": [*self._sequence.notes, *self.input_errors, *self._model.rig_notes(self._sequence.rig)],
+            "notes": [*self._sequence.notes, *self._rig_notes()],
             "files": [str(path) for path in self.files],
         }
 
@@ -191,8 +205,7 @@ class RunSummary:
             rows.append(("failed", f"{len(counts.not_finite)} frames: NaN or infinity, first in {where}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
-        rows += [("rig", note) for note in self.input_errors]
-        rows += [("rig", note) for note in self._model.rig_notes(self._sequence.rig)]
+        rows += [("rig", note) for note in self._rig_notes()]
         rows += [("written", str(path)) for path in self.files]
         return "\n".join(f"{name:<8} {text}" for name, text in rows)
 

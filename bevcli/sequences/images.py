@@ -1,7 +1,7 @@
 """A listed frame -> a Frame: its images, read from files or videos and decoded in parallel, and its poses."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +49,12 @@ class ImageSource:
 
     def __str__(self) -> str:
         return str(self.path) if self.video_index is None else f"{self.path}#{self.video_index}"
+
+
+def no_image_error(drive: str, reasons: Iterable[tuple[str, str]]) -> InputError:
+    """The error of a drive of which not one image could be read. reasons: cameras and why; the first one is named."""
+    why = next((f" (camera {camera}: {reason})" for camera, reason in reasons), "")
+    return InputError(f"{drive}: not one image could be read{why}: bring the images back")
 
 
 class UnreadableImage(Exception):

@@ -13,6 +13,7 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.selection import (
     WithClassNames,
     WithoutGroundTruth,
+    check_time_unit,
     select_every,
     select_range,
     select_rate,
@@ -52,6 +53,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     chosen = format_of(path)
     own = own_options(path, chosen, changes)
     sequence = chosen.open(path, options, own)
+    check_time_unit(sequence, path)
     if options.ground_truth:
         sequence = WithClassNames(sequence, ClassNames(options.class_map, options.classes or NUSCENES_CLASSES))
     else:

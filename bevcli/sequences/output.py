@@ -62,9 +62,16 @@ class FolderWriter(ExitStack):
     def _close(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is None:
             self._finish()
+            try:
+                self._read_back()
+            except InputError as error:
+                raise InputError(f"{self.folder}: is not written, because it could not be read: {error}") from None
 
     def _finish(self) -> None:
         """Write what needs all frames."""
+
+    def _read_back(self) -> None:
+        """Open what was written, so that nothing is left that a run would refuse. Raises InputError."""
 
     def _write_image(self, name: str, image: CameraImage) -> str:
         """Write an image file as it was read, or else a PNG; returns its path relative to the folder, with suffix."""

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence as Indices
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from bevcli.sequences.files.class_names import ClassNames
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+SHORTEST_PERIODS_NS = 3_000_000, 5_000_000  # between frames: a shorter one has a wrong unit; the right unit gives more
 LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
@@ -44,7 +45,7 @@ class WithoutGroundTruth(DerivedSequence):
 
 
 class WithClassNames(DerivedSequence):
-    """A sequence whose ground truth has the names of known classes; a note names boxes of other classes."""
+    """A sequence whose ground truth has the names of known classes, without impossible boxes; a note names others."""
 
     def __init__(self, sequence: Sequence, names: ClassNames) -> None:
         super().__init__(sequence)
@@ -66,7 +67,26 @@ class WithClassNames(DerivedSequence):
 
     def _renamed(self, frame: Frame) -> Frame:
         truth = frame.ground_truth
-        return frame if truth is None else replace(frame, ground_truth=self._names.renamed(truth))
+        if truth is None:
+            return frame
+        possible = (truth.sizes_lwh > 0).all(axis=1) & np.isfinite(truth.to_numpy()[:, :7]).all(axis=1)
+        kept = truth if possible.all() else truth[possible]
+        return replace(frame, ground_truth=self._names.renamed(kept), impossible_boxes=len(truth) - len(kept))
+
+
+def check_time_unit(sequence: Sequence, source: object) -> None:
+    """Raise InputError where frames follow each other so fast that their times are no nanoseconds."""
+    pairs = pairwise(sequence.stamps)
+    periods = [after.timestamp_ns - before.timestamp_ns for before, after in pairs if before.scene == after.scene]
+    period = (np.median(periods) or np.mean(periods)) if periods else np.inf
+    if period < SHORTEST_PERIODS_NS[0]:
+        # In place of nanoseconds, or of microseconds as in nuScenes' tables.
+        units = {10**3: "microseconds or milliseconds", 10**6: "milliseconds or seconds", 10**9: "seconds"}
+        factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)
+        raise InputError(
+            f"{source}: the timestamps are {factor} times too small (in {units[factor]}?): the frames are {period:.0f} "
+            f"ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
+        )
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

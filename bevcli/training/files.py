@@ -5,6 +5,7 @@ A file is written under a temporary name and renamed: a kill leaves the old one 
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.util
 import io
@@ -22,7 +23,7 @@ from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
 from bevcli.parsing.pth import read_pth
-from bevcli.writing import whole_file, write_whole
+from bevcli.writing import output_errors, whole_file, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,13 +75,30 @@ def load_checkpoint(
                 f"start a new training with `weights={path.with_name('weights.safetensors')}` and another `out`"
             )
         trained.load_state_dict(contents["model"])
+        settings = [dict(group) for group in optimizer.param_groups]
         optimizer.load_state_dict(contents["optimizer"])
+        for group, own in zip(optimizer.param_groups, settings, strict=True):
+            group.update(own)  # of this training, not of the file
         for key, value in {} if average is None else average.items():
             value.copy_(contents["average"][key])
-        return int(contents["step"])
+        _check_numbers(optimizer, [*trained.state_dict().values(), *(average or {}).values()])
+        if type(contents["step"]) is not int or contents["step"] < 0:
+            raise ValueError(f"its step is {contents['step']!r:.40} (expected an integer, 0 or more)")
+        return contents["step"]
     except _DAMAGE as error:
         reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
+
+
+def _check_numbers(optimizer: torch.optim.AdamW, tensors: list[Tensor]) -> None:
+    """Raises ValueError for what PyTorch takes: moments of a wrong shape or sign, NaN in them or in `tensors`."""
+    for parameter, own in optimizer.state.items():
+        first, second, step = (own[name] for name in ("exp_avg", "exp_avg_sq", "step"))
+        if not first.shape == second.shape == parameter.shape or step.shape or min(step, second.min()) < 0:
+            raise ValueError("the optimizer's moments do not fit the weights")
+        tensors = [*tensors, first, second, step]
+    if not all(torch.isfinite(tensor).all() for tensor in tensors):
+        raise ValueError("some of its numbers are NaN or infinite")
 
 
 def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
@@ -161,23 +179,21 @@ def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
 
 
 def _read(path: Path) -> list[Row]:
-    """The rows of a file. Raises InputError."""
+    """The rows of a file, without damaged ones. Raises InputError."""
     if not path.is_file():
         return []
     text = read_text(path, LARGEST_CSV_BYTES)
-    try:
-        rows: list[Row] = [
-            {name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))
-        ]
-    except (ValueError, TypeError, csv.Error) as error:  # no number, a missing or an additional one, a null byte
-        raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
+    rows: list[Row] = []
+    for row in csv.DictReader(io.StringIO(text)):
+        with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
+            rows.append({name: float(value) for name, value in row.items()})
     if rows and "step" not in rows[0]:
         raise InputError(f"{path}: has no column step: move it away, or start a new training")
     return rows
 
 
 def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
-    with path.open(mode, newline="") as file:
+    with output_errors(path), path.open(mode, newline="") as file:
         if rows:
             writer = csv.DictWriter(file, list(rows[0]))
             if header:

@@ -1,8 +1,10 @@
 """Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
 
+import contextlib
+import json
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +16,8 @@ from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.network import Network, build_network
+from bevcli.parsing.documents import read_json
+from bevcli.runs.folder import OWN, folder_lock
 from bevcli.synth.drives import Drives, check_training_seeds
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
@@ -28,7 +32,7 @@ from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.warm_start import WarmStart, warm_start
 from bevcli.weights.fetch import weights_file
-from bevcli.writing import output_errors
+from bevcli.writing import write_whole
 
 
 @dataclass(frozen=True)
@@ -192,6 +196,7 @@ class TrainingJob:
         notes: about the drives, for the user.
         log: where the learning curves are written, besides the CSV files; None for nowhere.
         warm_starts: what the training starts from; empty for random weights, or if it is resumed.
+        lock: keeps other trainings out of the folder until it is closed; empty in other processes than the leader.
     """
 
     model: Network
@@ -205,6 +210,7 @@ class TrainingJob:
     notes: tuple[str, ...] = ()
     log: Log | None = None
     warm_starts: tuple[WarmStart, ...] = ()
+    lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property
     def loaders(self) -> int:
@@ -213,6 +219,16 @@ class TrainingJob:
             return self.config.loaders or 1
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - CORES_OF_TRAINING)
+
+    def changed_settings(self) -> tuple[str, ...]:
+        """A note where the settings differ from those of the training so far in this folder; stores them."""
+        file, old = self.out / OWN / "training.json", {}
+        settings = {"seed": self.seed, "steps": self.config.steps, **asdict(self.config.optimizer)}
+        if (self.out / CHECKPOINT).exists() and file.exists():  # else a new training, or one of an older version
+            old = read_json(file)
+        write_whole(file, json.dumps(settings).encode(), parents=True)
+        changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
+        return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
 
 
 def prepare_training(
@@ -252,15 +268,15 @@ def prepare_training(
     if options.backbone_weights is not None and not options.resume:
         backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
         started, notes = [*started, backbone], (*notes, *about)
-    if not options.resume:
-        with output_errors(out, "made"):
-            out.mkdir(parents=True, exist_ok=True)
-    group = join_process_group(device)
+    group, lock = join_process_group(device), contextlib.ExitStack()
+    if group.leads and not (options.resume and not out.exists()):
+        lock.enter_context(folder_lock(out))
+        check_folder(out, resume=options.resume)  # again: another training may have been faster
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
         write_split(out / "split.toml", split)
-    starts = tuple(started)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, starts)
+    rest = options.seed, group, notes, options.log, tuple(started), lock
+    return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
 
 def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:

@@ -9,7 +9,7 @@ import pytest
 import typer
 from accuracy import WrongTimes, errors_of_drive
 from command_line import MINI_TOML, command
-from memory_drive import MemorySequence
+from memory_drive import MemorySequence, make_camera
 from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, wrong_rig
 from typer.testing import CliRunner
 
@@ -257,3 +257,18 @@ def test_a_camera_that_sees_a_pavement_finds_the_road(tmp_path):
     errors = {each.camera: each for each in errors_of_drive(drive, [4], [0])}
     assert abs(errors["right"].height_m) < 0.03  # the pavement to its right is 15 cm higher
     assert errors["right"].rotation_deg < 0.2
+
+
+@pytest.mark.parametrize(
+    ("matches", "deviation_deg", "said"),
+    [
+        (25, 0.1, "25 matches; its images are 160 x 90: about 320 x 180 would do"),
+        (500, 0.9, "the drive shows its rotation to ±0.9° only; its images are 160 x 90: about 480 x 270 would do"),
+        (0, 0.9, "0 matches; its images are 160 x 90: about 1000 x 562 would do"),
+    ],
+)
+def test_small_images_name_the_size_that_would_do(matches, deviation_deg, said):
+    camera = make_camera("CAM_FRONT", 0.0, 160, 90)
+    assert calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), camera) == said
+    large = make_camera("CAM_FRONT", 0.0, 1600, 900)
+    assert "would do" not in calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), large)

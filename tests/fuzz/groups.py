@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
+from dangling_cases import damaged_checkpoint, dangling_tokens
 from file_cases import batch_record, mesh, onnx_file, sqlite_schema
 from recording_cases import cut_recording, foreign_columns, reordered_recording
 from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
@@ -36,6 +37,8 @@ GROUPS = {
     "input exchanged between kill and resume": Group(exchanged_input, 800),
     "input or output exchanged under way": Group(exchanged_under_way, 300),
     "state with right hash and wrong content": Group(false_state, 600),
+    "dangling tokens": Group(dangling_tokens, 400),
+    "damaged checkpoint": Group(damaged_checkpoint, 400),
     "ONNX": Group(onnx_file, 600),
     "mesh with siblings": Group(mesh, 400),
     "batch record": Group(batch_record, 1000),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -66,6 +67,24 @@ def test_images_of_a_video_become_png(drive, edit, tmp_path):
     convert(drive, tmp_path / "out")
     written = tmp_path / "out" / "images" / "CAM_BACK" / "000012.png"
     np.testing.assert_array_equal(cv2.imread(str(written)), image_of("CAM_BACK", 9))
+
+
+@pytest.mark.parametrize("form", ["native", "nuscenes", "mcap"])
+def test_a_drive_without_a_readable_image_is_an_error(drive, tmp_path, form):
+    shutil.rmtree(drive / "images")
+    result = convert(drive, tmp_path / "out.mcap", "--format", form)
+    assert isinstance(result.exception, InputError)
+    assert "not one image could be read (camera CAM_FRONT: " in str(result.exception)
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_what_no_run_would_read_is_not_written(drive, tmp_path):
+    frame = open_sequence(drive).load(0)
+    absurd = replace(frame.kinematics, velocity=np.array([np.nan, 0.0, 0.0]))
+    writer = NativeWriter(tmp_path / "out", with_ego_motion=True)
+    with pytest.raises(InputError, match="is not written, because it could not be read"), writer:
+        writer.write(replace(frame, kinematics=absurd))
+    assert not (tmp_path / "out").exists()
 
 
 def test_existing_folder_is_replaced_only_with_force(drive, tmp_path):

@@ -325,6 +325,23 @@ def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("hwl", "sizes"),
+    [
+        ((1.6, 1.9, 4.5), [4.5, 1.9, 1.6]),  # a car that Datumaro converted from KITTI
+        ((1.75, 0.6, 0.8), [0.8, 0.6, 1.75]),  # a pedestrian likewise
+        ((1.9, 4.5, 1.6), [4.5, 1.9, 1.6]),  # a car of CVAT
+        ((0.6, 0.8, 1.75), [0.8, 0.6, 1.75]),
+    ],
+)
+def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list, tmp_path: Path) -> None:
+    height, width, length = hwl
+    text = CVAT_TRACKLETS.replace("<h>2.0</h><w>4.0</w><l>1.5</l>", f"<h>{height}</h><w>{width}</w><l>{length}</l>")
+    (tmp_path / "tracklet_labels.xml").write_text(text)
+    labels = label_format.read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
+    assert labels.frames[0].boxes.sizes_lwh[0].tolist() == sizes
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("<!DOCTYPE boost_serialization>", '<!DOCTYPE x [<!ENTITY a "b">]>', "declares the entity a"),

@@ -10,6 +10,7 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
+from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
@@ -188,7 +189,15 @@ def test_several_versions_require_a_choice(root):
         ("sample", lambda rows: rows[1:], "sample.json: token"),
         ("sample_data", lambda rows: [{**row, "timestamp": "now"} for row in rows], 'sample_data.json: "timestamp"'),
         ("sample_data", lambda rows: [{"token": row["token"]} for row in rows], "sample_data.json: a row has no"),
-        ("sample_data", lambda rows: [r for r in rows if "LIDAR" not in r["filename"]], "no keyframe of LIDAR_TOP"),
+        (
+            "sample_data",
+            lambda rows: [r for r in rows if "CAM" not in r["filename"]],
+            "sample_data.json: no row belongs",
+        ),
+        ("sample_data", lambda rows: [{**r, "width": 0} for r in rows], "sample_data.json: camera .* found 0x900"),
+        ("sample", lambda rows: [{**r, "timestamp": 1.5e9} for r in rows], "found 1500000000.0: give microseconds"),
+        ("sensor", lambda rows: rows[1:], "sensor.json: token"),
+        ("category", lambda rows: rows[1:], "instance.json: category .* is missing in category.json"),
         ("sample_annotation", lambda rows: [{**row, "size": [1, 2]} for row in rows], 'sample_annotation.json: "size"'),
         (
             "calibrated_sensor",
@@ -203,6 +212,76 @@ def test_invalid_or_inconsistent_table_is_named(root, table, change, expected):
     edit_table(root, table, change)
     with pytest.raises(InputError, match=expected):
         NuScenesSequence(root)
+
+
+def test_boxes_of_missing_instances_are_left_out_with_a_number(root):
+    edit_table(root, "instance", lambda rows: rows[1:])
+    drive = open_sequence(root)
+    assert [len(drive.load(place).ground_truth) for place in range(12)] == [3] * 4 + [4] * 8
+    assert sum(drive.class_counts.values()) == 3 * 4 + 4 * 8
+    (note,) = [note for note in drive.notes if "instance.json" in note]
+    assert "4 of 96 boxes are left out" in note
+    edit_table(root, "instance", lambda rows: [])
+    assert any("96 of 96 boxes are left out" in note for note in open_sequence(root).notes)
+
+
+@pytest.mark.parametrize("size", [[0.0, 0.0, 0.0], [2.0, -4.0, 1.5]])
+def test_boxes_of_an_impossible_size_are_left_out(size, root):
+    edit_table(root, "sample_annotation", lambda rows: [{**rows[0], "size": size}, *rows[1:]])
+    frames = [open_sequence(root).load(place) for place in range(2)]
+    assert [len(frame.ground_truth) for frame in frames] == [3, 4]
+    assert [frame.impossible_boxes for frame in frames] == [1, 0]
+
+
+def test_scenes_without_frames_are_skipped(root):
+    edit_table(root, "scene", lambda rows: [{**rows[0], "token": "e" * 32, "name": "empty"}, *rows])
+    assert {stamp.scene for stamp in open_sequence(root).stamps} == {scene_name(number) for number in range(3)}
+    with pytest.raises(InputError, match=r"sample_data\.json: scene empty has no image of a camera"):
+        open_sequence(root, scene="empty")
+
+
+def test_without_lidar_the_pose_is_the_nearest_and_bev_is_stated(root):
+    with_lidar = open_sequence(root)
+    edit_table(root, "sample_data", lambda rows: [row for row in rows if "LIDAR" not in row["filename"]])
+    drive = open_sequence(root)
+    assert drive.stamps == with_lidar.stamps
+    x = [drive.load(place).world_from_ego.translation[0] for place in range(4)]
+    np.testing.assert_allclose(x, [ego_x(0, sample_time(0, sample) - 10_000) for sample in range(4)])
+    assert drive.rig.ego_from_bev_assumed
+    assert any("12 of 12 samples have no keyframe of LIDAR_TOP" in note for note in drive.notes)
+    assert any("(0.94, 0, 1.84)" in note for note in drive.notes)
+
+
+def test_one_sample_without_lidar_keeps_the_bev_frame(root):
+    stated = open_sequence(root).rig.ego_from_bev
+    lidars = [
+        row for row in json.loads((root / "v1.0-trainval/sample_data.json").read_text()) if "LIDAR" in row["filename"]
+    ]
+    edit_table(root, "sample_data", lambda rows: [row for row in rows if row["token"] != lidars[0]["token"]])
+    drive = open_sequence(root)
+    np.testing.assert_array_equal(drive.rig.ego_from_bev, stated)
+    assert any("1 of 12 samples" in note for note in drive.notes)
+
+
+@pytest.mark.parametrize(("divisor", "said"), [(1000, "milliseconds"), (10**6, "milliseconds or seconds")])
+def test_tables_in_another_unit_of_time_are_refused(divisor, said, root):
+    for table in ("sample", "sample_data"):
+        edit_table(root, table, lambda rows: [{**row, "timestamp": row["timestamp"] // divisor} for row in rows])
+    with pytest.raises(InputError, match=f"the timestamps are {divisor} times too small .*{said}"):
+        open_sequence(root)
+
+
+def test_unknown_visibilities_and_points_are_unknown(root):
+    edit_table(root, "visibility", lambda rows: [{**row, "level": "Not available"} for row in rows])
+    edit_table(root, "sample_annotation", lambda rows: [{**row, "num_lidar_pts": None} for row in rows])
+    truth = open_sequence(root).load(0).ground_truth
+    assert np.isnan(truth.visibilities).all()
+    assert (truth.num_points == -1).all()
+    both = [{"num_lidar_pts": -1, "num_radar_pts": -1}, {"num_lidar_pts": 5, "num_radar_pts": 2}]
+    edit_table(root, "sample_annotation", lambda rows: [{**row, **both[k // 4 % 2]} for k, row in enumerate(rows)])
+    counts = open_sequence(root).load(0).ground_truth.num_points
+    written = boxes_from_json(boxes_to_json(open_sequence(root).load(0).ground_truth), "written").num_points
+    assert written.tolist() == [-1 if count < 0 else count for count in counts]
 
 
 def test_missing_or_broken_table_is_named(root):

@@ -14,8 +14,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import feather
+from typer.testing import CliRunner
 from written_formats import RING, WRITTEN
 
+from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import DerivedSequence, Frame, Sequence
@@ -303,6 +305,62 @@ def test_a_wrong_lens_of_t4_is_named(street, tmp_path):
     path.write_text(path.read_text().replace("-0.24, ", "-0.24, 1.0, ", 1))
     with pytest.raises(InputError, match=r'calibrated_sensor.json: "camera_distortion": expected 0, 4, 5 or 8 numbers'):
         open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "form"), [*((name, "native") for name in WRITTEN), ("t4", "nuscenes")])
+def test_impossible_boxes_are_left_out_with_their_number(name, form, street, tmp_path):
+    sizes = street[0].ground_truth.sizes_lwh.copy()
+    sizes[0], sizes[1, 2] = 0, -1.5
+    WRITTEN[name].write(
+        [replace(street[0], ground_truth=replace(street[0].ground_truth, sizes_lwh=sizes))], tmp_path / "in"
+    )
+    result = CliRunner().invoke(app, ["convert", str(tmp_path / "in"), str(tmp_path / "out"), "--format", form])
+    assert result.exit_code == 0
+    assert "2 boxes of the ground truth are left out" in result.output
+    assert len(open_sequence(tmp_path / "out").load(0).ground_truth) == len(sizes) - 2
+
+
+def test_a_size_that_is_no_number_is_named(street, tmp_path):
+    sizes = street[0].ground_truth.sizes_lwh.copy()
+    sizes[3, 0] = np.nan
+    truth = replace(street[0].ground_truth, sizes_lwh=sizes)
+    WRITTEN["argoverse2"].write([replace(street[0], ground_truth=truth)], tmp_path)
+    with pytest.raises(InputError, match=r'"length_m": expected finite numbers below 1e12, found nan in row 3'):
+        open_sequence(tmp_path)
+
+
+def test_a_camera_without_image_in_a_sample_of_dgp_is_missing(street, tmp_path):
+    name = street[0].rig.names[1]
+    without = replace(street[1], images={one: image for one, image in street[1].images.items() if one != name})
+    WRITTEN["dgp"].write([street[0], without, replace(street[2], images={})], tmp_path)
+    drive = open_sequence(tmp_path)
+    assert [sorted(drive.load(place).dropped) for place in range(3)] == [[], [name], sorted(street[0].rig.names)]
+    assert [drive.load(place).rig.names for place in range(3)] == [street[0].rig.names] * 3
+    WRITTEN["dgp"].write([replace(frame, images={}) for frame in street], tmp_path / "none")
+    _assert_refused(tmp_path / "none", "scene_s.json: no sample has an image")
+
+
+@pytest.mark.parametrize("table", ["category", "sensor", "calibrated_sensor", "ego_pose", "sample", "scene"])
+def test_a_reference_of_t4_that_leads_nowhere_is_named(table, street, tmp_path):
+    WRITTEN["t4"].write(street[:1], tmp_path)
+    _lose_one_row(tmp_path / f"annotation/{table}.json")
+    _assert_refused(tmp_path, f"{table}.json")
+
+
+@pytest.mark.parametrize("table", ["instance", "visibility"])
+def test_boxes_of_t4_are_kept_or_left_out_with_a_number(table, street, tmp_path):
+    WRITTEN["t4"].write(street[:1], tmp_path)
+    _lose_one_row(tmp_path / f"annotation/{table}.json")
+    drive, boxes = open_sequence(tmp_path), len(street[0].ground_truth)
+    lost = 1 if table == "instance" else 0
+    assert len(drive.load(0).ground_truth) == boxes - lost
+    assert any(f"{lost} of {boxes} boxes are left out" in note for note in drive.notes) == bool(lost)
+
+
+def _lose_one_row(path: Path) -> None:
+    """Rename the token of the last row of a table."""
+    *rows, last = json.loads(path.read_text())
+    path.write_text(json.dumps([*rows, {**last, "token": "lost"}]))
 
 
 def test_static_is_refused(written):

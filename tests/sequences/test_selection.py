@@ -117,3 +117,37 @@ def test_invalid_rate_is_an_error(drive, options):
 def test_invalid_step_is_an_error(drive):
     with pytest.raises(InputError, match="`every=0`"):
         open_sequence(drive, every=0)
+
+
+@pytest.mark.parametrize(
+    ("unit_ns", "said"),
+    [(1000, r"1000 times too small \(in microseconds"), (10**6, r"1000000 times too small \(in milliseconds")],
+)
+def test_a_drive_in_another_unit_is_refused(unit_ns, said, drive):
+    for file in ("frames.csv", "ego_motion.csv"):
+        head, *rows = (drive / file).read_text().splitlines()
+        is_time = [name.endswith("timestamp_ns") for name in head.split(",")]
+        cells = [zip(is_time, row.split(","), strict=True) for row in rows]
+        rows = [",".join(str(int(text) // unit_ns) if time else text for time, text in row) for row in cells]
+        (drive / file).write_text("\n".join([head, *rows]))
+    for options in ({}, {"rate_hz": 2.0}, {"model_rate_hz": 2.0}):
+        with pytest.raises(InputError, match=said):
+            open_sequence(drive, **options)
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("1.70000E+18", "its last digits are lost"),
+        ("1.700000000500000000E+18", "write 1700000000500000000"),
+        ("1700000000.5", "1700000000500000000, if it is in seconds"),
+        ("1700000000500.25", "1700000000500250000, if it is in milliseconds"),
+        ("1700000000500000000.0", "write 1700000000500000000"),
+        ("nan", "write digits only"),
+    ],
+)
+def test_advice_for_a_time_gives_the_right_number(cell, said, edit):
+    with pytest.raises(InputError) as error:
+        open_sequence(edit("frames.csv", "\n10,1000000000,", f"\n10,{cell},"))
+    assert said in str(error.value)
+    assert "remove decimal point" not in str(error.value)

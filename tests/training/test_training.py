@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +17,14 @@ from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
 from bevcli.cli.stop_signals import StopSignals
+from bevcli.cli.train import _run
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
 from bevcli.synth.options import DriveOptions, parse_seeds
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.files import save_checkpoint
+from bevcli.training.files import load_checkpoint, save_checkpoint
 from bevcli.training.frame_losses import DenseLossConfig
 from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.training.options import TrainOptions
@@ -254,6 +257,77 @@ def test_resuming_from_nothing_or_from_another_model_is_rejected(tmp_path: Path)
     save_checkpoint(tmp_path / "checkpoint.pt", 1, other, make_optimizer(other, other.backbone, OptimizerConfig()))
     with pytest.raises(WeightsError, match="is not a checkpoint of this model"):
         trainer(tmp_path, resume=True)
+
+
+DAMAGES: dict[str, Callable[[dict], object]] = {
+    "negative step": lambda found: found.update(step=-6),
+    "step is a text": lambda found: found.update(step="2"),
+    "NaN in a weight": lambda found: found["model"]["weight"].fill_(torch.nan),
+    "moments of another shape": lambda found: found["optimizer"]["state"][0].update(exp_avg=torch.zeros(3)),
+    "NaN in a moment": lambda found: found["optimizer"]["state"][0]["exp_avg_sq"].fill_(torch.nan),
+    "negative second moment": lambda found: found["optimizer"]["state"][0]["exp_avg_sq"].fill_(-1),
+    "no moments": lambda found: found["optimizer"]["state"].update({0: {}}),
+    "moments of nothing": lambda found: found["optimizer"]["state"].update({"a": {}}),
+    "no settings": lambda found: found["optimizer"].pop("param_groups"),
+}
+
+
+@pytest.mark.parametrize("kind", list(DAMAGES))
+def test_a_damaged_checkpoint_is_rejected_in_one_line(kind: str, tmp_path: Path) -> None:
+    model = torch.nn.Linear(2, 2)
+    optimizer = torch.optim.AdamW(model.parameters())
+    model(torch.ones(2)).sum().backward()
+    optimizer.step()
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(path, 2, model, optimizer)
+    assert load_checkpoint(path, model, optimizer) == 2
+    contents = torch.load(path)
+    DAMAGES[kind](contents)
+    torch.save(contents, path)
+    with pytest.raises(WeightsError, match=r"checkpoint\.pt: is not a checkpoint of this model: ") as error:
+        load_checkpoint(path, model, optimizer)
+    assert "\n" not in str(error.value)
+
+
+def test_half_a_row_of_a_full_disk_does_not_stop_a_training(two_steps: Trainer, tmp_path: Path) -> None:
+    shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
+    rows = (two_steps.job.out / "loss.csv").read_text()
+    (tmp_path / "loss.csv").write_text(f"{rows}3,0.5,")
+    resumed = trainer(tmp_path, resume=True, settings=TWO_STEPS)
+    assert resumed.done == 2
+    assert (tmp_path / "loss.csv").read_text() == rows
+    (tmp_path / "loss.csv").unlink()
+    (tmp_path / "loss.csv").symlink_to("/dev/full")
+    with pytest.raises(OutputError, match=r"loss\.csv: cannot be written \(No space left"):
+        resumed._loss_curve.add(3, {"loss": 1.0})
+
+
+def test_one_folder_holds_one_training_at_a_time(tmp_path: Path) -> None:
+    def prepare() -> TrainingJob:
+        return prepare_training(
+            "demo", torch.device("cpu"), DriveOptions(rendered=tuple(range(5))), TrainOptions(tmp_path)
+        )
+
+    with prepare().lock, pytest.raises(OutputError, match="is in use by another run"):
+        prepare()
+    prepare().lock.close()
+
+
+def test_a_resumed_training_names_other_settings(two_steps: Trainer, tmp_path: Path) -> None:
+    job = replace(two_steps.job, out=tmp_path)
+    assert job.changed_settings() == ()
+    shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
+    assert job.changed_settings() == ()
+    optimizer = replace(job.config.optimizer, learning_rate=0.5)
+    (note,) = replace(job, seed=7, config=replace(job.config, optimizer=optimizer)).changed_settings()
+    assert "seed 7 (before 0)" in note
+    assert "learning_rate 0.5 (before 0.0002)" in note
+
+
+def test_a_training_beyond_its_steps_says_so(two_steps: Trainer, tmp_path: Path) -> None:
+    shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
+    with pytest.raises(InputError, match=r"has done 2 steps already \(expected at most `steps=1`\)"):
+        _run(trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1)))
 
 
 def test_a_checkpoint_of_an_earlier_image_loss_is_rejected(tmp_path: Path) -> None:

@@ -125,8 +125,10 @@ class FeatherTable:
         if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)) or column.null_count:
             raise self._error(name, "numbers", column)
         values = column.to_numpy().astype(np.float64)
-        if not (np.abs(values) < LARGEST_NUMBER).all():
-            raise self._error(name, "finite numbers below 1e12", column)
+        wrong = np.flatnonzero(~(np.abs(values) < LARGEST_NUMBER))
+        if len(wrong):
+            found = f"{values[wrong[0]]:g} in row {wrong[0]}"
+            raise InputError(f'{self.path}: column "{name}": expected finite numbers below 1e12, found {found}')
         return values
 
     def _error(self, name: str, expected: str, column: pa.ChunkedArray) -> InputError:

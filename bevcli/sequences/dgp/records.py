@@ -173,7 +173,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class Sample:
-    """The images and point clouds of one moment, at least one image among them. calibration: of their sensors."""
+    """The images and point clouds of one moment, at least one. calibration: of their sensors."""
 
     time_ns: int
     data: tuple[Datum, ...]
@@ -185,9 +185,15 @@ class Sample:
             datum.world_from_sensor.matrix @ inverse(self.calibration.ego_from[datum.sensor].matrix)
         )
 
-    def rig(self) -> CameraRig:
-        """The cameras that have an image, in the order of the calibration. Raises InputError."""
-        images = {datum.sensor: datum.content for datum in self.data if datum.is_image}
+    def images(self) -> dict[str, Record]:
+        """The content of each camera's image."""
+        return {datum.sensor: datum.content for datum in self.data if datum.is_image}
+
+    def rig(self, others: Mapping[str, Record]) -> CameraRig:
+        """The cameras in the order of the calibration. others: their images elsewhere, for sizes. Raises InputError."""
+        images = {**others, **self.images()}
+        if unknown := [name for name in images if name not in self.calibration.ego_from]:
+            raise InputError(f'{images[unknown[0]].where}: a calibration has no sensor "{unknown[0]}"')
         names = [name for name in self.calibration.ego_from if name in images]
         sizes = [(images[name].integer("width"), images[name].integer("height")) for name in names]
         cameras = tuple(map(self.calibration.camera, names, sizes))
@@ -228,8 +234,8 @@ def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibra
         if datum.sensor not in calibration.ego_from:
             raise InputError(f'{sample.where}: its calibration has no sensor "{datum.sensor}"')
         found.append(datum)
-    if not any(datum.is_image for datum in found):
-        raise InputError(f"{sample.where}: has no image (expected at least one)")
+    if not found:
+        raise InputError(f"{sample.where}: has no image and no point cloud (expected at least one)")
     return tuple(found)
 
 

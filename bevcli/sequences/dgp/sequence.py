@@ -46,13 +46,12 @@ class DgpSequence(ListedSequence):
         self.path, self.name = path, path.resolve().name
         scene, self._outside = read_record(_scene_file(path)), common.allow_outside
         samples, tenfold = read_samples(path, scene)
-        self._list(tuple(self._entry(index, sample) for index, sample in enumerate(samples)), path, common)
-        self._rigs = tuple(sample.rig() for sample in samples)
+        images = {name: image for sample in samples for name, image in sample.images().items()}
+        if not images:
+            raise InputError(f"{scene.where}: no sample has an image (expected at least one)")
+        self._rigs = tuple(sample.rig(images) for sample in samples)
         self.rig = self._rigs[0]
-        if any(rig.names != self.rig.names for rig in self._rigs):
-            raise InputError(
-                f"{scene.where}: the samples have different cameras (expected {', '.join(self.rig.names)})"
-            )
+        self._list(tuple(self._entry(index, sample) for index, sample in enumerate(samples)), path, common)
         self.ego_motion = motion_of_keyframes(poses(samples, keys=True), poses(samples, keys=False))
         self._truth = self._read_truth(scene, samples, common.class_map) if common.ground_truth else {}
         self.notes = (*rig_notes(self.rig, "a DGP scene"), *((TENFOLD,) if tenfold else ()))
@@ -74,7 +73,8 @@ class DgpSequence(ListedSequence):
             for datum in sample.data
             if datum.is_image
         }
-        return FrameEntry(FrameStamp(index, "", sample.time_ns), sources, {}, str(self.path))
+        dropped = {name: "no image in the sample" for name in self.rig.names if name not in sources}
+        return FrameEntry(FrameStamp(index, "", sample.time_ns), sources, dropped, str(self.path))
 
     def _file(self, record: Record, member: str) -> Path:
         """The file that a member names. Raises InputError if it leads out of the scene."""

@@ -112,6 +112,7 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         column = getattr(boxes, name)
         if column is not None:
             known = ~np.isnan(column) if isinstance(unknown, float) else column != unknown
+            known = column >= 0 if name == "num_points" else known  # two unknown numbers may add up to -2
             for box, value, is_known in zip(objects, column.tolist(), known.tolist(), strict=True):
                 if is_known:
                     box[key] = value

@@ -15,7 +15,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import read_json
-from bevcli.printing import one_line
+from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
 from bevcli.writing import write_whole
 
@@ -136,7 +136,7 @@ def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin 
         number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), within)
         if number is not None and abs(number[0]) > limit:
             wanted = f"degrees, -{limit:g} to {limit:g}"
-            within.error("wrong-size", name, "is out of range", expected=wanted, found=stated[name])
+            within.error("wrong-size", name, "is out of range", expected=wanted, found=quoted(stated[name]))
         elif number is not None:
             numbers.append(float(number[0]))
     return GeoOrigin(*numbers) if len(numbers) == len(ORIGIN_LIMITS) else None
@@ -244,7 +244,7 @@ def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int | N
         return None
     if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= LARGEST_SIZE:
         expected = f"a positive integer, at most {LARGEST_SIZE}"
-        report.error("wrong-size", name, "is not an image size", expected=expected, found=value)
+        report.error("wrong-size", name, "is not an image size", expected=expected, found=quoted(value))
         return None
     return value
 

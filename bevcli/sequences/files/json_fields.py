@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion
-from bevcli.printing import one_line
+from bevcli.printing import one_line, quoted
 
 LARGEST_NUMBER = 1e12
 LONGEST_VALUE = 60  # characters of a value in a message
@@ -76,7 +76,7 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     array = array_of_numbers(value)
     if array is None or array.shape != shape:
         message = "is not an array of numbers" if array is None else "has the wrong shape"
-        found = value if array is None else "x".join(map(str, array.shape)) or value
+        found = quoted(value) if array is None else "x".join(map(str, array.shape)) or value
         report.error("wrong-shape", name, message, expected=expected, found=found)
         return None
     if not (np.abs(array) < LARGEST_NUMBER).all():
@@ -107,7 +107,7 @@ def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Arra
         report.missing(name, expected)
         return None
     if not isinstance(value, dict):
-        report.error("wrong-shape", name, "is not a transform", expected=expected, found=value)
+        report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
         return None
     inside = report.within(name)
     translation, rotation = parse_numbers(value, "translation", (3,), inside), _parse_rotation(value, inside)

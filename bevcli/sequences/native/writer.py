@@ -18,9 +18,9 @@ from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.lines_file import TRUE_LINES, LinesWriter
 from bevcli.sequences.files.map_folder import write_map
-from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
+from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
 from bevcli.sequences.native.tables import write_ego_motion
-from bevcli.sequences.options import WriteOptions
+from bevcli.sequences.options import SequenceOptions, WriteOptions
 from bevcli.sequences.output import FolderWriter
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
@@ -87,6 +87,9 @@ class NativeWriter(FolderWriter):
             self._check_scenes()
             write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
         write_calibration(self.folder / "calibration.json", self._rig, self._facts)
+
+    def _read_back(self) -> None:
+        FolderSequence(self.folder, SequenceOptions(ego_motion="optional"))
 
     def _check(self, frame: Frame) -> None:
         stamp = frame.stamp

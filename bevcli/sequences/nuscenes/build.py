@@ -24,13 +24,23 @@ def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
         data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors, dialect)
         data["translations"], data["quaternions"] = _read_poses(tables, data.pop("poses"))
         lidar = np.isin(sensors.channels[data["sensors"]], dialect.lidars)
-        lidar_rows = _lidar_of_samples(tables, data["samples"], np.flatnonzero(lidar), sample_tokens, dialect)
         image_rows = np.flatnonzero(~lidar)
-        owners, times = sample_scenes[data["samples"][image_rows]], data["times_us"][image_rows]
-        images = Images(**_rows(data, image_rows[np.lexsort((times, owners))]))
+        if not len(image_rows):
+            raise InputError(f"{tables / 'sample_data.json'}: no row belongs to a camera (expected camera images)")
+        image_rows = image_rows[np.lexsort((data["times_us"][image_rows], sample_scenes[data["samples"][image_rows]]))]
+        images = Images(**_rows(data, image_rows))
+        starts = _starts(sample_scenes[images.samples], len(names))
+        lidar_rows = np.full(len(sample_tokens), -1)
+        lidar_rows[data["samples"][lidar]] = np.flatnonzero(lidar)
+        pose_rows = lidar_rows.copy()
+        for sample in np.flatnonzero(lidar_rows < 0):  # the nearest image; any in a scene without images
+            rows = image_rows[slice(*starts[sample_scenes[sample] :][:2])]
+            distances = np.abs(data["times_us"][rows] - sample_times[sample])
+            pose_rows[sample] = rows[distances.argmin()] if len(rows) else 0
         annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
-    scenes = Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names)))
-    translations, quaternions, lidars = (data[name][lidar_rows] for name in ("translations", "quaternions", "sensors"))
+    scenes = Scenes(names, _starts(sample_scenes, len(names)), starts)
+    translations, quaternions = data["translations"][pose_rows], data["quaternions"][pose_rows]
+    lidars = np.where(lidar_rows < 0, -1, data["sensors"][lidar_rows])
     samples = Samples(sample_tokens, sample_times, translations, quaternions, lidars, first_annotation)
     return NuScenesIndex(scenes, sensors, samples, images, annotations)
 
@@ -44,10 +54,10 @@ def _joined(parts: list[Columns]) -> Columns:
 
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
-    channels = read_rows(tables / "sensor.json").by_token("channel")
-    table = read_rows(tables / "calibrated_sensor.json")
+    channels, table = read_rows(tables / "sensor.json"), read_rows(tables / "calibrated_sensor.json")
+    places = places_of(table.tokens("sensor_token"), channels.tokens("token"), channels.path)
     sensors = Sensors(
-        np.array([channels.get(token, "") for token in table.texts("sensor_token")], dtype=np.str_),
+        np.array(channels.texts("channel"), dtype=np.str_)[places],
         table.vectors("translation", 3),
         table.quaternions("rotation"),
         np.array([_intrinsics(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
@@ -100,18 +110,18 @@ def _read_sensor_data(
     path = tables / "sample_data.json"
     lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
-    parts = []
+    parts, known = [], {token.decode() for token in sensor_tokens}
     for batch in read_batches(path):
         facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
         needed = batch.where(
-            (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
+            (owner in cameras and row.get("is_valid") is not False)
+            or (key and owner in lidars)
+            or owner not in known  # an error, which `places_of` raises
             for row, owner, key in facts
         )
         if len(needed):
             parts.append(_sensor_data_of(needed, sample_tokens, sensor_tokens))
-    if not parts:
-        raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
-    return _joined(parts)
+    return _joined(parts or [_sensor_data_of(Rows(path, []), sample_tokens, sensor_tokens)])
 
 
 def _sensor_data_of(rows: Rows, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]) -> Columns:
@@ -139,20 +149,6 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     places = places_of(wanted, found, path)
     chosen = rotations[places]
     return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
-
-
-def _lidar_of_samples(
-    tables: Path, samples: Ints, lidar_rows: Ints, sample_tokens: NDArray[np.bytes_], dialect: Dialect
-) -> Ints:
-    """(N,) the row of each sample's lidar keyframe."""
-    rows = np.full(len(sample_tokens), -1, dtype=np.int64)
-    rows[samples[lidar_rows]] = lidar_rows
-    if (rows < 0).any():
-        token = sample_tokens[rows < 0][0].decode()
-        raise InputError(
-            f'{tables / "sample_data.json"}: sample "{token}" has no keyframe of {" or ".join(dialect.lidars)}'
-        )
-    return rows
 
 
 def _starts(sorted_owners: Ints, count: int) -> Ints:
@@ -198,7 +194,7 @@ class _Names:
         attributes = _optional(tables / "attribute.json", "name") if dialect.has_attributes else {}
         self.attribute = {token: name.encode() for token, name in attributes.items()}
         self.visibility = {
-            token: dialect.visibilities.get(level) or _middle(level, tables)
+            token: dialect.visibilities.get(level) or _middle(level)
             for token, level in _optional(tables / "visibility.json", "level").items()
         }
 
@@ -207,12 +203,20 @@ def _optional(path: Path, name: str) -> dict[str, str]:
     return read_rows(path).by_token(name) if path.is_file() else {}
 
 
-def _middle(level: str, tables: Path) -> float:
-    """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1."""
-    found = re.fullmatch(r"v([0-9]{1,3})-([0-9]{1,3})", level)
-    if found is None:
-        raise InputError(f'{tables / "visibility.json"}: unknown level "{level:.40}" (expected such as v40-60)')
-    return (int(found[1]) + int(found[2])) / 200
+def _middle(level: str) -> float:
+    """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1; NaN for other levels."""
+    found = re.fullmatch(r"v(100|[0-9]{1,2})-(100|[0-9]{1,2})", level)
+    return np.nan if found is None else (int(found[1]) + int(found[2])) / 200
+
+
+def _num_points(rows: Rows) -> Ints:
+    """(A,) lidar and radar points; -1 where one of them is null."""
+    columns = [rows.column(name) for name in ("num_lidar_pts", "num_radar_pts")]
+    known = [None not in counts for counts in zip(*columns, strict=True)]
+    found = np.full(len(rows), -1, dtype=np.int64)
+    some = rows.where(known)
+    found[known] = some.integers("num_lidar_pts") + some.integers("num_radar_pts")
+    return found
 
 
 def _columns(rows: Rows, names: _Names) -> Columns:
@@ -231,5 +235,5 @@ def _columns(rows: Rows, names: _Names) -> Columns:
         "sizes_wlh": rows.vectors("size", 3),
         "quaternions": rows.quaternions("rotation"),
         "visibilities": np.array([names.visibility.get(token, np.nan) for token in rows.texts("visibility_token")]),
-        "num_points": rows.integers("num_lidar_pts") + rows.integers("num_radar_pts"),
+        "num_points": _num_points(rows),
     }

@@ -41,7 +41,7 @@ def choose_version(root: object, versions: Sequence[str], version: str | None) -
 
 
 def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: str | None = None) -> list[int]:
-    """Indices of the scenes of a split (None: all), or of one scene. Raises InputError if there are none."""
+    """Indices of the scenes with images of a split (None: all), or of one scene. Raises InputError without any."""
     names = [str(name) for name in index.scenes.names]
     if split is not None and split not in SPLITS:
         raise InputError(f'`split` "{split}": expected one of {", ".join(SPLITS)}')
@@ -57,7 +57,11 @@ def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: 
     if not scenes:
         what = f"scene {scene} is not in" if scene else "has no scene of"
         raise InputError(f"{tables}: {what} the split {split}: choose another `split` or `version`")
-    return scenes
+    with_frames = (np.diff(index.scenes.first_sample) > 0) & (np.diff(index.scenes.first_image) > 0)
+    filled = [number for number in scenes if with_frames[number]]
+    if not filled:
+        raise InputError(f"{tables / 'sample_data.json'}: scene {names[scenes[0]]} has no image of a camera")
+    return filled
 
 
 def split_of(scene: str, *, mini: bool) -> str:

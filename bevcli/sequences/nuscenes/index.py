@@ -36,18 +36,18 @@ class Dialect:
     """The reading of tables that differ from nuScenes' own in some points.
 
     Attributes:
-        lidars: channels of which each sample has a keyframe, whose ego pose is that of the frame.
+        lidars: channels of which each sample should have a keyframe, whose ego pose is that of the frame.
         class_of: a category -> its class, None for a category that is left out.
         visibilities: names of visibility levels -> visible fraction, besides names such as "v40-60".
         has_attributes: whether the attributes are those of nuScenes, which are scored.
-        ego_from_bev: (4, 4) metres; None for the frame of the lidar.
+        bev_is_lidar: whether the bev frame is that of the lidar.
     """
 
     lidars: tuple[str, ...]
     class_of: Callable[[str], str | None]
     visibilities: Mapping[str, float] = field(default_factory=dict)
     has_attributes: bool = True
-    ego_from_bev: Array | None = None
+    bev_is_lidar: bool = True
 
 
 # The published models predict in the frame of LIDAR_TOP.
@@ -94,8 +94,9 @@ class Samples:
     Attributes:
         tokens: (N,) nuScenes' identifiers.
         times_us: (N,) microseconds.
-        translations, quaternions: (N, 3) metres and (N, 4) w, x, y, z of world_from_ego at the time of LIDAR_TOP.
-        lidars: (N,) row of the sample's LIDAR_TOP in Sensors.
+        translations, quaternions: (N, 3) metres and (N, 4) w, x, y, z of world_from_ego at the time of LIDAR_TOP,
+            or of the nearest image where there is none.
+        lidars: (N,) row of the sample's LIDAR_TOP in Sensors, -1 where there is none.
         first_annotation: (N + 1,) row of each sample's first annotation.
     """
 
@@ -136,7 +137,7 @@ class Annotations:
     """A annotated boxes in the world frame, ordered by sample.
 
     Attributes:
-        categories: (A,) nuScenes' category names.
+        categories: (A,) nuScenes' category names; "" for a box that refers to a missing instance and is left out.
         attributes: (A,) attribute names, "" for none.
         instances: (A,) tokens of the objects.
         centers: (A, 3) metres.
@@ -144,7 +145,7 @@ class Annotations:
         quaternions: (A, 4) w, x, y, z.
         velocities: (A, 2) m/s along x and y; NaN if unknown.
         visibilities: (A,) 0 to 1; NaN if unknown.
-        num_points: (A,) number of lidar and radar points.
+        num_points: (A,) number of lidar and radar points, -1 if unknown.
     """
 
     categories: NDArray[np.bytes_]
@@ -178,8 +179,8 @@ class NuScenesIndex:
         if not len(self.annotations.categories):
             return None
         rows = self._annotations_of(sample)
-        classes = [class_of(name.decode()) for name in self.annotations.categories[rows]]
-        kept = np.array([name is not None for name in classes], dtype=bool)
+        classes = [class_of(name.decode()) if name else None for name in self.annotations.categories[rows]]
+        kept = np.array([bool(name) for name in classes], dtype=bool)
         return self._boxes(rows[kept], [name for name in classes if name])
 
     def bicycle_racks(self, sample: int) -> Boxes3D:

@@ -53,7 +53,11 @@ class Rows:
         """(N,) int64 values of a column."""
         values = self.column(name)
         if not set(map(type, values)) <= {int, bool} or max(map(abs, values), default=0) > LARGEST_INTEGER // 1000:
-            raise self._error(f'"{name}": expected an integer of at most 52 bits in every row')
+            found = next(one for one in values if type(one) not in (int, bool) or abs(one) > LARGEST_INTEGER // 1000)
+            unit = ": give microseconds, not seconds" if type(found) is float and 1e8 < found < 1e11 else ""
+            raise self._error(
+                f'"{name}": expected an integer of at most 52 bits in every row, found {found!r:.40}{unit}'
+            )
         return np.array(values, dtype=np.int64)
 
     def vectors(self, name: str, size: int) -> Array:

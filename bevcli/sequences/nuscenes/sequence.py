@@ -1,7 +1,7 @@
 """A nuScenes dataset root as a Sequence, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 from bevcli.sequences.images import ImageReader, ImageSource
+from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
@@ -82,12 +83,30 @@ class TableSequence(Sequence):
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
-        self.rig = scene_rig(self.index, dialect, self.scenes[0])
+        self.rig = scene_rig(self.index, dialect, self.scenes[0], tables)
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
-        self.notes = (note,) if note else ()
+        self.notes = (*((note,) if note else ()), *rig_notes(self.rig, str(tables)), *self._table_notes())
+
+    def _table_notes(self) -> Iterator[str]:
+        """What the tables lack."""
+        samples, spans = (
+            self.index.samples,
+            [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes],
+        )
+        lidars = np.concatenate([samples.lidars[slice(*span)] for span in spans])
+        if (lidars < 0).any():
+            yield (
+                f"{self.tables / 'sample_data.json'}: {(lidars < 0).sum()} of {len(lidars)} samples have no keyframe "
+                f"of {' or '.join(self.dialect.lidars)}: their pose is that of the image nearest in time"
+            )
+        of_spans = [slice(*samples.first_annotation[span]) for span in spans]
+        names = np.concatenate([self.index.annotations.categories[span] for span in of_spans])
+        if (names == b"").any():
+            where = f"{self.tables / 'sample_annotation.json'}: {(names == b'').sum()} of {len(names)}"
+            yield f"{where} boxes are left out: instance.json lacks their instance"
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -101,7 +120,7 @@ class TableSequence(Sequence):
             found.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
         for category, count in found.items():
-            if name := self.dialect.class_of(category.decode()):
+            if category and (name := self.dialect.class_of(category.decode())):
                 counts[name] += count
         return counts
 
@@ -137,7 +156,7 @@ class TableSequence(Sequence):
 
     def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
         """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
-        rig, motion = scene_rig(self.index, self.dialect, scene), scene_motion(self.index, scene)
+        rig, motion = scene_rig(self.index, self.dialect, scene, self.tables), scene_motion(self.index, scene)
         return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
 
     def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
@@ -192,17 +211,18 @@ def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:
     return Pose(np.array(table.translations[row]), np.array(table.quaternions[row]))
 
 
-def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
-    """The rig of a scene. Raises InputError."""
+def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int, tables: Path) -> CameraRig:
+    """The rig of a scene. tables: for messages. Raises InputError."""
     first, last = index.scenes.first_image[scene : scene + 2]
     sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
-    cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
+    cameras = [_camera(index, int(sensor), first + row, tables) for sensor, row in zip(sensors, rows, strict=True)]
     cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
-    if dialect.ego_from_bev is not None:
-        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True)
-    lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
+    lidars = index.samples.lidars[slice(*index.scenes.first_sample[scene : scene + 2])]
+    lidar = next((int(one) for one in lidars if one >= 0), None)
+    if lidar is None or not dialect.bev_is_lidar:
+        return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
     return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)
 
 
@@ -231,12 +251,13 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
     return CanBus(times[order], *(values[order] for values in quantities))
 
 
-def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
+def _camera(index: NuScenesIndex, sensor: int, image: int, tables: Path) -> Camera:
     width, height = (int(value) for value in index.images.sizes[image])
     name = str(index.sensors.channels[sensor])
     if not is_file_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
         raise InputError(
-            f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
+            f'{tables / "sample_data.json"}: camera "{name:.60}": expected a name without a slash and an image size, '
+            f"found {width}x{height}"
         )
     intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
     return Camera(name, width, height, intrinsics, _pose_of(index.sensors, sensor).matrix, lens)

@@ -16,9 +16,10 @@ from bevcli.geometry.cameras import Camera, CameraRig, same_rig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import is_file_name
-from bevcli.sequences.nuscenes.format import versions_in
+from bevcli.sequences.nuscenes.format import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
 from bevcli.sequences.nuscenes.json_tables import Row
+from bevcli.sequences.nuscenes.sequence import NuScenesSequence
 from bevcli.sequences.options import WriteOptions
 from bevcli.sequences.output import FolderWriter
 from bevcli.writing import write_whole
@@ -86,6 +87,9 @@ class NuScenesWriter(FolderWriter):
         self._tables.finish(MAP_FILE)
         for name, rows in self._tables.rows.items():
             write_whole(self.folder / VERSION / f"{name}.json", _json(rows), parents=True)
+
+    def _read_back(self) -> None:
+        NuScenesSequence(self.folder, own=NuScenesOptions(version=VERSION))
 
 
 def _message(time_us: int, pose: Pose, kinematics: Kinematics) -> Row:

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Dialect
 from bevcli.sequences.nuscenes.sequence import TableSequence
@@ -59,9 +57,6 @@ class T4Sequence(TableSequence):
         self, path: Path, common: SequenceOptions = SequenceOptions(), own: FormatOptions = FormatOptions()
     ) -> None:
         names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
-        dialect = Dialect(
-            LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, ego_from_bev=default_ego_from_bev()
-        )
+        dialect = Dialect(LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, bev_is_lidar=False)
         super().__init__(path, path / "annotation", common, dialect, NuScenesOptions())
         self.name = path.resolve().name
-        self.notes = (*self.notes, *rig_notes(self.rig, "a T4 dataset"))

@@ -1,0 +1,42 @@
+"""A run tells what is wrong with all images of a drive, or of a camera."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from memory_drive import MemorySequence, WithoutImages
+
+from bevcli.errors import InputError
+from bevcli.frame import CameraImage
+from bevcli.inference.load import Model
+from bevcli.recording.options import RecordingOptions
+from bevcli.runs.options import RunOptions
+from bevcli.runs.run_into_folder import run_into_folder
+
+MINIMAL = RunOptions(recording=RecordingOptions(level="minimal"))
+
+
+def test_a_run_without_any_image_is_an_error(mini_model, tmp_path):
+    drive = WithoutImages({0: "all", 1: "all"}, count=2)
+    with pytest.raises(InputError, match=r"memory: not one image could be read \(camera CAM_FRONT: missing\)"):
+        run_into_folder(Model(mini_model), drive, tmp_path / "none", MINIMAL)
+    with_one = run_into_folder(Model(mini_model), WithoutImages({0: "all"}, count=2), tmp_path / "one", MINIMAL)
+    assert with_one.counts.skipped == [0]
+
+
+class TwelveBitsInSixteen(MemorySequence):
+    """The images of one camera have 12 bits that are stored in 16, of which a reader keeps the upper 8."""
+
+    def load(self, place):
+        frame = super().load(place)
+        image = frame.images["CAM_BACK"]
+        dark = CameraImage(image.timestamp_ns, (image.pixels_bgr.astype(np.uint16) * 16 // 256).astype(np.uint8))
+        return replace(frame, images={**frame.images, "CAM_BACK": dark})
+
+
+def test_images_that_are_black_throughout_are_said(mini_model, tmp_path):
+    summary = run_into_folder(Model(mini_model), TwelveBitsInSixteen(2), tmp_path, MINIMAL)
+    said = "all images of CAM_BACK are nearly black or white"
+    assert said in summary.table()
+    assert any(said in note for note in json.loads((tmp_path / "summary.json").read_text())["notes"])
