@@ -170,7 +170,8 @@ class ImageReader:
         pixels = decode(encoded, size[0] * size[1])
         if pixels is None:
             raise UnreadableImage(f"{source.path} is not a complete image")
-        return CameraImage(source.timestamp_ns, pixels, encoded, media_type_of(encoded))
+        media_type = media_type_of(encoded)
+        return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
     def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
         reader = self._videos.get(camera)
@@ -184,7 +185,7 @@ class ImageReader:
 
 
 def decode(encoded: bytes, most_pixels: int = MOST_PIXELS) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more pixels (64 MP)."""
+    """(H, W, 3) uint8 BGR of an image file; None for another format, a damaged one, or one of more pixels (64 MP)."""
     pixels = decode_image(encoded, DECODE_FLAGS, most_pixels)
     return None if pixels is None else pixels.astype(np.uint8, copy=False)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence as Indices
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
+MOST_INVALID = 1000  # messages of a topic before the first valid one
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 _Value = TypeVar("_Value")
 
@@ -53,6 +54,7 @@ class Bag:
         with _broken_files_refused(path):
             self.file_paths = tuple(self._file_paths())
             self._files = [_open_file(file) for file in self.file_paths]
+            self.size = sum(file.stat().st_size for file in self.file_paths)  # bytes
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoder = cache(lambda topic: decoder(self.topics[topic]))
 
@@ -84,6 +86,25 @@ class Bag:
             return parse(message)
         except (AttributeError, ValueError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is not {kind} ({error})") from None
+
+    def first(self, topic: str, parse: Callable[[Any], _Value], kind: str) -> _Value:
+        """The first value of a topic's messages that is valid, and not empty: nodes publish before they are set up.
+
+        Raises InputError as `read` for the first message, if no message has a value.
+        """
+        invalid: InputError | None = None
+        empty: _Value | None = None
+        for index in range(min(len(self.times(topic)), MOST_INVALID)):
+            try:
+                empty = self.read(topic, index, parse, kind)
+            except InputError as error:
+                invalid = invalid or error
+            else:
+                if empty:
+                    return empty
+        if empty is None and invalid is not None:
+            raise invalid
+        return cast(_Value, empty)
 
     def _bytes(self, topic: str, index: int) -> bytes:
         for file in self._files:
