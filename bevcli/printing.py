@@ -1,8 +1,10 @@
 """Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
 
+import io
 import sys
 import unicodedata
 from collections.abc import Collection, Sequence
+from typing import Any
 
 LONGEST_MESSAGE = 1000  # characters
 
@@ -18,6 +20,11 @@ def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
     return f"{text[: longest - end - 3]}...{text[len(text) - end :]}"
 
 
+def valid_text(name: str) -> str:
+    """The text with escapes for the bytes of a name that are not UTF-8, which no file or package can hold."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 def reason_of(error: BaseException) -> str:
     """The message of a package's error on one line; the name of its class where it has none."""
     return " ".join(str(error).split()) or type(error).__name__
@@ -29,6 +36,27 @@ def say(*texts: object, err: bool = False) -> None:
     if not text.isprintable():
         text = "".join(char if char in "\n\t" else _escaped(char) for char in text)
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
+
+
+class _Output(io.FileIO):
+    """A stream whose reader may go away: what nobody reads is dropped, and the command goes on."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            return len(data)
+
+
+def prepare_output() -> None:
+    """Make stdout and stderr escape what a terminal does not know, such as "°", and outlive the reader of a pipe."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is getattr(sys, f"__{name}__") and stream is not None and not stream.isatty():
+            raw = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, line_buffering=stream.line_buffering))
+        if isinstance(getattr(sys, name), io.TextIOWrapper):
+            getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
 def _escaped(char: str) -> str:

@@ -23,6 +23,7 @@ from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, rea
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
+from bevcli.sequences.video import rotation_notes
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -59,7 +60,9 @@ class FolderSequence(ListedSequence):
             _check_coverage(file, self.ego_motion, entries, advice)
         self.has_ego_motion = self.ego_motion is not None
         self._read_truth(is_read=common.ground_truth)
-        self.notes = (*rig_notes(self.rig), *notes, *motion_notes)
+        sources = [one for entry in entries for one in entry.sources.values() if isinstance(one, ImageSource)]
+        turned = rotation_notes(sorted({one.path for one in sources if one.video_index is not None}))
+        self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *turned)
 
     def _read_truth(self, *, is_read: bool) -> None:
         """Read ground_truth.json and ground_truth_lines.json; maps are read frame by frame. Each may be missing."""
