@@ -253,6 +253,11 @@ def read_frame(
     )
 
 
+def leads_out(path: Path, folder: Path) -> bool:
+    """True for a path that is not below the folder, by its names alone: links are followed when the image is read."""
+    return not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
+
+
 class ListedSequence(Sequence):
     """Base of a `Sequence` of a folder whose frames are entries: a subclass calls `_list`, and has `_frame`."""
 

@@ -19,6 +19,7 @@ from bags import (
     header,
     odometry,
     transform,
+    write_encoded,
     write_json_mcap,
     write_mcap,
     write_protobuf_mcap,
@@ -664,6 +665,26 @@ def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequen
     (tmp_path / "folder.bag").mkdir()
     with pytest.raises(InputError, match=r"folder\.bag: is a bag of ROS 1: convert it"):
         open_sequence(tmp_path / "folder.bag")
+
+
+@pytest.mark.parametrize("name", ["drive.mcap.zst", "drive.db3.gz", "folder"])
+def test_a_packed_bag_is_named_with_the_remedy(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.mkdir() if name == "folder" else path.write_bytes(b"packed")
+    if name == "folder":
+        (path / "drive_0.mcap.zst").write_bytes(b"packed")
+    with pytest.raises(InputError, match=rf"{name}: .* compressed: decompress .*zstd -d drive"):
+        open_sequence(path)
+
+
+def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path: Path) -> None:
+    path = write_encoded(
+        tmp_path / "old.mcap",
+        [("/cam/image", "sensor_msgs/CompressedImage", 1, {}), ("/cam/camera_info", "sensor_msgs/CameraInfo", 1, {})],
+        lambda fields: b"\0" * 20, "ros1", "ros1msg", lambda kind: b"",
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"old\.mcap: .*encoded as ros1.*rosbags-convert"):
+        open_sequence(path)
 
 
 def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion) -> None:

@@ -144,6 +144,12 @@ def test_images_outside_of_the_folder_need_allow_outside(drive, kind):
     assert "CAM_BACK" in open_sequence(drive, allow_outside=True).load(1).images
 
 
+def test_dots_that_lead_back_into_the_folder_are_inside(drive):
+    table = drive / "frames.csv"
+    table.write_text(table.read_text().replace("images/CAM_BACK/1.png", "images/../images/CAM_BACK/1.png"))
+    assert "CAM_BACK" in open_sequence(drive).load(1).images
+
+
 def test_commands_take_allow_outside(drive, tmp_path, monkeypatch):
     for name in ("write_camera_sheet", "write_coverage_map"):  # their figures take most of the time
         monkeypatch.setattr(drawings, name, lambda path, *content: path.touch())

@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
 from bevcli.printing import reason_of
-from bevcli.sequences.ros.format import METADATA, SUFFIXES
+from bevcli.sequences.ros.format import METADATA, SUFFIXES, is_packed_bag
 from bevcli.sequences.ros.messages import decoder
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = reason_of(error)
         if isinstance(error, BevcliError):
-            raise type(error)(reason) from None
+            raise type(error)(reason if str(path) in reason else f"{path}: {reason}") from None
         raise InputError(f"{path}: is damaged ({reason:.200})") from None
 
 
@@ -123,8 +123,9 @@ class Bag:
         stated = _metadata(self.path / METADATA)
         listed = [self.path / Path(name).name for name in stated.get("relative_file_paths", [])]
         mode = str(stated.get("compression_mode", "")).lower()
-        if mode == "file" and not found:
-            raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d *.zstd)")
+        packed = sorted(file.name for file in self.path.iterdir() if is_packed_bag(file))
+        if packed and not found:
+            raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d {packed[0]})")
         self._compression = mode
         paths = [file for file in listed if file.suffix in SUFFIXES and file.is_file()] or found
         if not listed and len({SPLIT_NUMBER.sub("", file.stem) for file in paths}) > 1:

@@ -17,7 +17,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.geometry.transforms import Array, Pose, rigid
 from bevcli.parsing.documents import parse_json
-from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS
+from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS, LENS_NAMES
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for
@@ -38,13 +38,6 @@ KINDS: dict[str, Kind] = {
     "foxglove/PoseInFrame": "pose",
     "geometry_msgs/PoseWithCovarianceStamped": "pose",
     "geometry_msgs/PoseStamped": "pose",
-}
-LENSES = {
-    "plumb_bob": "brown_conrady",
-    "rational_polynomial": "brown_conrady",
-    "equidistant": "kannala_brandt",
-    "kannala_brandt": "kannala_brandt",
-    "fisheye": "kannala_brandt",
 }
 FARTHEST = 1e12  # of a coordinate in metres, as in calibration.json
 Decode = Callable[[bytes], Any]
@@ -83,7 +76,8 @@ def decoder(topic: Topic) -> Decode:
     makers = {"cdr": _cdr, "json": _json, "protobuf": _protobuf}
     make = makers.get(topic.encoding)
     if make is None:
-        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)})")
+        hint = ": convert the .bag of ROS 1 with rosbags-convert" if topic.encoding == "ros1" else ""
+        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)}){hint}")
     return make(topic)
 
 
@@ -216,9 +210,9 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
 def _distortion(model: str, coefficients: list[float], where: str) -> Distortion | None:
     if not any(coefficients):
         return None
-    known = LENSES.get(model.lower() or "plumb_bob")
+    known = LENS_NAMES.get(model.lower() or "plumb_bob")
     if known is None:
-        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENSES)})")
+        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENS_NAMES)})")
     counts = COEFFICIENT_COUNTS[known]
     if known == "brown_conrady" and len(coefficients) > 8 and not any(coefficients[8:]):
         coefficients = coefficients[:8]

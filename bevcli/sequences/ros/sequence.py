@@ -30,7 +30,7 @@ from bevcli.sequences.ros.ego_motion import (
     motion_from_transforms,
     sampled_transforms,
 )
-from bevcli.sequences.ros.format import BagOptions, is_ros_bag
+from bevcli.sequences.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.sequences.ros.images import BagVideo, bag_image
 from bevcli.sequences.ros.messages import camera_of, frame_of, pose_of
 from bevcli.sequences.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
@@ -54,6 +54,8 @@ class RosSequence(Sequence):
             raise InputError(
                 f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
             )
+        if path.is_file() and is_packed_bag(path):
+            raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
         stated = read_topics_file(own.topics_file, own.topics)
         rig = own.rig()
         self.path = path
