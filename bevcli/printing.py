@@ -52,11 +52,12 @@ def prepare_output() -> None:
     """Make stdout and stderr escape what a terminal does not know, such as "°", and outlive the reader of a pipe."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is getattr(sys, f"__{name}__") and stream is not None and not stream.isatty():
-            raw = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
-            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, line_buffering=stream.line_buffering))
-        if isinstance(getattr(sys, name), io.TextIOWrapper):
-            getattr(sys, name).reconfigure(errors="backslashreplace")
+        if isinstance(stream, io.TextIOWrapper):
+            if stream is getattr(sys, f"__{name}__") and not stream.isatty():
+                raw = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+                stream = io.TextIOWrapper(raw, stream.encoding, line_buffering=stream.line_buffering)
+            stream.reconfigure(errors="backslashreplace")
+            setattr(sys, name, stream)
 
 
 def _escaped(char: str) -> str:

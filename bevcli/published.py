@@ -12,7 +12,7 @@ import msgspec
 from bevcli.errors import ConfigError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.user_folders import user_config
+from bevcli.user_folders import user_folder
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
@@ -76,7 +76,7 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 def own_table() -> Path:
     """The file in which a user adds sources, $XDG_CONFIG_HOME/bevcli/weights.toml (default ~/.config)."""
-    return user_config() / "weights.toml"
+    return user_folder("XDG_CONFIG_HOME", ".config") / "weights.toml"
 
 
 def read_sources() -> dict[str, Source]:

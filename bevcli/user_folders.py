@@ -8,15 +8,11 @@ NO_HOME = Path("/nonexistent")  # as in the passwd of Debian; caches that cannot
 
 def user_cache() -> Path:
     """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
-    return _folder("XDG_CACHE_HOME", ".cache")
+    return user_folder("XDG_CACHE_HOME", ".cache")
 
 
-def user_config() -> Path:
-    """The folder of a user's own settings, $XDG_CONFIG_HOME/bevcli (default ~/.config/bevcli)."""
-    return _folder("XDG_CONFIG_HOME", ".config")
-
-
-def _folder(variable: str, below_home: str) -> Path:
+def user_folder(variable: str, below_home: str) -> Path:
+    """The folder of bevcli in that of an environment variable, by default in one below the user's home folder."""
     try:
         return Path(os.environ.get(variable) or Path.home() / below_home) / "bevcli"
     except RuntimeError:  # no HOME, and no entry in the system's list of users

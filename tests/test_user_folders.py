@@ -2,8 +2,8 @@
 
 import pwd
 
-from bevcli.published import read_sources
-from bevcli.user_folders import user_cache, user_config
+from bevcli.published import own_table, read_sources
+from bevcli.user_folders import user_cache
 
 
 def test_a_user_without_a_home_has_folders_that_are_not_there(monkeypatch):
@@ -15,5 +15,5 @@ def test_a_user_without_a_home_has_folders_that_are_not_there(monkeypatch):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", unknown)
     assert not user_cache().exists()
-    assert not user_config().exists()
+    assert not own_table().exists()
     assert read_sources().keys() <= known.keys()

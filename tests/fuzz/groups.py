@@ -13,6 +13,7 @@ from pathlib import Path
 from random import Random
 
 from file_cases import batch_record, mesh, onnx_file, sqlite_schema
+from name_cases import bag_order, name_bytes
 from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
 
 
@@ -38,4 +39,6 @@ GROUPS = {
     "mesh with siblings": Group(mesh, 400),
     "batch record": Group(batch_record, 1000),
     "SQLite schema": Group(sqlite_schema, 700),
+    "order of bags": Group(bag_order, 200),
+    "name bytes": Group(name_bytes, 200),
 }

@@ -107,19 +107,12 @@ class BagEgoMotion:
     """
 
     def __init__(
-        self,
-        times: np.ndarray,
-        read: ReadMessage,
-        links: Sequence[str],
-        source: str,
-        ego: Array | None = None,
-        notes: Sequence[str] = (),
+        self, times: np.ndarray, read: ReadMessage, links: Sequence[str], source: str, ego: Array | None = None
     ) -> None:
         """times: (N,) of the messages, ns. read: the samples of a message by link. links: from the world to the ego
         vehicle; their poses are multiplied. source: for error messages. ego: (4, 4) child_from_ego, None: the same.
-        notes: for the user.
         """
-        self.notes = tuple(notes)
+        self.notes: list[str] = []
         self._times, self._links, self._source, self._ego = times, tuple(links), source, ego
         self._read = lru_cache(maxsize=1 << 14)(read)
         self._window = lru_cache(maxsize=64)(self._read_window)
@@ -237,8 +230,10 @@ def _motion_from(
                 found.setdefault(link, []).append((one.timestamp_ns or int(times[index]), one.parent_from_child))
         return found
 
-    source = f"{bag.path}: {' and '.join(topics)}"
-    return BagEgoMotion(times, read, links, source, child_from_ego, invalid_note(" and ".join(topics), are_valid))
+    source = " and ".join(topics)
+    motion = BagEgoMotion(times, read, links, f"{bag.path}: {source}", child_from_ego)
+    motion.notes += invalid_note(source, are_valid)
+    return motion
 
 
 def _at(samples: list[Sample], time: int) -> Pose:
@@ -285,13 +280,10 @@ def capture_times(
 
     logged = {topic: bag.times(topic) for topic in topics}
     is_small = bag.size <= READ_WHOLE
-    places = [
-        (int(own[number]), topic, number)
-        for topic, own in logged.items()
-        for number in (range(len(own)) if is_small else spread(len(own), SAMPLES))
-    ]
+    numbers = {topic: range(len(own)) if is_small else spread(len(own), SAMPLES) for topic, own in logged.items()}
     # In the order of recording, so that each chunk is decompressed once.
-    times = {(topic, number): stated(topic, number) for _, topic, number in sorted(places)}
+    places = sorted((int(own[number]), topic, number) for topic, own in logged.items() for number in numbers[topic])
+    times = {(topic, number): stated(topic, number) for _, topic, number in places}
     found = {}
     for topic, own in logged.items():
         delays = [time - int(own[number]) for (other, number), time in times.items() if other == topic and time]
@@ -299,8 +291,8 @@ def capture_times(
         if is_small or (delays and max(delays) - min(delays) > LARGEST_SPREAD_NS):
             exact = (times[topic, number] if is_small else stated(topic, number) for number in range(len(own)))
             captured = np.array([time or rough for time, rough in zip(exact, captured.tolist(), strict=True)], np.int64)
-        numbers = np.argsort(captured, kind="stable")
-        found[topic] = (captured[numbers], numbers)
+        order = np.argsort(captured, kind="stable")
+        found[topic] = (captured[order], order)
     return found
 
 
