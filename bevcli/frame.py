@@ -15,6 +15,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose, apply
+from bevcli.printing import valid_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -227,7 +228,7 @@ class DerivedSequence(Sequence):
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
-        self.name, self.rig, self.stamps = sequence.name, sequence.rig, sequence.stamps
+        self.name, self.rig, self.stamps = valid_text(sequence.name), sequence.rig, sequence.stamps
         self.has_ego_motion, self.notes, self.facts = sequence.has_ego_motion, sequence.notes, sequence.facts
         self.ego_motion = sequence.ego_motion
 

@@ -1,8 +1,10 @@
 """Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
 
+import io
 import sys
 import unicodedata
 from collections.abc import Collection, Sequence
+from typing import Any
 
 LONGEST_MESSAGE = 1000  # characters
 
@@ -16,6 +18,11 @@ def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
         return text
     end = longest // 3  # a message ends with what to do
     return f"{text[: longest - end - 3]}...{text[len(text) - end :]}"
+
+
+def valid_text(name: str) -> str:
+    """The text with escapes for the bytes of a name that are not UTF-8, which no file or package can hold."""
+    return name.encode(errors="backslashreplace").decode()
 
 
 def reason_of(error: BaseException) -> str:
@@ -34,6 +41,28 @@ def say(*texts: object, err: bool = False) -> None:
 def counted(count: int | str, things: str) -> str:
     """A number of things, such as "6 cameras" or "1 camera". things: a plural that ends in s."""
     return f"{count} {things.removesuffix('s') if str(count) == '1' else things}"
+
+
+class _Output(io.FileIO):
+    """A stream whose reader may go away: what nobody reads is dropped, and the command goes on."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            return len(data)
+
+
+def prepare_output() -> None:
+    """Make stdout and stderr escape what a terminal does not know, such as "°", and outlive the reader of a pipe."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper):
+            if stream is getattr(sys, f"__{name}__") and not stream.isatty():
+                raw = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+                stream = io.TextIOWrapper(raw, stream.encoding, line_buffering=stream.line_buffering)
+            stream.reconfigure(errors="backslashreplace")
+            setattr(sys, name, stream)
 
 
 def _escaped(char: str) -> str:

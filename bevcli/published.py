@@ -12,6 +12,7 @@ import msgspec
 from bevcli.errors import ConfigError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
+from bevcli.user_folders import user_folder
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
@@ -70,12 +71,12 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     @property
     def path(self) -> Path | None:
         """The file, where the source is a path: it is used where it lies."""
-        return Path(self.source).expanduser() if self.source and not self.url else None
+        return Path(os.path.expanduser(self.source)) if self.source and not self.url else None
 
 
 def own_table() -> Path:
     """The file in which a user adds sources, $XDG_CONFIG_HOME/bevcli/weights.toml (default ~/.config)."""
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "bevcli/weights.toml"
+    return user_folder("XDG_CONFIG_HOME", ".config") / "weights.toml"
 
 
 def read_sources() -> dict[str, Source]:

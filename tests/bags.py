@@ -220,7 +220,7 @@ def write_json_mcap(path: Path, messages: list[Message]) -> Path:
     def encode(fields: dict[str, Any]) -> bytes:
         return json.dumps(fields, default=lambda data: base64.b64encode(data).decode()).encode()
 
-    return _write_encoded(path, messages, encode, "json", "jsonschema", lambda kind: b"{}")
+    return write_encoded(path, messages, encode, "json", "jsonschema", lambda kind: b"{}")
 
 
 def write_protobuf_mcap(path: Path, messages: list[Message], files: Any) -> Path:
@@ -238,10 +238,10 @@ def write_protobuf_mcap(path: Path, messages: list[Message], files: Any) -> Path
         return json_format.ParseDict(text, message).SerializeToString()
 
     typed = [(topic, kind, time, {**fields, "__type": kind}) for topic, kind, time, fields in messages]
-    return _write_encoded(path, typed, encode, "protobuf", "protobuf", lambda kind: files.SerializeToString())
+    return write_encoded(path, typed, encode, "protobuf", "protobuf", lambda kind: files.SerializeToString())
 
 
-def _write_encoded(
+def write_encoded(
     path: Path,
     messages: list[Message],
     encode: Callable[[dict[str, Any]], bytes],

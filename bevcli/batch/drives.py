@@ -49,7 +49,7 @@ class Drive:
 
     def result(self, job_hash: str) -> str:
         """The name of the folder of its results: other input, model, weights or options have another name."""
-        key = hashlib.sha256(f"{self.input_hash or self.source} {job_hash}".encode()).hexdigest()
+        key = hashlib.sha256(os.fsencode(f"{self.input_hash or self.source} {job_hash}")).hexdigest()
         return f"{self.name}-{key[:_KEY_DIGITS]}"
 
 

@@ -103,7 +103,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
-        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]})") from None
+        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]}); `count=1` needs no Ray") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
     try:

@@ -26,6 +26,7 @@ from bevcli.evaluation.joint import DriveMatches
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.parsing.files import is_there
+from bevcli.printing import valid_text
 from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
@@ -82,7 +83,7 @@ class Worker:
             else:
                 self._out.remove(marker)
                 return record
-        record = {**_about(drive, result), "attempts": attempt, "error": error}
+        record = {**_about(drive, result), "attempts": attempt, "error": valid_text(error)}
         self._out.write(f"{FAILED}/{result}.json", json.dumps(record).encode())
         self._out.remove(marker)
         return record
@@ -193,7 +194,7 @@ def use_threads(count: int) -> None:
 
 
 def _about(drive: Drive, result: str) -> Record:
-    return {"drive": drive.name, "source": drive.source, "scene": drive.scene, "result": result}
+    return {"drive": drive.name, "source": valid_text(drive.source), "scene": drive.scene, "result": result}
 
 
 def _summary_columns(summary: RunSummary) -> Record:

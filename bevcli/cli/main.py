@@ -5,7 +5,6 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 """
 
 import inspect
-import io
 import os
 import re
 import sys
@@ -21,7 +20,7 @@ from bevcli.cli.bridge import command
 from bevcli.cli.help_text import PlainCommand, printable, write_panels
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
-from bevcli.printing import one_line, reason_of, say
+from bevcli.printing import one_line, prepare_output, reason_of, say
 from bevcli.registry import entries, load
 
 # The order of the commands' panels. A command states its own as `PANEL` in its file; those that state none come last.
@@ -106,9 +105,7 @@ def run_app() -> None:
     """Run the given command: a user's mistake is one line on stderr and exit code 1, never a traceback."""
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal may know no "°"
+    prepare_output()
     keep_freed_memory()
     try:
         try:
@@ -120,9 +117,6 @@ def run_app() -> None:
         if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
             os._exit(1)
         sys.exit(1)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of the output is gone
-        sys.exit(0)
     except OSError as error:  # the system refuses: no space, no permission, a name that is too long
         where = "" if error.filename is None else f"{error.filename}: "
         message = None if error.strerror else system_error(error)
@@ -140,6 +134,8 @@ def run_app() -> None:
 def system_error(error: Exception) -> str | None:
     """The message for a lack of memory, or for a package that cannot be imported; None for any other error."""
     reason = one_line(reason_of(error), 300)
+    if isinstance(error, UnicodeEncodeError) and "surrogates" in error.reason:
+        return f"{one_line(error.object)}: is not a name in UTF-8: rename it"
     if _lacks_memory(error):
         return f"the system gives no more memory or threads: {reason}"
     package = _failed_import(error)

@@ -30,7 +30,16 @@ MOST_VALUES = 200_000  # of a TOML or YAML file
 _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
-_YamlLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _YamlLoader(_SafeLoader):
+    """The safe loader, which makes no Python objects, and reads OpenCV's matrices as mappings."""
+
+
+_YamlLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
 
 
 def read_json(
@@ -111,10 +120,10 @@ def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputErro
 
 def read_yaml(path: Path) -> Any:
     """The contents of a YAML file with plain values. Raises InputError."""
-    text = read_text(path, YAML_BYTES)
+    text = re.sub(r"\A%YAML:.*", "", read_text(path, YAML_BYTES))  # OpenCV's header, which is not YAML
     try:
         _check_yaml_depth(text, path)
-        document = yaml.load(text, _YamlLoader)  # the safe loader, which makes no Python objects
+        document = yaml.load(text, _YamlLoader)
     except yaml.YAMLError as error:
         raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError) as error:

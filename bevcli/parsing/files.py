@@ -2,10 +2,14 @@
 
 import os
 import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from bevcli.errors import BevcliError, InputError
+from bevcli.printing import valid_text
 
 MIB = 1 << 20
 
@@ -57,6 +61,23 @@ def open_regular(
         os.close(descriptor)
         raise error(f"{path}: is not a regular file (expected no folder, pipe or device)")
     return os.fdopen(descriptor, "rb")
+
+
+@contextmanager
+def plain_name(path: Path) -> Iterator[str]:
+    """A name for libraries that take UTF-8 only (OpenCV ends the process at others): of a link, where it has to be.
+
+    The library opens the file, which may be a new one, while the context lasts.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
+            link = Path(folder, "file").with_suffix(valid_text(path.suffix))
+            link.symlink_to(path.absolute())
+            yield str(link)
+    else:
+        yield str(path)
 
 
 def _size(count: int) -> str:

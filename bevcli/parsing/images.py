@@ -1,6 +1,8 @@
-"""Decodes JPEG and PNG images. The size is read from the header first: a small file can state a size of gigabytes."""
+"""Decodes image files. The size is read from the header first: a small file can state a size of gigabytes."""
 
+import re
 import struct
+from io import BytesIO
 
 import cv2
 import numpy as np
@@ -8,6 +10,8 @@ from numpy.typing import NDArray
 
 # Markers of a JPEG that state its size (start of frame): all from C0 to CF except DHT, JPG and DAC.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")  # those that have a length, and the end
+OTHERS = ("WEBP", "TIFF", "BMP")  # formats that Pillow and OpenCV read
 _WITHOUT_LENGTH = frozenset(range(0xD0, 0xD9)) | {0x01}
 
 
@@ -19,7 +23,7 @@ def media_type_of(encoded: bytes) -> str | None:
 
 
 def decode_image(encoded: bytes, flags: int, most_pixels: int) -> NDArray | None:
-    """The pixels of a whole JPEG or PNG, as `cv2.imdecode` gives them.
+    """The pixels of a whole image file, as `cv2.imdecode` gives them.
 
     None for another format, a damaged or cut file, and for an image with more than `most_pixels` pixels.
     """
@@ -33,14 +37,24 @@ def decode_image(encoded: bytes, flags: int, most_pixels: int) -> NDArray | None
 
 
 def size_of_image(encoded: bytes) -> tuple[int, int] | None:
-    """(width, height) in pixels as the header of a JPEG or PNG states it; None where it states none."""
+    """(width, height) in pixels as the header of an image file states it; None where it states none."""
     kind = media_type_of(encoded)
     if kind == "image/png":
         if len(encoded) < 24 or encoded[12:16] != b"IHDR":
             return None
         width, height = struct.unpack(">II", encoded[16:24])
         return width, height
-    return _jpeg_size(encoded) if kind == "image/jpeg" else None
+    return _jpeg_size(encoded) if kind == "image/jpeg" else _other_size(encoded)
+
+
+def _other_size(encoded: bytes) -> tuple[int, int] | None:
+    from PIL import Image
+
+    try:
+        with Image.open(BytesIO(encoded), formats=OTHERS) as image:
+            return image.size
+    except Exception:  # of many types for broken bytes
+        return None
 
 
 def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
@@ -65,13 +79,22 @@ def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def _is_cut_short(encoded: bytes) -> bool:
-    """True if the end of a JPEG or PNG is missing. OpenCV fills it with grey, and allocates what a chunk states."""
-    if media_type_of(encoded) == "image/jpeg":
-        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
-    place = 8
+    """True if the end of a JPEG or PNG is missing. OpenCV fills it with grey, and allocates what a chunk states.
+
+    Bytes after the end, such as the video of a motion photo, do not matter.
+    """
+    kind = media_type_of(encoded)
+    place = 2 if kind == "image/jpeg" else 8
+    while kind == "image/jpeg":
+        found = _MARKER.search(encoded, place)
+        if found is None or found[0] == b"\xff\xd9":  # the end of the image, which is not that of its thumbnail
+            return found is None
+        place = found.end() + int.from_bytes(encoded[found.end() : found.end() + 2], "big")
+    if kind is None:
+        return False  # OpenCV refuses those of the other formats
     while place + 12 <= len(encoded):  # a chunk of a PNG: length, kind, contents, checksum
-        kind = encoded[place + 4 : place + 8]
+        chunk = encoded[place + 4 : place + 8]
         place += 12 + int.from_bytes(encoded[place : place + 4], "big")
-        if kind == b"IEND":
+        if chunk == b"IEND":
             return place > len(encoded)
     return True

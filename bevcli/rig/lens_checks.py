@@ -14,19 +14,21 @@ SAME_SCALE = 0.3  # largest relative difference of the two axes' scales for one 
 MIN_FOV_DEG, MAX_PINHOLE_FOV_DEG = 10.0, 150.0
 WIDE_PINHOLE_DEG = 120.0  # lenses this wide have distortion
 SQUARE_PIXELS = 0.1
+LARGEST_SKEW = 0.05  # relative to fx; real cameras: below 0.001
+FARTHEST_CENTER = 0.25  # from the image, relative to its size: farther out not even cropped images have it
 VALID_SHARE = 0.7  # a lens model must be valid up to this share of the distance to the image border
 MAX_BEND = 2.0  # largest factor by which it may change the angle of a ray
 _ANGLES = np.radians(np.arange(0.25, 89.5, 0.25))
 
 
 def check_lenses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
-    """At most one error a camera: from the lens model, the image size, or the field of view, in this order.
+    """At most one error a camera: from the lens model, the image size, the field of view, or the matrix, in this order.
 
     Cameras without an error may get warnings.
     """
     findings: list[Finding] = []
     for camera in cameras:
-        possible = (_distortion(camera), _resolution(camera), _field_of_view(camera))
+        possible = (_distortion(camera), _resolution(camera), _field_of_view(camera), _center_or_skew(camera))
         error = next((finding for finding in possible if finding is not None), None)
         findings.extend([error] if error is not None else _warnings(camera))
     return tuple(findings)
@@ -102,6 +104,20 @@ def _field_of_view(camera: Camera) -> Finding | None:
     found = f"{horizontal:.1f}° horizontally, focal length {camera.intrinsics[0, 0]:.0f} px, image width {camera.width}"
     message, advice = "the field of view is implausible", "give the focal length in pixels of these images"
     return Finding("fov-implausible", "error", camera.name, message, found, expected, advice)
+
+
+def _center_or_skew(camera: Camera) -> Finding | None:
+    """A principal point far outside of the image, or a skew that no camera has."""
+    advice = "write the matrix row by row, [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], in pixels of these images"
+    skew, center = float(camera.intrinsics[0, 1]), camera.intrinsics[:2, 2]
+    if abs(skew) > LARGEST_SKEW * camera.intrinsics[0, 0]:
+        message = "the intrinsics have a skew that no camera has"
+        return Finding("intrinsics-skew", "error", camera.name, message, f"{skew:g} px", "about 0", advice)
+    if (abs(center / (camera.width, camera.height) - 0.5) <= 0.5 + FARTHEST_CENTER).all():
+        return None
+    message, found = "the principal point is far outside of the image", f"{center[0]:.0f}, {center[1]:.0f}"
+    expected = f"about {camera.width / 2:.0f}, {camera.height / 2:.0f}"
+    return Finding("principal-point", "error", camera.name, message, found, expected, advice)
 
 
 def _warnings(camera: Camera) -> list[Finding]:

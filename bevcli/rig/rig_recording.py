@@ -13,6 +13,7 @@ from matplotlib.colors import to_rgb
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
+from bevcli.parsing.files import plain_name
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.colors import BACKGROUND
@@ -106,7 +107,7 @@ def _layout(rig: CameraRig) -> Layout:
 @contextlib.contextmanager
 def rig_recording(path: Path, application: str, rig: CameraRig, layout: Layout) -> Iterator[rr.RecordingStream]:
     """A recording with the vehicle and the rig's pinholes; the layout is freed. Raises OutputError."""
-    with whole_file(path) as unfinished, rr.RecordingStream(application) as stream:
+    with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream(application) as stream:
         try:
             stream.save(unfinished, default_blueprint=layout)
         except RuntimeError as error:

@@ -176,7 +176,8 @@ class ImageReader:
         pixels = decode(encoded, size[0] * size[1])
         if pixels is None:
             raise UnreadableImage(f"{source.path} is not a complete image")
-        return CameraImage(source.timestamp_ns, pixels, encoded, media_type_of(encoded))
+        media_type = media_type_of(encoded)
+        return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
     def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
         reader = self._videos.get(camera)
@@ -190,7 +191,7 @@ class ImageReader:
 
 
 def decode(encoded: bytes, most_pixels: int = MOST_PIXELS) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more pixels (64 MP)."""
+    """(H, W, 3) uint8 BGR of an image file; None for another format, a damaged one, or one of more pixels (64 MP)."""
     pixels = decode_image(encoded, DECODE_FLAGS, most_pixels)
     return None if pixels is None else pixels.astype(np.uint8, copy=False)
 
@@ -256,6 +257,11 @@ def read_frame(
         ground_truth=ground_truth,
         ground_truth_map=ground_truth_map,
     )
+
+
+def leads_out(path: Path, folder: Path) -> bool:
+    """True for a path that is not below the folder, by its names alone: links are followed when the image is read."""
+    return not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
 
 
 class ListedSequence(Sequence):

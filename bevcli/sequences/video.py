@@ -1,6 +1,7 @@
 """Reads a video from front to back. It never seeks, because OpenCV's seeking is inexact in many codecs."""
 
 import contextlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.parsing.files import open_regular
+from bevcli.parsing.files import open_regular, plain_name
 
 # Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
 # H.265, VP9 and AV1.
@@ -66,16 +67,28 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     if not any(start[place:].startswith(magic) for place, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
     try:
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        with plain_name(path) as name:
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     except cv2.error:
         capture = cv2.VideoCapture()
     if not capture.isOpened():
         raise InputError(f"{path} cannot be opened as a video (expected a codec such as H.264 or FFV1)")
+    # The calibration is that of the pixels as they are stored, and versions of OpenCV differ in whether they turn them.
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     width, height = (capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     if not 0 < width * height <= MOST_PIXELS:
         capture.release()
         raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
     return capture
+
+
+def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:
+    """A note on each video with a tag by which players turn its images. Videos that cannot be read have none."""
+    for path in paths:
+        with contextlib.suppress(InputError):
+            degrees = open_capture(path).get(cv2.CAP_PROP_ORIENTATION_META)
+            if degrees % 360:
+                yield f"{path}: has a rotation tag ({degrees:.0f} degrees): its images are read as they are stored"
 
 
 def count_and_rate(path: Path) -> tuple[int, float]:

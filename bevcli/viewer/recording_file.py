@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import rerun as rr
 
 from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.parsing.files import plain_name
 from bevcli.parsing.own_process import run_program, run_python
 from bevcli.viewer.native import viewer_binary, viewer_environment
 from bevcli.writing import whole_file
@@ -58,11 +59,12 @@ def open_recording(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is not a regular file (expected no folder, pipe or device)")
     if _is_whole(path):
-        _check(path, path)
-        yield path
+        with plain_name(path) as name:
+            _check(Path(name), path)
+            yield Path(name)
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
-        copy = Path(folder) / path.name
+        copy = Path(folder) / RECORDING
         _repair(path, copy)
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")

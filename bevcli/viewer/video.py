@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.parsing.files import plain_name
 from bevcli.recording import entities
 from bevcli.recording.video_images import has_av
 from bevcli.viewer.recording_reader import RecordingReader
@@ -32,7 +33,7 @@ def write_video(recording: Path, video: Path, count: int, rate: float, on_frame:
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
     encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
-    with whole_file(video) as unfinished:
+    with whole_file(video) as own, plain_name(own) as unfinished:
         with encoder(unfinished, rate) as write:
             for image in _images(recording):
                 write(image)
@@ -40,16 +41,16 @@ def write_video(recording: Path, video: Path, count: int, rate: float, on_frame:
         _check_complete(unfinished, count)
 
 
-def _check_complete(video: Path, count: int) -> None:
+def _check_complete(video: str, count: int) -> None:
     """Raises OSError where a video lacks frames: OpenCV does not tell that a disk is full."""
-    found = cv2.VideoCapture(str(video))
+    found = cv2.VideoCapture(video)
     if not (found.isOpened() and found.get(cv2.CAP_PROP_FRAME_COUNT) >= count - 1):  # computed from the times in a WebM
         raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
 
 
 @contextmanager
-def _vp9(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
-    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*FOURCC[video.suffix.lower()]), rate, (WIDTH, HEIGHT))
+def _vp9(video: str, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
+    writer = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*FOURCC[Path(video).suffix.lower()]), rate, (WIDTH, HEIGHT))
     if not writer.isOpened():
         raise OSError("OpenCV cannot open it: is its folder there and writable, and is there enough memory?")
     try:
@@ -59,10 +60,10 @@ def _vp9(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
 
 
 @contextmanager
-def _h264(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
+def _h264(video: str, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
     import av
 
-    with av.open(str(video), "w", options={"movflags": "+faststart"}) as container:
+    with av.open(video, "w", options={"movflags": "+faststart"}) as container:
         exact = Fraction(rate).limit_denominator(1000)
         stream = container.add_stream("libx264", rate=exact, options={"crf": str(H264_QUALITY)})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"

@@ -323,16 +323,17 @@ def test_damaged_records_are_run_again(batch, tmp_path):
         assert all(old[key] == new[key] for key in ("drive", "result", "attempts", "error", "boxes_by_class"))
 
 
-def test_names_of_drives_are_no_formulas_in_batch_csv(batch, tmp_path):
-    names = ["+1+1", "-1", "=1+1", "@x"]
+def test_odd_names_of_drives_are_cells_and_no_formulas(batch, tmp_path):
+    names = ["+1+1", "-1", "=1+1", "@x", "\udcffx"]
     for seed, name in enumerate(names):
         write_drive(tmp_path / name, seed, 1)
     batch([str(tmp_path / name) for name in names])
     rows = list(csv.DictReader((tmp_path / "out/batch.csv").open()))
-    assert [row["drive"] for row in rows] == ["'+1+1", "'-1", "_1+1", "_x"]
+    assert [row["drive"] for row in rows] == ["'+1+1", "'-1", "_1+1", "_x", "_x"]
+    assert rows[-1]["source"].endswith(r"/\udcffx")
     assert all(cell[:1] not in ("+", "=", "-", "@") for row in rows for cell in row.values())
     table = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
-    assert [row["drive"] for row in table] == ["+1+1", "-1", "_1+1", "_x"]
+    assert [row["drive"] for row in table] == ["+1+1", "-1", "_1+1", "_x", "_x"]
 
 
 def test_the_row_of_a_drive_in_millimetres_says_so(batch, tmp_path):

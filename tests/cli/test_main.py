@@ -185,11 +185,12 @@ def test_a_pipe_is_no_recording(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["a b", "a'b\"c", "a\nb", "a*[?]b", "-r", "x" * 255, "日本", "%s{0}", "a#3"])
+@pytest.mark.parametrize("name", ["a b", "a'b\"c", "a\nb", "a*[?]b", "-r", "x" * 255, "日本", "%s{0}", "a#3", "\udcff"])
 def test_a_drive_of_any_name_is_checked(tmp_path, name):
     shutil.copytree(SAMPLE, tmp_path / name)
-    assert command(tmp_path, "project-debug", tmp_path / name, "--out", "out").returncode == 0
-    assert (tmp_path / "out/findings.json").is_file()
+    out = f"out{name[:9]}"
+    assert command(tmp_path, "project-debug", tmp_path / name, "--out", out).returncode == 0
+    assert (tmp_path / out / "findings.json").is_file()
 
 
 NAME_OF_300 = "x" * 300

@@ -23,6 +23,23 @@ def test_closed_streams_are_null_devices(streams):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_reader_that_is_gone_before_the_first_byte_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run([*PROGRAM, "--version"], stdout=writer, stderr=subprocess.PIPE, check=False)
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_name_that_a_package_cannot_take_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(main, "app", lambda: "drive\udcff".encode())
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    done = command(tmp_path, "run")
+    assert (done.returncode, done.stderr) == (1, "error: drive\\udcff: is not a name in UTF-8: rename it\n")
+
+
 @pytest.mark.parametrize(
     "error",
     [

@@ -14,6 +14,7 @@ from random import Random
 
 from dangling_cases import damaged_checkpoint, dangling_tokens
 from file_cases import batch_record, mesh, onnx_file, sqlite_schema
+from name_cases import bag_order, name_bytes
 from recording_cases import cut_recording, foreign_columns, reordered_recording
 from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
 from server_cases import server_behaviour
@@ -47,4 +48,6 @@ GROUPS = {
     "order of recordings": Group(reordered_recording, 100),
     "cuts of recordings": Group(cut_recording, 200),
     "servers of weights": Group(server_behaviour, 1000),
+    "order of bags": Group(bag_order, 200),
+    "name bytes": Group(name_bytes, 200),
 }

@@ -161,6 +161,14 @@ def shifted_center(camera):
     camera["intrinsics"][0][2] *= 1.4
 
 
+def center_outside(camera):
+    camera["intrinsics"][0][2] = -0.49 * camera["width"]
+
+
+def skewed(camera):
+    camera["intrinsics"][0][1] = 0.8 * camera["intrinsics"][0][0]
+
+
 LENS_MISTAKES = [
     ("intrinsics-resolution", scaled(0.5)),
     ("intrinsics-resolution", scaled(2.0)),
@@ -169,6 +177,8 @@ LENS_MISTAKES = [
     ("intrinsics-resolution", transposed_size),
     ("fov-implausible", focal(15)),
     ("fov-implausible", focal(0.1)),
+    ("principal-point", center_outside),
+    ("intrinsics-skew", skewed),
     ("distortion-absurd", lens("brown_conrady", [-3.0, 0.0, 0.0, 0.0])),
     ("distortion-absurd", lens("brown_conrady", [0.1, 0.0, 0.9, 0.0])),
     ("distortion-absurd", lens("brown_conrady", [900.0, 0.2, 0.0, 0.0, 0.0])),

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -84,6 +85,49 @@ def test_folder_of_ros_files(tmp_path):
     assert rig["narrow"].distortion.coefficients == (0.1, -0.2, 0.001, 0.002, 0.03)
     assert rig["wide"].distortion.coefficients == (0.1, 0.2, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1)
     np.testing.assert_allclose(rig["wide"].intrinsics, [[500, 0, 320], [0, 501, 240], [0, 0, 1]])
+
+
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 5.0e+02, 0., 320., 0., 5.01e+02, 240., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 0.1, -0.2, 0.001, 0.002, 0.03 ]
+"""
+
+
+def test_the_file_that_opencv_writes(tmp_path):
+    stated = cv2.FileStorage(OPENCV, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    camera = read(tmp_path, OPENCV, "intrinsics")
+    np.testing.assert_array_equal(camera.intrinsics, stated.getNode("camera_matrix").mat())
+    np.testing.assert_array_equal(
+        camera.distortion.coefficients, stated.getNode("distortion_coefficients").mat().ravel()
+    )
+
+
+@pytest.mark.parametrize(
+    ("alias", "model"), [("radtan", "brown_conrady"), ("fisheye", "kannala_brandt"), ("equidistant", "kannala_brandt")]
+)
+def test_a_lens_has_the_names_of_ros_kalibr_and_opencv(tmp_path, alias, model):
+    four = ROS.replace("cols: 5, data: [0.1, -0.2, 0.001, 0.002, 0.03]", "cols: 4, data: [0.1, -0.2, 0.001, 0.002]")
+    for text, name in ((four.replace("plumb_bob", alias), "narrow"), (KALIBR.replace("radtan", alias), "cam0")):
+        assert read(tmp_path, text, name).distortion.model == model
+
+
+def read(folder, intrinsics, name):
+    """A camera of an intrinsics file."""
+    (folder / "intrinsics.yaml").write_text(intrinsics)
+    pose = {"ego_from_camera": {"translation": [0, 0, 0], "rotation_wxyz": [1, 0, 0, 0]}}
+    (folder / "poses.json").write_text(json.dumps({"cameras": {name: pose}}))
+    return read_rig(folder / "intrinsics.yaml", folder / "poses.json")[name]
 
 
 def test_distortion_with_zero_coefficients_is_none(tmp_path):

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,8 @@ from bags import (
     drive_messages,
     header,
     odometry,
-    quaternion,
     transform,
+    write_encoded,
     write_json_mcap,
     write_mcap,
     write_protobuf_mcap,
@@ -27,7 +28,7 @@ from bags import (
 )
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import CameraImage, Sequence
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose, rotation_about_z
@@ -114,11 +115,12 @@ def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
     )
 
 
-def test_opening_a_bag_reads_no_image(
+def test_opening_a_large_bag_reads_few_images(
     tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bevcli.sequences.ros.storage import McapFile
 
+    monkeypatch.setattr("bevcli.sequences.ros.ego_motion.READ_WHOLE", 0)
     messages = messages_of(native, motion)
     images = [message for message in messages if "image" in message[0]]
     for repeat in range(1, 50):
@@ -179,12 +181,102 @@ def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Sequence
     assert "\n" not in str(found.value)
 
 
-def test_a_first_pose_without_a_rotation_is_an_error(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+NO_POSES = {
+    "NaN": Pose(np.full(3, np.nan), np.array([1.0, 0, 0, 0])),
+    "infinite": Pose(np.array([0, np.inf, 0]), np.array([1.0, 0, 0, 0])),
+    "zero": Pose(np.zeros(3), np.zeros(4)),
+    "NaN rotation": Pose(np.zeros(3), np.full(4, np.nan)),
+}
+
+
+@pytest.mark.parametrize("poses_in", ["odometry", "tf"])
+def test_poses_that_are_none_are_left_out_with_their_number(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, poses_in: str
+) -> None:
+    messages = messages_of(native, motion, poses_in=poses_in)
+    topic = {"odometry": "/odom", "tf": "/tf"}[poses_in]
+    of_topic = [place for place, message in enumerate(messages) if message[0] == topic]
+    for place, pose in zip((of_topic[0], *of_topic[4:10:4], of_topic[-1]), NO_POSES.values(), strict=True):
+        _, kind, time, fields = messages[place]
+        fields = odometry(time, "map", "base_link", pose)
+        if poses_in == "tf":
+            fields = {"transforms": [transform(time, "map", "base_link", pose)]}
+        messages[place] = (topic, kind, time, fields)
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    assert any(f"{topic}: 4 of {len(of_topic)} poses are left out" in note for note in sequence.notes)
+    found, true = sequence.load(0), native.load(0)
+    np.testing.assert_allclose(
+        found.world_from_ego_at["CAM_FRONT"].matrix, true.world_from_ego_at["CAM_FRONT"].matrix, atol=1e-9
+    )
+
+
+def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
     messages = messages_of(native, motion)
-    first = next(fields for topic, *_, fields in messages if topic == "/odom")
-    first["pose"]["pose"]["orientation"] = quaternion(np.zeros(4))
-    with pytest.raises(InputError, match=r"/odom: message 0 is not a pose"):
-        open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    bad = [transform(1, "base_link", f"{name}_optical", NO_POSES["zero"]) for name in native.rig.names]
+    early = [("/tf_static", "tf2_msgs/TFMessage", time, {"transforms": bad}) for time in range(1, 300)]
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", early + messages))
+    np.testing.assert_allclose(
+        sequence.rig["CAM_FRONT"].ego_from_camera, native.rig["CAM_FRONT"].ego_from_camera, atol=1e-12
+    )
+    assert any("/tf_static: 598 of 600 poses are left out" in note for note in sequence.notes)
+
+
+def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    messages = [message for message in messages_of(native, motion) if message[0] != "/odom"]
+    bad = [
+        ("/odom", "nav_msgs/Odometry", time, odometry(time, "map", "base_link", NO_POSES["NaN"]))
+        for time in motion.timestamps_ns.tolist()
+    ]
+    with pytest.raises(InputError, match=r"/odom: has no poses"):
+        open_sequence(write_mcap(tmp_path / "bag.mcap", messages + bad))
+
+
+def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    messages = messages_of(native, motion)
+    for time, zero in enumerate((0.0, np.nan), start=1):
+        unset = {**camera_info(native.rig["CAM_FRONT"], time, ""), "k": [zero] * 9}
+        messages.append(("/CAM_FRONT/camera_info", "sensor_msgs/CameraInfo", time, unset))
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    np.testing.assert_array_equal(sequence.rig["CAM_FRONT"].intrinsics, native.rig["CAM_FRONT"].intrinsics)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_the_intrinsics_are_those_of_the_region_of_interest(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, rectified: bool
+) -> None:
+    info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
+    info |= {"width": 200, "height": 100, "k": [80.0, 0, 100, 0, 80, 50, 0, 0, 1], "binning_x": 2, "binning_y": 2}
+    info |= {"p": [80.0, 0, 100, 0, 0, 80, 50, 0, 0, 0, 1, 0]}
+    info["roi"] = {"x_offset": 40, "y_offset": 10, "width": 128, "height": 64, "do_rectify": False}
+    messages = [
+        (t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages_of(native, motion)
+    ]
+    if rectified:
+        messages = renamed(messages, {"/CAM_FRONT/image/compressed": "/CAM_FRONT/image_rect/compressed"})
+    camera = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).rig["CAM_FRONT"]
+    assert (camera.width, camera.height) == (64, 32)
+    # The sensor's pixel (100, 50) is pixel (60, 40) of the region, and every second pixel of it is kept.
+    np.testing.assert_array_equal(camera.intrinsics, [[40, 0, 30], [0, 40, 20], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("topic", ["/CAM_FRONT/image/compressed", "/CAM_BACK/image/compressed", "/odom"])
+def test_messages_in_any_order_give_the_same_frames(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, topic: str
+) -> None:
+    messages = messages_of(native, motion)
+    times = [time for name, _, time, _ in messages if name == topic]
+    shuffled = iter(np.random.default_rng(0).permutation(times).tolist())
+    late = [(name, kind, next(shuffled) if name == topic else time, f) for name, kind, time, f in messages]
+    found = open_sequence(write_mcap(tmp_path / "late.mcap", late))
+    true = open_sequence(write_mcap(tmp_path / "true.mcap", messages))
+    assert found.stamps == true.stamps
+    for place in range(len(true.stamps)):
+        assert not found.load(place).dropped
+        for name, image in true.load(place).images.items():
+            np.testing.assert_array_equal(found.load(place).images[name].pixels_bgr, image.pixels_bgr)
+            np.testing.assert_array_equal(
+                found.load(place).world_from_ego_at[name].matrix, true.load(place).world_from_ego_at[name].matrix
+            )
 
 
 def test_files_beside_the_bag_replace_its_calibration_and_poses(
@@ -435,6 +527,60 @@ def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(
         open_sequence(path, strict=True).load(0)
 
 
+def compressed_bag(folder: Path, native: Sequence, images: list[tuple[str, bytes]]) -> Path:
+    """The small drive with these images in turn: their formats and bytes."""
+    messages, left = [], cycle(images)
+    for topic, kind, time, fields in messages_of(native, None):
+        if kind == "sensor_msgs/CompressedImage":
+            stated, encoded = next(left)
+            fields = {**fields, "format": stated, "data": encoded}
+        messages.append((topic, kind, time, fields))
+    return write_mcap(folder / "bag.mcap", messages)
+
+
+def images_of_bag(path: Path) -> list[CameraImage]:
+    """The images of all frames."""
+    sequence = open_sequence(path, ego_motion="static")
+    frames = [sequence.load(place) for place in range(len(sequence.stamps))]
+    return [image for frame in frames for image in frame.images.values()]
+
+
+def encoded_as(suffix: str, pixels: np.ndarray) -> bytes:
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
+    return cv2.imencode(suffix, pixels, quality)[1].tobytes()
+
+
+def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Sequence) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (36, 64, 3), dtype=np.uint8)  # OpenCV's WebP is without loss
+    images = [(f"bgr8; {kind} compressed bgr8", encoded_as(f".{kind}", pixels)) for kind in ("webp", "tiff", "bmp")]
+    images.append(("rgb8; png compressed rgb8", encoded_as(".png", pixels[..., ::-1])))
+    for image in images_of_bag(compressed_bag(tmp_path, native, images)):
+        np.testing.assert_array_equal(image.pixels_bgr, pixels)
+        assert image.encoded is None  # other files are not handed on
+
+
+def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: Sequence) -> None:
+    tile = np.array([[200, 120], [120, 40]])  # red top left
+    small, wide = (np.tile(tile << shift, (18, 32)).astype(kind) for shift, kind in ((0, np.uint8), (8, np.uint16)))
+    coloured = np.full((36, 64, 3), (40, 120, 200), dtype=np.uint8)
+    images = [
+        ("bayer_rggb8; jpeg compressed bayer_rggb8", encoded_as(".jpg", small)),
+        ("bayer_rggb8; jpeg compressed ", encoded_as(".jpg", small)),
+        ("bayer_rggb16; png compressed ", encoded_as(".png", wide)),
+        ("bayer_rggb8; jpeg compressed bgr8", encoded_as(".jpg", coloured)),
+    ]
+    for image in images_of_bag(compressed_bag(tmp_path, native, images)):
+        np.testing.assert_allclose(image.pixels_bgr[10, 10].astype(int), [40, 120, 200], atol=4)
+
+
+def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path: Path, native: Sequence) -> None:
+    path = compressed_bag(tmp_path, native, [("h264", b"\0\0\0\1" * 20)])
+    with pytest.raises(
+        InputError, match=r"/CAM_BACK/image/compressed: images of format h264 are not read \(expected JP"
+    ):
+        open_sequence(path, ego_motion="static").load(0)
+
+
 def foxglove_messages(native: Sequence, motion: EgoMotion, time_of) -> list[Message]:
     """The drive in Foxglove's schemas. time_of: nanoseconds -> the schema's time."""
     messages: list[Message] = []
@@ -519,6 +665,26 @@ def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequen
     (tmp_path / "folder.bag").mkdir()
     with pytest.raises(InputError, match=r"folder\.bag: is a bag of ROS 1: convert it"):
         open_sequence(tmp_path / "folder.bag")
+
+
+@pytest.mark.parametrize("name", ["drive.mcap.zst", "drive.db3.gz", "folder"])
+def test_a_packed_bag_is_named_with_the_remedy(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.mkdir() if name == "folder" else path.write_bytes(b"packed")
+    if name == "folder":
+        (path / "drive_0.mcap.zst").write_bytes(b"packed")
+    with pytest.raises(InputError, match=rf"{name}: .* compressed: decompress .*zstd -d drive"):
+        open_sequence(path)
+
+
+def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path: Path) -> None:
+    path = write_encoded(
+        tmp_path / "old.mcap",
+        [("/cam/image", "sensor_msgs/CompressedImage", 1, {}), ("/cam/camera_info", "sensor_msgs/CameraInfo", 1, {})],
+        lambda fields: b"\0" * 20, "ros1", "ros1msg", lambda kind: b"",
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"old\.mcap: .*encoded as ros1.*rosbags-convert"):
+        open_sequence(path)
 
 
 def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion) -> None:

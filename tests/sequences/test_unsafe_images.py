@@ -84,6 +84,24 @@ def test_the_header_states_the_size_of_the_image(suffix):
             assert decode_image(encoded[:cut], cv2.IMREAD_COLOR, width * height) is None
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_bytes_after_the_end_of_an_image_do_not_matter(suffix):
+    pixels = np.random.default_rng(0).integers(0, 255, (36, 64, 3), dtype=np.uint8)
+    encoded = cv2.imencode(suffix, pixels)[1].tobytes()
+    for tail in (b"\0" * 99, b"\xff\xda" * 9, encoded[:-9], b"ftyp\xff\xd8\xff\xda" * 9):
+        found = decode_image(encoded + tail, cv2.IMREAD_COLOR, 64 * 36)
+        np.testing.assert_array_equal(found, decode_image(encoded, cv2.IMREAD_COLOR, 64 * 36))
+
+
+def test_a_cut_jpeg_with_a_whole_thumbnail_is_cut():
+    encoded = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (36, 64, 3), dtype=np.uint8))[1].tobytes()
+    small = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    exif = b"\xff\xe1" + (len(small) + 2).to_bytes(2, "big") + small
+    whole = encoded[:2] + exif + encoded[2:]
+    assert decode_image(whole, cv2.IMREAD_COLOR, 64 * 36) is not None
+    assert decode_image(whole[:-400], cv2.IMREAD_COLOR, 64 * 36) is None
+
+
 def test_a_png_chunk_longer_than_the_file_is_refused_undecoded():
     encoded = bytearray(cv2.imencode(".png", np.zeros((36, 64, 3), np.uint8))[1].tobytes())
     place = encoded.index(b"IDAT") - 4
@@ -124,6 +142,12 @@ def test_images_outside_of_the_folder_need_allow_outside(drive, kind):
     with pytest.raises(InputError, match=r"leads out of the folder.*`allow_outside=True`"):
         open_sequence(drive).load(1)
     assert "CAM_BACK" in open_sequence(drive, allow_outside=True).load(1).images
+
+
+def test_dots_that_lead_back_into_the_folder_are_inside(drive):
+    table = drive / "frames.csv"
+    table.write_text(table.read_text().replace("images/CAM_BACK/1.png", "images/../images/CAM_BACK/1.png"))
+    assert "CAM_BACK" in open_sequence(drive).load(1).images
 
 
 def test_commands_take_allow_outside(drive, tmp_path, monkeypatch):

@@ -45,6 +45,31 @@ def test_images_are_read_by_index_in_any_order(tmp_path, suffix):
         np.testing.assert_array_equal(reader.read(number), images[number])
 
 
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_rotation_tag_leaves_the_pixels_as_stored(videos, degrees):
+    plain = videos / "videos/CAM_FRONT.mp4"
+    (videos / "videos/CAM_FRONT.mkv").unlink()
+    write_video(plain, [image_of("CAM_FRONT", n) for n in range(10)], 10, "mp4v")
+    stored = VideoReader(plain).read(0)
+    content = bytearray(plain.read_bytes())
+    matrix = content.index(b"tkhd") + 44  # of a track: nine numbers of 32 bits, the first two rows in 16.16
+    turn = {90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}[degrees]
+    for place, value in zip((0, 4, 12, 16), turn, strict=True):
+        content[matrix + place : matrix + place + 4] = (value << 16).to_bytes(4, "big", signed=True)
+    plain.write_bytes(content)
+    sequence = open_sequence(videos, ego_motion="static")
+    assert any("CAM_FRONT.mp4: has a rotation tag" in note for note in sequence.notes)
+    np.testing.assert_array_equal(sequence.load(0).images["CAM_FRONT"].pixels_bgr, stored)
+
+
+def test_a_video_whose_name_is_not_utf8_is_read(tmp_path):
+    """OpenCV ends the process at such a name."""
+    images = [image_of("CAM_FRONT", number) for number in range(2)]
+    write_video(tmp_path / "v.mkv", images, 10)
+    odd = (tmp_path / "v.mkv").rename(tmp_path / "\udcff\udce9.mkv")
+    np.testing.assert_array_equal(VideoReader(odd).read(1), images[1])
+
+
 def test_index_beyond_the_end_is_an_error_every_time(tmp_path):
     write_video(tmp_path / "v.mkv", [image_of("CAM_FRONT", number) for number in range(3)], 10)
     reader = VideoReader(tmp_path / "v.mkv")

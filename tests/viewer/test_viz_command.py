@@ -3,6 +3,8 @@
 import csv
 import json
 import resource
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -91,7 +93,9 @@ def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, e
         pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
     monkeypatch.setattr(video, "has_av", lambda: with_av)
     _, path = drive
-    viz(path, "--video", tmp_path / f"v.{ending}")
+    odd = Path(shutil.copytree(path.parent, tmp_path / "\udcff"), path.name)  # not UTF-8: OpenCV and rerun fail at it
+    viz(odd, "--video", tmp_path / f"\udcff.{ending}")
+    (tmp_path / f"\udcff.{ending}").rename(tmp_path / f"v.{ending}")
     written = cv2.VideoCapture(str(tmp_path / f"v.{ending}"))
     codec = int(written.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
     assert codec in codecs

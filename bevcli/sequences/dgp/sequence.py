@@ -12,7 +12,7 @@ from bevcli.geometry.ego_motion import motion_of_keyframes
 from bevcli.geometry.transforms import Array, yaw_of_rotation
 from bevcli.sequences.dgp.records import Record, Sample, poses, read_record, read_samples
 from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, leads_out, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.sequences.tracks import with_track_velocities
@@ -80,7 +80,7 @@ class DgpSequence(ListedSequence):
         """The file that a member names. Raises InputError if it leads out of the scene."""
         name = record.text(member)
         file = PurePosixPath(name)
-        if not self._outside and (file.is_absolute() or ".." in file.parts):
+        if not self._outside and leads_out(self.path / file, self.path):
             where = f"{record.where}: {name:.100}"
             raise InputError(f"{where}: leads out of the folder: pass `allow_outside=True` to read it")
         return self.path / file

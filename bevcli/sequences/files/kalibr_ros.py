@@ -9,13 +9,11 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json, read_yaml
-from bevcli.sequences.files.calibration_file import parse_camera
+from bevcli.sequences.files.calibration_file import LENS_NAMES, parse_camera
 from bevcli.sequences.files.json_fields import parse_numbers, parse_transform, require, transform_to_json
 
 Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
 YAML_SUFFIXES = (".yaml", ".yml")
-KALIBR_LENSES = {"radtan": "brown_conrady", "equidistant": "kannala_brandt", "none": "none"}
-ROS_LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
 CHAIN = "camera_from_previous"  # key of Kalibr's T_cn_cnm1 in Fields, until all poses are known
 
 
@@ -84,9 +82,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
         "width": int(width),
         "height": int(height),
         "intrinsics": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-        "distortion": _lens(
-            entry.get("distortion_model", "none"), entry.get("distortion_coeffs") or [], KALIBR_LENSES, where
-        ),
+        "distortion": _lens(entry.get("distortion_model", "none"), entry.get("distortion_coeffs") or [], where),
     }
     if "T_cn_cnm1" in entry:
         fields[CHAIN] = require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where)
@@ -103,7 +99,7 @@ def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
         "width": document.get("image_width", document.get("width")),
         "height": document.get("image_height", document.get("height")),
         "intrinsics": [numbers[0:3], numbers[3:6], numbers[6:9]],
-        "distortion": _lens(document.get("distortion_model") or "plumb_bob", coefficients or [], ROS_LENSES, where),
+        "distortion": _lens(document.get("distortion_model") or "plumb_bob", coefficients or [], where),
     }
 
 
@@ -116,9 +112,10 @@ def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> lis
     return require(parse_numbers, owner, name, (count,), where=where).tolist()
 
 
-def _lens(model: object, coefficients: object, known: Mapping[str, str], where: str) -> Fields:
+def _lens(model: object, coefficients: object, where: str) -> Fields:
     if not isinstance(coefficients, list):
         raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
+    known = {**LENS_NAMES, "none": "none"}
     if not isinstance(model, str) or model not in known:
         raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {', '.join(known)})")
     if not any(coefficients):

@@ -19,10 +19,11 @@ from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import open_maps
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, leads_out, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
+from bevcli.sequences.video import rotation_notes
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -59,7 +60,9 @@ class FolderSequence(ListedSequence):
             _check_coverage(file, self.ego_motion, entries, advice)
         self.has_ego_motion = self.ego_motion is not None
         self._read_truth(is_read=common.ground_truth)
-        self.notes = (*rig_notes(self.rig), *notes, *motion_notes)
+        sources = [one for entry in entries for one in entry.sources.values() if isinstance(one, ImageSource)]
+        turned = rotation_notes(sorted({one.path for one in sources if one.video_index is not None}))
+        self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *turned)
 
     def _read_truth(self, *, is_read: bool) -> None:
         """Read ground_truth.json and ground_truth_lines.json; maps are read frame by frame. Each may be missing."""
@@ -124,11 +127,11 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
 
 
 def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
-    """Raise InputError for an absolute path or one with "..". Links are followed when the image is read."""
+    """Raise InputError for a path that leads out of the folder. Links are followed when the image is read."""
     for entry in entries:
         for camera, source in entry.sources.items():
             path = source.path if isinstance(source, ImageSource) else folder
-            if not path.is_relative_to(folder) or ".." in path.relative_to(folder).parts:
+            if leads_out(path, folder):
                 raise InputError(
                     f"{entry.origin}: camera {camera}: {path}: leads out of the folder: pass "
                     "`allow_outside=True` to read it"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence as Indices
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
 from bevcli.printing import reason_of
-from bevcli.sequences.ros.format import METADATA, SUFFIXES
+from bevcli.sequences.ros.format import METADATA, SUFFIXES, is_packed_bag
 from bevcli.sequences.ros.messages import decoder
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
+MOST_INVALID = 1000  # messages of a topic before the first valid one
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 _Value = TypeVar("_Value")
 
@@ -36,7 +37,7 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = reason_of(error)
         if isinstance(error, BevcliError):
-            raise type(error)(reason) from None
+            raise type(error)(reason if str(path) in reason else f"{path}: {reason}") from None
         raise InputError(f"{path}: is damaged ({reason:.200})") from None
 
 
@@ -53,6 +54,7 @@ class Bag:
         with _broken_files_refused(path):
             self.file_paths = tuple(self._file_paths())
             self._files = [_open_file(file) for file in self.file_paths]
+            self.size = sum(file.stat().st_size for file in self.file_paths)  # bytes
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoder = cache(lambda topic: decoder(self.topics[topic]))
 
@@ -85,6 +87,25 @@ class Bag:
         except (AttributeError, ValueError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is not {kind} ({error})") from None
 
+    def first(self, topic: str, parse: Callable[[Any], _Value], kind: str) -> _Value:
+        """The first value of a topic's messages that is valid, and not empty: nodes publish before they are set up.
+
+        Raises InputError as `read` for the first message, if no message has a value.
+        """
+        invalid: InputError | None = None
+        empty: _Value | None = None
+        for index in range(min(len(self.times(topic)), MOST_INVALID)):
+            try:
+                empty = self.read(topic, index, parse, kind)
+            except InputError as error:
+                invalid = invalid or error
+            else:
+                if empty:
+                    return empty
+        if empty is None and invalid is not None:
+            raise invalid
+        return cast(_Value, empty)
+
     def _bytes(self, topic: str, index: int) -> bytes:
         for file in self._files:
             count = len(file.times(topic)) if topic in file.topics else 0
@@ -102,8 +123,9 @@ class Bag:
         stated = _metadata(self.path / METADATA)
         listed = [self.path / Path(name).name for name in stated.get("relative_file_paths", [])]
         mode = str(stated.get("compression_mode", "")).lower()
-        if mode == "file" and not found:
-            raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d *.zstd)")
+        packed = sorted(file.name for file in self.path.iterdir() if is_packed_bag(file))
+        if packed and not found:
+            raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d {packed[0]})")
         self._compression = mode
         paths = [file for file in listed if file.suffix in SUFFIXES and file.is_file()] or found
         if not listed and len({SPLIT_NUMBER.sub("", file.stem) for file in paths}) > 1:

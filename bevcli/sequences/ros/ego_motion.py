@@ -3,7 +3,8 @@
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, reduce
-from itertools import chain, pairwise
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,12 @@ from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rigid
+from bevcli.parsing.files import MIB
 from bevcli.sequences.ros.bag import Bag, spread
-from bevcli.sequences.ros.messages import Transform, pose_of, timestamp_ns, transforms_of
+from bevcli.sequences.ros.messages import Transform, timestamp_ns, transforms_of
 
 SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
+READ_WHOLE = 2048 * MIB  # of larger bags, not the times of all messages are read
 Sample = tuple[int, Pose]  # time ns, pose at that time
 ReadMessage = Callable[[int], dict[str, list[Sample]]]  # message -> samples by link
 MARGIN = 4  # samples on each side of a time: derivatives of second order, and one more
@@ -35,7 +38,7 @@ class TransformTree:
     def __init__(self, transforms: Iterable[Transform] = ()) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
         for one in transforms:
-            if one.child != one.parent:
+            if one.child != one.parent and one.parent_from_child is not None:
                 self._parents.setdefault(one.child, (one.parent, one.parent_from_child.matrix))
 
     @property
@@ -59,10 +62,9 @@ class TransformTree:
         return found
 
 
-def read_transforms(bag: Bag, topic: str, indices: Iterable[int]) -> list[Transform]:
-    """The transforms of some messages of a topic. Raises InputError if one is broken."""
-    messages = (bag.read(topic, index, lambda message: [*transforms_of(message)], "a transform") for index in indices)
-    return list(chain.from_iterable(messages))
+def read_transforms(bag: Bag, topic: str, number: int) -> list[Transform]:
+    """The transforms of a message of a topic, or its pose. Raises InputError if it is broken."""
+    return bag.read(topic, number, lambda message: [*transforms_of(message)], "a pose")
 
 
 def is_static(topic: str) -> bool:
@@ -70,14 +72,32 @@ def is_static(topic: str) -> bool:
     return topic.rstrip("/").endswith("static")
 
 
-def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform], list[Transform]]:
-    """Static transforms, and the first ones of the topics with transforms that change."""
+def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform], list[Transform], list[str]]:
+    """Static transforms, the first ones of the topics with transforms that change, and notes.
+
+    More messages are read while a frame has had no valid transform.
+    """
     static: list[Transform] = []
     changing: list[Transform] = []
+    notes: list[str] = []
     for topic in topics:
-        first = range(min(len(bag.times(topic)), SAMPLED_MESSAGES))
-        (static if is_static(topic) else changing).extend(read_transforms(bag, topic, first))
-    return static, changing
+        found: list[Transform] = []
+        for number in range(min(len(bag.times(topic)), MOST_MESSAGES)):
+            if number and number % SAMPLED_MESSAGES == 0:
+                valid = {one.child for one in found if one.parent_from_child is not None}
+                if valid.issuperset(one.child for one in found):
+                    break
+            found += read_transforms(bag, topic, number)
+        if is_static(topic):
+            notes += invalid_note(topic, [one.parent_from_child is not None for one in found])
+        (static if is_static(topic) else changing).extend(found)
+    return static, changing, notes
+
+
+def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
+    """A note on the poses that are left out; none where all are valid."""
+    invalid, reason = are_valid.count(False), "NaN, or a rotation that is not a quaternion of norm 1"
+    return [f"{source}: {invalid} of {len(are_valid)} poses are left out: {reason}"] if invalid else []
 
 
 class BagEgoMotion:
@@ -92,6 +112,7 @@ class BagEgoMotion:
         """times: (N,) of the messages, ns. read: the samples of a message by link. links: from the world to the ego
         vehicle; their poses are multiplied. source: for error messages. ego: (4, 4) child_from_ego, None: the same.
         """
+        self.notes: list[str] = []
         self._times, self._links, self._source, self._ego = times, tuple(links), source, ego
         self._read = lru_cache(maxsize=1 << 14)(read)
         self._window = lru_cache(maxsize=64)(self._read_window)
@@ -166,13 +187,7 @@ def _reaches(times: list[int], timestamp_ns: int, sign: int) -> bool:
 
 def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> BagEgoMotion:
     """Poses of a topic with Odometry or poses. child_from_ego: (4, 4) from the frame of the poses, None: the same."""
-    times = capture_times(bag, topic)
-
-    def read(index: int) -> dict[str, list[Sample]]:
-        found = bag.read(topic, index, pose_of, "a pose")
-        return {topic: [(found.timestamp_ns or int(times[index]), found.parent_from_child)]}
-
-    return BagEgoMotion(times, read, (topic,), f"{bag.path}: {topic}", child_from_ego)
+    return _motion_from(bag, [topic], [topic], lambda one: topic, child_from_ego)
 
 
 def motion_from_transforms(
@@ -185,21 +200,40 @@ def motion_from_transforms(
     """
     links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
     by_child = dict(zip(frames[1:], links, strict=True))
-    parts = [capture_times(bag, topic) for topic in topics]
-    order = np.argsort(np.concatenate(parts), kind="stable")
-    times = np.concatenate(parts)[order]
-    places = [(topic, index) for topic, part in zip(topics, parts, strict=True) for index in range(len(part))]
+    return _motion_from(bag, topics, links, lambda one: by_child.get(one.child), child_from_ego)
+
+
+def _motion_from(
+    bag: Bag,
+    topics: Sequence[str],
+    links: Sequence[str],
+    link_of: Callable[[Transform], str | None],
+    child_from_ego: Array | None,
+) -> BagEgoMotion:
+    """Poses along links. link_of: the link that a transform states, None for none of them."""
+    are_valid: list[bool] = []
+
+    def seen(message: Any) -> None:
+        are_valid.extend(one.parent_from_child is not None for one in transforms_of(message) if link_of(one))
+
+    parts = capture_times(bag, topics, seen)
+    places = [(topic, number) for topic, (_, numbers) in parts.items() for number in numbers.tolist()]
+    times = np.concatenate([times for times, _ in parts.values()])
+    order = np.argsort(times, kind="stable")
+    times = times[order]
 
     def read(index: int) -> dict[str, list[Sample]]:
-        topic, message = places[order[index]]
         found: dict[str, list[Sample]] = {}
-        for one in read_transforms(bag, topic, (message,)):
-            if one.child in by_child:
-                sample = (one.timestamp_ns or int(times[index]), one.parent_from_child)
-                found.setdefault(by_child[one.child], []).append(sample)
+        for one in read_transforms(bag, *places[order[index]]):
+            link = link_of(one)
+            if link is not None and one.parent_from_child is not None:
+                found.setdefault(link, []).append((one.timestamp_ns or int(times[index]), one.parent_from_child))
         return found
 
-    return BagEgoMotion(times, read, links, f"{bag.path}: {' and '.join(topics)}", child_from_ego)
+    source = " and ".join(topics)
+    motion = BagEgoMotion(times, read, links, f"{bag.path}: {source}", child_from_ego)
+    motion.notes += invalid_note(source, are_valid)
+    return motion
 
 
 def _at(samples: list[Sample], time: int) -> Pose:
@@ -226,30 +260,40 @@ def _kinematics(times: np.ndarray, translations: Array, quaternions: Array) -> t
     )
 
 
-def capture_times(bag: Bag, topic: str) -> NDArray[np.int64]:
-    """(N,) times at which a topic's messages were captured, ns, within about the jitter of their recording.
+def capture_times(
+    bag: Bag, topics: Iterable[str], seen: Callable[[Any], None] = lambda message: None
+) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """By topic, (N,) times at which its messages were captured, ns, in order; and (N,) their numbers.
 
-    The index of a bag has the times of recording only. The delay is taken from a few messages. If it differs much
-    among them, such as in a bag that was replayed at another speed, the times of all messages are read.
+    The index of a bag has the times of recording only, in another order where messages were late. So all messages are
+    read. Of a bag above READ_WHOLE, the delay is taken from a few messages; if it differs much among them, such as in
+    a bag that was replayed at another speed, all messages are read, too. seen: is called with the messages read.
     """
-    logged = bag.times(topic)
-    stated = {index: _stated_time(bag, topic, index) for index in spread(len(logged), SAMPLES)}
-    delays = [time - int(logged[index]) for index, time in stated.items() if time]
-    if not delays:
-        return logged
-    typical = int(np.median(delays))
-    if max(delays) - min(delays) <= LARGEST_SPREAD_NS:
-        return logged + typical
-    return np.array([_stated_time(bag, topic, index) or int(time) + typical for index, time in enumerate(logged)])
 
+    def stated(topic: str, number: int) -> int:
+        try:
+            message = bag.message(topic, number)
+            seen(message)
+            return timestamp_ns(message) or next((one.timestamp_ns for one in transforms_of(message)), 0)
+        except (InputError, AttributeError, ValueError):
+            return 0
 
-def _stated_time(bag: Bag, topic: str, index: int) -> int:
-    """The time that a message states, ns; 0 if it states none, or cannot be read."""
-    try:
-        message = bag.message(topic, index)
-        return timestamp_ns(message) or next((one.timestamp_ns for one in transforms_of(message)), 0)
-    except (InputError, AttributeError, ValueError):
-        return 0
+    logged = {topic: bag.times(topic) for topic in topics}
+    is_small = bag.size <= READ_WHOLE
+    numbers = {topic: range(len(own)) if is_small else spread(len(own), SAMPLES) for topic, own in logged.items()}
+    # In the order of recording, so that each chunk is decompressed once.
+    places = sorted((int(own[number]), topic, number) for topic, own in logged.items() for number in numbers[topic])
+    times = {(topic, number): stated(topic, number) for _, topic, number in places}
+    found = {}
+    for topic, own in logged.items():
+        delays = [time - int(own[number]) for (other, number), time in times.items() if other == topic and time]
+        captured = own + int(np.median(delays or [0]))
+        if is_small or (delays and max(delays) - min(delays) > LARGEST_SPREAD_NS):
+            exact = (times[topic, number] if is_small else stated(topic, number) for number in range(len(own)))
+            captured = np.array([time or rough for time, rough in zip(exact, captured.tolist(), strict=True)], np.int64)
+        order = np.argsort(captured, kind="stable")
+        found[topic] = (captured[order], order)
+    return found
 
 
 def find_geo_origin(bag: Bag, motion: EgoMotion | BagEgoMotion | None) -> GeoOrigin | None:

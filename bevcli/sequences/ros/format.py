@@ -10,6 +10,7 @@ from bevcli.sequences.format import Format
 from bevcli.sequences.options import RigOptions
 
 SUFFIXES = (".mcap", ".db3")
+PACKED = (".zst", ".zstd", ".lz4", ".gz", ".xz", ".bz2")
 METADATA = "metadata.yaml"
 
 
@@ -34,11 +35,16 @@ class BagOptions(RigOptions):
     )
 
 
+def is_packed_bag(path: Path) -> bool:
+    """True for the name of a compressed bag, such as drive.mcap.zst."""
+    return path.suffix in PACKED and path.with_suffix("").suffix in SUFFIXES
+
+
 def is_ros_bag(path: Path) -> bool:
     """True for an .mcap or .db3 file, or a folder with some."""
     if not path.is_dir():
-        return path.suffix in SUFFIXES
-    if any(file.suffix in SUFFIXES for file in path.iterdir()):
+        return path.suffix in SUFFIXES or is_packed_bag(path)
+    if any(file.suffix in SUFFIXES or is_packed_bag(file) for file in path.iterdir()):
         return True
     if not (path / METADATA).is_file():
         return False

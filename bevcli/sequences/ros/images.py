@@ -3,6 +3,7 @@
 OpenCV decodes files only. So the packets from a keyframe to the next are written to a temporary file, and read from it.
 """
 
+import re
 import struct
 import tempfile
 import threading
@@ -16,11 +17,12 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage
-from bevcli.parsing.images import media_type_of
+from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.printing import one_line
 from bevcli.sequences.images import MessageSource, UnreadableImage, decode
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.messages import payload, timestamp_ns
-from bevcli.sequences.video import VideoReader
+from bevcli.sequences.video import MOST_PIXELS, VideoReader
 
 # Encoding -> channels, bytes a channel, conversion to BGR. ROS names the top left 2x2 pixels of a Bayer pattern.
 RAW_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
@@ -43,21 +45,24 @@ for pattern in ("rggb", "bggr", "gbrg", "grbg"):
     for bits in (8, 16):
         conversion = getattr(cv2, f"COLOR_Bayer{pattern.upper()}2BGR")
         RAW_ENCODINGS[f"bayer_{pattern}{bits}"] = (1, bits // 8, conversion)
+BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)(8|16)")
+COMPRESSED = re.compile("jpe?g|png|webp|tiff?|bmp", re.I)  # in the name of a format; "compressedDepth" is another one
 IVF_CODES = {"vp9": b"VP90", "av1": b"AV01"}
 RAW_FORMATS = ("h264", "h265")
 LONGEST_GROUP = 600  # packets from one keyframe to the next
 
 
-def bag_image(bag: Bag, topic: str, index: int, time_ns: int) -> MessageSource:
-    """One image message of a bag, read on demand. time_ns: according to the index of the bag."""
-    name = f"{bag.path}: {topic}: message {index}"
-    return MessageSource(name, time_ns, lambda: _read_message(bag, topic, index, time_ns, name))
+def bag_image(bag: Bag, topic: str, numbers: NDArray[np.int64], index: int, time_ns: int) -> MessageSource:
+    """Image `index` of a topic, read on demand. numbers: (N,) of its messages in order of capture. time_ns: roughly."""
+    number = int(numbers[index])
+    name = f"{bag.path}: {topic}: message {number}"
+    return MessageSource(name, time_ns, lambda: _read_message(bag, topic, number, time_ns, name))
 
 
 def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> CameraImage:
     """The image, with the time that its message states.
 
-    Raises UnreadableImage if it is broken, and InputError for an unknown encoding.
+    Raises UnreadableImage if it is broken, and InputError for an unknown encoding or format.
     """
     try:
         message = bag.message(topic, index)
@@ -66,11 +71,35 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
     time, data = timestamp_ns(message) or time_ns, payload(message)
     if hasattr(message, "encoding"):
         return CameraImage(time, _raw_pixels(message, data, name))
-    pixels = decode(data)
+    stated = str(getattr(message, "format", ""))
+    pixels, is_as_stored = _decoded(data, stated)
+    if pixels is None and stated and size_of_image(data) is None and not COMPRESSED.search(stated):
+        raise InputError(
+            f"{bag.path}: {topic}: images of format {one_line(stated, 60)} are not read (expected JPEG, PNG, WebP, "
+            "TIFF or BMP, or video as foxglove.CompressedVideo): write the topic in one of these"
+        )
     if pixels is None:
         raise UnreadableImage(f"{name} is not a complete image")
-    media_type = media_type_of(data)
+    media_type = media_type_of(data) if is_as_stored else None
     return CameraImage(time, pixels, data if media_type else None, media_type)
+
+
+def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
+    """(H, W, 3) uint8 BGR of a compressed image, None for a broken one; False if the file shows other colours.
+
+    stated: the format. After "compressed", ROS's image_transport names the encoding of what OpenCV compressed as if it
+    were BGR or grey, such as in "rgb8; png compressed rgb8" and "bayer_rggb8; jpeg compressed ".
+    """
+    before, _, after = stated.partition("compressed")
+    encoding = after.strip() or before.partition(";")[0]
+    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, MOST_PIXELS) if BAYER.fullmatch(encoding) else None
+    if pixels is not None and pixels.ndim == 2:
+        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        return cv2.cvtColor(pixels, RAW_ENCODINGS[encoding][2] or 0).astype(np.uint8, copy=False), False
+    pixels = decode(data)
+    if pixels is None or not (after.strip() and encoding.startswith("rgb")):
+        return pixels, True
+    return pixels[..., ::-1].copy(), False
 
 
 def _raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
@@ -105,9 +134,9 @@ class BagVideo:
     Raises InputError for a format that is not supported.
     """
 
-    def __init__(self, bag: Bag, topic: str) -> None:
-        self._bag, self._topic = bag, topic
-        self._count = len(bag.times(topic))
+    def __init__(self, bag: Bag, topic: str, numbers: NDArray[np.int64]) -> None:
+        """numbers: (N,) of the topic's messages in order of capture."""
+        self._bag, self._topic, self._numbers = bag, topic, numbers.tolist()
         self._format = str(bag.message(topic, 0).format).lower()
         if self._format not in (*IVF_CODES, *RAW_FORMATS):
             expected = ", ".join((*RAW_FORMATS, *IVF_CODES))
@@ -119,7 +148,7 @@ class BagVideo:
 
     def image(self, index: int, time_ns: int) -> MessageSource:
         """The source of image `index`. time_ns: according to the index of the bag."""
-        name = f"{self._bag.path}: {self._topic}: message {index}"
+        name = f"{self._bag.path}: {self._topic}: message {self._numbers[index]}"
         return MessageSource(name, time_ns, lambda: self.read(index, time_ns))
 
     def read(self, index: int, time_ns: int) -> CameraImage:
@@ -130,7 +159,7 @@ class BagVideo:
                     self._open_group(index)
                 assert self._reader is not None
                 pixels = self._reader.read(index - self._group.start)
-                time = timestamp_ns(self._bag.message(self._topic, index)) or time_ns
+                time = timestamp_ns(self._bag.message(self._topic, self._numbers[index])) or time_ns
             except InputError as error:
                 raise UnreadableImage(f"{self._topic}: image {index} cannot be decoded ({error})") from None
         return CameraImage(time, pixels)
@@ -142,7 +171,7 @@ class BagVideo:
             if start < 0 or index - start > LONGEST_GROUP:
                 raise InputError("there is no keyframe before it")
         stop = index + 1
-        while stop < self._count and not is_keyframe(self._packet(stop), self._format):
+        while stop < len(self._numbers) and not is_keyframe(self._packet(stop), self._format):
             stop += 1
         path = Path(self._folder.name) / f"{start}.{'ivf' if self._format in IVF_CODES else self._format}"
         path.write_bytes(_file_of([self._packet(number) for number in range(start, stop)], self._format))
@@ -151,7 +180,7 @@ class BagVideo:
         self._reader, self._group = VideoReader(path), range(start, stop)
 
     def _packet(self, index: int) -> bytes:
-        return payload(self._bag.message(self._topic, index))
+        return payload(self._bag.message(self._topic, self._numbers[index]))
 
 
 def is_keyframe(packet: bytes, video_format: str) -> bool:

@@ -17,7 +17,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.geometry.transforms import Array, Pose, rigid
 from bevcli.parsing.documents import parse_json
-from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS
+from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS, LENS_NAMES
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for
@@ -39,13 +39,7 @@ KINDS: dict[str, Kind] = {
     "geometry_msgs/PoseWithCovarianceStamped": "pose",
     "geometry_msgs/PoseStamped": "pose",
 }
-LENSES = {
-    "plumb_bob": "brown_conrady",
-    "rational_polynomial": "brown_conrady",
-    "equidistant": "kannala_brandt",
-    "kannala_brandt": "kannala_brandt",
-    "fisheye": "kannala_brandt",
-}
+FARTHEST = 1e12  # of a coordinate in metres, as in calibration.json
 Decode = Callable[[bytes], Any]
 
 
@@ -82,7 +76,8 @@ def decoder(topic: Topic) -> Decode:
     makers = {"cdr": _cdr, "json": _json, "protobuf": _protobuf}
     make = makers.get(topic.encoding)
     if make is None:
-        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)})")
+        hint = ": convert the .bag of ROS 1 with rosbags-convert" if topic.encoding == "ros1" else ""
+        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)}){hint}")
     return make(topic)
 
 
@@ -125,12 +120,15 @@ def _protobuf(topic: Topic) -> Decode:
 
 @dataclass(frozen=True)
 class Transform:
-    """The pose of a child frame in its parent at a time. timestamp_ns: 0 if it is not stated."""
+    """The pose of a child frame in its parent at a time.
+
+    timestamp_ns: 0 if it is not stated. parent_from_child: None for numbers that are no pose, such as NaN.
+    """
 
     parent: str
     child: str
     timestamp_ns: int
-    parent_from_child: Pose
+    parent_from_child: Pose | None
 
 
 def timestamp_ns(message: Any) -> int:
@@ -157,7 +155,10 @@ def payload(message: Any) -> bytes:
 
 
 def transforms_of(message: Any) -> Iterator[Transform]:
-    """The transforms of a message: TFMessage, TransformStamped, FrameTransform or FrameTransforms."""
+    """The transforms of a message: TFMessage, TransformStamped, FrameTransform, FrameTransforms, or of `pose_of`."""
+    if hasattr(message, "pose"):
+        yield pose_of(message)
+        return
     for part in message.transforms if hasattr(message, "transforms") else (message,):
         parent = frame_of(part) if hasattr(part, "transform") else str(part.parent_frame_id).lstrip("/")
         child, inner = str(part.child_frame_id).lstrip("/"), getattr(part, "transform", part)
@@ -179,30 +180,39 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
 
     ego_from_camera: (4, 4) of the optical frame, metres. rectified: lens distortion was removed from the images. where:
     start of an error message.
+    K and P of a CameraInfo are those of the whole sensor: the image is its region of interest, then binned.
     Raises InputError if the intrinsics are not set or have an unknown distortion model.
     """
     binning = [max(1, int(getattr(message, name, 1) or 1)) for name in ("binning_x", "binning_y")]
-    width, height = int(message.width) // binning[0], int(message.height) // binning[1]
+    region = getattr(message, "roi", None)
+    if region is None or not (region.width and region.height):
+        region = SimpleNamespace(x_offset=0, y_offset=0, width=message.width, height=message.height)
+    width, height = int(region.width) // binning[0], int(region.height) // binning[1]
     scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
-    intrinsics = scale @ _matrix(_first(message, "k", "K"), 3, 3)
-    if not (intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
-        raise InputError(f"{where}: the camera is not calibrated (K is zero): pass `calibration=FILE`")
-    lens = _distortion(str(message.distortion_model), [float(d) for d in _first(message, "d", "D")], where)
-    projection = _matrix(_first(message, "p", "P"), 3, 4)
+    image_from_sensor = scale @ [[1, 0, -region.x_offset], [0, 1, -region.y_offset], [0, 0, 1]]
+    intrinsics = image_from_sensor @ _matrix(_first(message, "k", "K"), 3, 3)
+    coefficients = [float(d) for d in _first(message, "d", "D")]
+    is_finite = np.isfinite([*intrinsics.ravel(), *coefficients]).all()
+    if not (is_finite and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0 and width > 0 and height > 0):
+        raise InputError(
+            f"{where}: the camera is not calibrated (K or the size is zero or not a number): pass `calibration=FILE`"
+        )
+    lens = _distortion(str(message.distortion_model), coefficients, where)
+    projection = image_from_sensor @ _matrix(_first(message, "p", "P"), 3, 4)
     rotation = _matrix(_first(message, "r", "R"), 3, 3)
     if rectified and projection[0, 0] > 0:
         rectified_from_camera = rotation if abs(np.linalg.det(rotation) - 1) < 1e-3 else np.eye(3)
         ego_from_camera = ego_from_camera @ rigid((0, 0, 0), rectified_from_camera.T)
-        return Camera(name, width, height, scale @ projection[:, :3], ego_from_camera)
+        return Camera(name, width, height, projection[:, :3], ego_from_camera)
     return Camera(name, width, height, intrinsics, ego_from_camera, None if rectified else lens)
 
 
 def _distortion(model: str, coefficients: list[float], where: str) -> Distortion | None:
     if not any(coefficients):
         return None
-    known = LENSES.get(model.lower() or "plumb_bob")
+    known = LENS_NAMES.get(model.lower() or "plumb_bob")
     if known is None:
-        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENSES)})")
+        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENS_NAMES)})")
     counts = COEFFICIENT_COUNTS[known]
     if known == "brown_conrady" and len(coefficients) > 8 and not any(coefficients[8:]):
         coefficients = coefficients[:8]
@@ -212,12 +222,11 @@ def _distortion(model: str, coefficients: list[float], where: str) -> Distortion
     return Distortion(known, tuple(coefficients))  # type: ignore[arg-type]
 
 
-def _pose(translation: Any, rotation: Any) -> Pose:
+def _pose(translation: Any, rotation: Any) -> Pose | None:
     quaternion = np.array([rotation.w, rotation.x, rotation.y, rotation.z], dtype=np.float64)
+    place = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     norm = float(np.linalg.norm(quaternion))
-    if not 0.9 < norm < 1.1:
-        raise ValueError(f"a rotation is not a quaternion of norm 1, its norm is {norm:.3g}")
-    return Pose(np.array([translation.x, translation.y, translation.z], dtype=np.float64), quaternion / norm)
+    return Pose(place, quaternion / norm) if 0.9 < norm < 1.1 and (abs(place) < FARTHEST).all() else None
 
 
 def _matrix(values: Any, rows: int, columns: int) -> Array:

@@ -30,7 +30,7 @@ from bevcli.sequences.ros.ego_motion import (
     motion_from_transforms,
     sampled_transforms,
 )
-from bevcli.sequences.ros.format import BagOptions, is_ros_bag
+from bevcli.sequences.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.sequences.ros.images import BagVideo, bag_image
 from bevcli.sequences.ros.messages import camera_of, frame_of, pose_of
 from bevcli.sequences.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
@@ -54,6 +54,8 @@ class RosSequence(Sequence):
             raise InputError(
                 f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
             )
+        if path.is_file() and is_packed_bag(path):
+            raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
         stated = read_topics_file(own.topics_file, own.topics)
         rig = own.rig()
         self.path = path
@@ -76,6 +78,7 @@ class RosSequence(Sequence):
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
             *rig_notes(self.rig, "the calibration" if rig else "a bag"),
             *motion_notes,
+            *getattr(self._motion, "notes", ()),
             *gaps,
         )
         self._images = ImageReader(strict=common.strict)
@@ -108,9 +111,8 @@ class _VehicleReader:
 
     def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
         self._bag, self._finder, self._stated = bag, finder, stated
-        static, changing = sampled_transforms(bag, finder.of_kind("transforms"))
+        static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
         self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
-        self.notes: list[str] = []
         self.ego_frame = stated.ego_frame
 
     def rig(self) -> CameraRig:
@@ -124,7 +126,7 @@ class _VehicleReader:
     def _frame_of(self, topics: CameraTopics) -> str:
         """The optical frame that the images name, or else the calibration."""
         named = (
-            self._bag.read(topic, 0, frame_of, "an image or a calibration")
+            self._bag.first(topic, frame_of, "an image or a calibration")
             for topic in (topics.images, topics.calibration)
             if topic
         )
@@ -136,13 +138,13 @@ class _VehicleReader:
         parse = partial(
             camera_of, name=topics.camera, ego_from_camera=ego_from_camera, rectified=topics.is_rectified, where=where
         )
-        return self._bag.read(topics.calibration, 0, parse, "a calibration")
+        return self._bag.first(topics.calibration, parse, "a calibration")
 
     def _find_ego_frame(self, camera_frames: list[str]) -> str:
         """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
         above = [self._tree.up(frame) for frame in camera_frames]
         pose = self._finder.pose_topic()
-        named = self._bag.read(pose, 0, pose_of, "a pose").child if pose else ""
+        named = self._child_of(pose) if pose else ""
         for name in (named, *EGO_FRAMES):
             if name and name in self._tree.frames:
                 return name
@@ -154,6 +156,10 @@ class _VehicleReader:
             "(ego_frame in `topics_file=FILE.toml` states another)"
         )
         return common[0]
+
+    def _child_of(self, topic: str) -> str:
+        """The frame whose poses a topic has, "" if it names none."""
+        return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
 
     def _ego_from(self, frame: str, camera: str) -> Array:
         found = self._tree.between(self.ego_frame, frame)
@@ -185,7 +191,7 @@ class _VehicleReader:
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:
-            child = self._bag.read(topic, 0, pose_of, "a pose").child
+            child = self._child_of(topic)
             is_other = child not in ("", ego_frame)
             child_from_ego = self._tree.between(child, ego_frame) if is_other else None
             note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
@@ -217,13 +223,16 @@ class _VehicleReader:
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
-    times = {one.camera: capture_times(bag, one.images) for one in cameras}
+    captured = capture_times(bag, [one.images for one in cameras])
+    times = {one.camera: captured[one.images][0] for one in cameras}
     # The median time between images; a second for a single one.
     periods = {n: float(np.median(np.diff(own))) if len(own) > 1 else 1e9 for n, own in times.items()}
     slowest = max(periods.values())
     leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
     makers: dict[str, Callable[[int, int], Source]] = {
-        one.camera: BagVideo(bag, one.images).image if one.is_video else partial(bag_image, bag, one.images)
+        one.camera: BagVideo(bag, one.images, captured[one.images][1]).image
+        if one.is_video
+        else partial(bag_image, bag, one.images, captured[one.images][1])
         for one in cameras
     }
     topics = {one.camera: one.images for one in cameras}
@@ -239,7 +248,7 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
                 dropped[name] = f"{topics[name]} has no image within {periods[name] / 2e6:.0f} ms of {time} ns"
             else:
                 sources[name] = makers[name](index, int(own[index]))
-        origin = f"{bag.path}: {topics[leading]}: message {place}"
+        origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][place]}"
         entries.append(FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
     return tuple(entries)
 
