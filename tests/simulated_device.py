@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
@@ -241,12 +242,21 @@ class Kernel:
         self.device.record(self.plain, args, constants, None)
 
 
-def add_and_relu(values, bias, shortcut, elements, channels, HAS_SHORTCUT, **constants):  # type: ignore[no-untyped-def]
+def pool(values, bias, out, elements, *sizes, **constants):  # type: ignore[no-untyped-def]
     """The numbers of the kernel of this name, from PyTorch's own operations."""
-    assert elements == values.held.numel()
-    assert values.held.shape[1] == channels
-    total = values.held.float() + bias.held.float()[:, None, None]
-    values.held.copy_((total + shortcut.held.float() if HAS_SHORTCUT else total).relu())
+    assert elements == out.held[0].numel()
+    assert sizes == (*values.held.shape[2:], *out.held.shape[2:])
+    out.held.copy_((F.max_pool2d(values.held, 3, 2, 1) + bias.held[:, None, None]).relu())
+
+
+def convolution_relu(x, weight, bias, *rest):  # type: ignore[no-untyped-def]
+    """`torch.cudnn_convolution_relu` from other operations."""
+    return F.conv2d(x, weight, bias, *rest).relu()
+
+
+def convolution_add_relu(x, weight, shortcut, alpha, bias, *rest):  # type: ignore[no-untyped-def]
+    """`torch.cudnn_convolution_add_relu` from other operations."""
+    return (F.conv2d(x, weight, bias, *rest) + alpha * shortcut).relu()
 
 
 def provide_triton(monkeypatch: Any) -> None:
@@ -280,13 +290,12 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention, triton_bottleneck, triton_convolution
+        from bevcli.model.kernels import triton_attention, triton_convolution, triton_stem
 
         monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
-        for module, name, plain in (
-            (triton_attention, "_sample", sample),
-            (triton_bottleneck, "_add_and_relu", add_and_relu),
-        ):
+        monkeypatch.setattr(torch, "cudnn_convolution_relu", convolution_relu)
+        monkeypatch.setattr(torch, "cudnn_convolution_add_relu", convolution_add_relu)
+        for module, name, plain in ((triton_attention, "_sample", sample), (triton_stem, "_pool", pool)):
             monkeypatch.setattr(module, name, Kernel(device, plain))
     with device:
         yield device

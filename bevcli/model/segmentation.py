@@ -160,11 +160,16 @@ class LocationDecoder(nn.Module):
 
 
 class MaskDecoderLayer(nn.Module):
-    """Multi-head attention of queries to all cells of the BEV map; a query's mask is made of its attention maps."""
+    """Multi-head attention of queries to all cells of the BEV map; a query's mask is made of its attention maps.
+
+    Attributes:
+        attend: the attention of queries, keys and values (B, heads, …, C / heads); a faster function can take its place.
+    """
 
     def __init__(self, channels: int, heads: int, feed_forward_width: int, dropout: float) -> None:
         super().__init__()
         self.heads = heads
+        self.attend: Callable[[Tensor, Tensor, Tensor], Tensor] = F.scaled_dot_product_attention
         self.query_projection = nn.Linear(channels, channels)
         self.key_projection = nn.Linear(channels, channels)
         self.value_projection = nn.Linear(channels, channels)
@@ -185,7 +190,7 @@ class MaskDecoderLayer(nn.Module):
         queries = split_heads(self.query_projection(query), self.heads)
         keys = split_heads(self.key_projection(bev + position), self.heads)
         values = split_heads(self.value_projection(bev), self.heads)  # (B, heads, Y·X, C / heads)
-        attended = F.scaled_dot_product_attention(queries, keys, values).transpose(1, 2).flatten(2)  # (B, Q, C)
+        attended = self.attend(queries, keys, values).transpose(1, 2).flatten(2)  # (B, Q, C)
         # The heads' attention maps before the softmax, each times its weight: one product over all channels.
         weights = self.mask_projection.weight.flatten()[:, None, None] / math.sqrt(keys.shape[-1])  # (heads, 1, 1)
         masks = (queries * weights).transpose(1, 2).flatten(2) @ keys.transpose(1, 2).flatten(2).transpose(1, 2)

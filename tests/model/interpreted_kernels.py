@@ -6,6 +6,7 @@ It prints one line for each case. The results and the gradients of the two versi
 from __future__ import annotations
 
 import contextlib
+import copy
 from collections.abc import Callable, Sequence
 
 import torch
@@ -15,7 +16,8 @@ from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
-from bevcli.model.resnet import ResNet
+from bevcli.model.prepare import add_to_class
+from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
 FAR = 1e6  # where positions have no gradients
@@ -118,14 +120,29 @@ def main() -> None:
 
     shapes = sorted({(c // SCALE, o // SCALE, s) for each in configs for c, o, s in convolution_shapes(each)})
     cases = [*shapes, (6, 5, 1), (20, 17, 2), (3, 4, 1, (1, 1)), (3, 4, 2, (4, 4), 0)]
-    convolution._has_matrix_units = lambda device: False
+    for case in cases:
+        compare(f"convolution {case}", convolution_case(*case), *convolutions(case[2]))
     halves = [each.half() for each in convolution_case(16, 16, 1)]
-    for kernel in ("columns", "one kernel"):
-        if kernel == "one kernel":
-            convolution._by_columns = convolution._in_one_kernel  # in float32 its products are exact too
-        for case in cases:
-            compare(f"convolution {case}, {kernel}", convolution_case(*case), *convolutions(case[2]))
-        compare(f"convolution in half precision, {kernel}", halves, *convolutions(1))
+    compare("convolution in half precision", halves, *convolutions(1))
+    compare_stems()
+
+
+def compare_stems() -> None:
+    """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
+    from bevcli.model.kernels.choose import fold_batch_norms
+    from bevcli.model.kernels.triton_stem import FusedStem
+
+    torch.manual_seed(0)
+    backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)
+    backbone.bn1.bias.normal_()
+    fused = copy.deepcopy(backbone)
+    fold_batch_norms(fused, torch.device("meta"))
+    add_to_class(fused, FusedStem)
+    for batch, height, width in ((2, 32, 64), (1, 33, 47), (1, 2, 2), (0, 32, 32)):
+        images = torch.randn(batch, 3, height, width)
+        images[:, 0, 0, 0] = torch.nan
+        torch.testing.assert_close(fused.stem(images), backbone.stem(images), equal_nan=True)
+        print(f"stem {batch, height, width}", flush=True)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,9 @@ ATTENTIONS = sorted(
     for dtype in (("fp32", "bf16", "fp16") if shape[4] else ("fp32",))
 )
 CONVOLUTIONS = sorted(
-    (*shape, dtype) for shape in set().union(*map(convolution_shapes, CONFIGS)) for dtype in ("fp32", "bf16", "fp16")
+    (*shape, dtype)
+    for shape in {(c, s) for config in CONFIGS for c, _, s in convolution_shapes(config)}
+    for dtype in ("fp32", "bf16", "fp16")
 )
 
 
@@ -58,18 +60,16 @@ def compile_attention(generation: int, heads: int, depth: int, levels: int, poin
     return [compile_kernel(kernel, generation, types, chosen) for kernel in (_sample, _sample_backward)]
 
 
-def compile_convolution(generation: int, channels: int, outputs: int, stride: int, dtype: str) -> list[bytes]:
-    """The machine codes of the columns, of the gradients and, for halves on matrix units, of the one kernel."""
+def compile_convolution(generation: int, channels: int, stride: int, dtype: str) -> list[bytes]:
+    """The machine codes of the columns and of the gradients."""
     import bevcli.model.kernels.triton_convolution as convolution
 
-    types = dict.fromkeys(("values", "predicted", "weight", "bias", "out", "columns", "columns_gradient"), dtype)
+    types = dict.fromkeys(("values", "predicted", "columns", "columns_gradient"), dtype)
     types |= dict.fromkeys(("values_gradient", "predicted_gradient"), "fp32")
     kernels = {
         convolution._write_columns: convolution.COLUMN_TILES,
         convolution._add_gradients: convolution.GRADIENT_TILES,
     }
-    if dtype != "fp32" and generation >= 10 * convolution.FIRST_WITH_MATRIX_UNITS[0]:
-        kernels[convolution._convolve] = convolution.output_tiles(outputs)
     return [
         compile_kernel(kernel, generation, types, convolution.constants(channels, stride, tiles))
         for kernel, tiles in kernels.items()
