@@ -10,11 +10,12 @@ import copy
 from collections.abc import Callable, Sequence
 
 import torch
+from simulated_device import sample_hits_plainly
 from torch import Tensor, nn
 
 from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import GridSampling
+from bevcli.model.deformable_attention import GridSampling, Hits
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
 from bevcli.model.prepare import add_to_class
 from bevcli.model.resnet import ResNet, ResNetConfig
@@ -114,6 +115,9 @@ def main() -> None:
         "attention in half precision", inputs, *(sampling(each(), 1, (3,)) for each in (GridSampling, TritonSampling))
     )
 
+    for case in ((2, 6, 4, 8, 1, 4), (2, 6, 1, 4, 2, 1), (1, 8, 3, 5, 1, 1)):
+        compare_hits(*case)
+
     def convolutions(stride: int) -> list[Callable[..., Tensor]]:
         versions = (predicted_deformable_convolution, convolution.deformable_convolution)
         return [lambda *inputs, each=each: each(*inputs, stride) for each in versions]
@@ -125,6 +129,25 @@ def main() -> None:
     halves = [each.half() for each in convolution_case(16, 16, 1)]
     compare("convolution in half precision", halves, *convolutions(1))
     compare_stems()
+
+
+def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: int, pillar_points: int) -> None:
+    """Compare the sums of hits with those by tables; some hits lie far outside."""
+    from bevcli.model.kernels.triton_attention import sample_hits
+
+    counts, queries = (0, 40, 0, 3), 9
+    values, locations, _ = attention_case(heads, depth, levels, points, counts)
+    reference_points = locations[:, 0, 0, :pillar_points].contiguous()
+    random = torch.Generator().manual_seed(levels)
+    offsets = 3 * torch.randn(queries, heads, predictions, levels, points, 2, generator=random)
+    logits = 4 * torch.randn(queries, heads, predictions, levels, points, generator=random)
+    query = torch.randint(queries, (sum(counts),), generator=random)
+    prediction = torch.randint(predictions, (sum(counts),), generator=random)
+    shapes = LEVEL_SHAPES[:levels]
+    found = sample_hits(values, shapes, Hits(query, reference_points, counts, prediction), offsets, logits)
+    read = (values, reference_points, offsets, logits, query, prediction)
+    torch.testing.assert_close(found, sample_hits_plainly(*read, shapes, counts), rtol=1e-4, atol=1e-4)
+    print(f"hits {heads, depth, levels, points, predictions, pillar_points}", flush=True)
 
 
 def compare_stems() -> None:

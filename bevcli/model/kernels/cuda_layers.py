@@ -11,7 +11,7 @@ from bevcli.model.resnet import Bottleneck
 
 
 class FusedBottleneck(Bottleneck):
-    """Added to the bottlenecks whose batch norms are folded: cuDNN adds bias and shortcut, and applies ReLU, at once."""
+    """Added to the bottlenecks with folded batch norms: cuDNN adds bias and shortcut, and applies ReLU, at once."""
 
     def fuse(self) -> None:
         """Moves the bias of the shortcut's convolution into the last one, in place, as both are added to the result."""
