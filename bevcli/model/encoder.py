@@ -218,15 +218,15 @@ class SpatialCrossAttention(nn.Module):
 def temporal_hits(reference_points: Tensor, queries_per_map: Sequence[int]) -> Hits:
     """The hits of the BEV cells in the history and the current map. reference_points: (B, 2, Y·X, 2)."""
     batch, maps, cells, _ = reference_points.shape
-    query, prediction = _temporal_queries(batch, maps, cells, reference_points.device)
+    query, prediction = map_queries(batch, maps, cells, reference_points.device)
     return Hits(query, reference_points.reshape(-1, 1, 2), queries_per_map, prediction)
 
 
 @cache
-def _temporal_queries(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """`query` and `prediction` of the hits of all cells. They are kept: CUDA graphs hold their addresses."""
+def map_queries(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`Hits.query` and `Hits.prediction` of maps that all cells sample. They are kept: CUDA graphs hold addresses."""
     query = torch.arange(batch * cells, device=device).view(batch, 1, cells).expand(-1, maps, -1).flatten()
-    return query, torch.arange(maps, device=device)[None, :, None].expand(batch, -1, cells).flatten()
+    return query, torch.arange(maps, device=device)[None, :, None].repeat(batch, 1, cells).flatten()
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

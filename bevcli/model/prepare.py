@@ -18,7 +18,7 @@ from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
@@ -116,6 +116,10 @@ def _use_cuda_layers(network: nn.Module, device: torch.device) -> None:
             from bevcli.model.kernels.triton_stem import FusedStem  # only where Triton is installed
 
             add_to_class(module, FusedStem)
+        elif type(module) is DeformableAttention and has_triton(device):
+            from bevcli.model.kernels.triton_attention import AttentionByHits  # only where Triton is installed
+
+            add_to_class(module, AttentionByHits)
         elif isinstance(module, ImageTokens):
             add_to_class(module, TokensInOnePass)
         elif isinstance(module, MaskDecoderLayer):
