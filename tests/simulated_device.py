@@ -19,10 +19,12 @@ from types import ModuleType
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+from bevcli.model.deformable_attention import GridSampling, level_sizes, sampling_locations
 from bevcli.model.deformable_convolution import predicted_deformable_convolution
 
 CPU = torch.device("cpu")
@@ -241,12 +243,43 @@ class Kernel:
         self.device.record(self.plain, args, constants, None)
 
 
-def add_and_relu(values, bias, shortcut, elements, channels, HAS_SHORTCUT, **constants):  # type: ignore[no-untyped-def]
+def hits_plainly(  # type: ignore[no-untyped-def]
+    values, shapes, reference_points, offsets, logits, query, prediction, ends, out, hits, maps, cells, **constants
+):
+    """The numbers of the kernel `_sample_hits`, from the plain module."""
+    read = (values, reference_points, offsets, logits, query, prediction)
+    assert all(isinstance(each, OnDevice) and each.is_contiguous() for each in (*read, shapes, ends, out))
+    assert values.shape[:2] == (maps, cells)
+    assert len(query) == len(prediction) == hits
+    sizes = tuple(map(tuple, shapes.held.tolist()))
+    found = sample_hits_plainly(*(each.held for each in read), sizes, torch.diff(ends.held, prepend=torch.zeros(1)))
+    out.held.copy_(found.view(out.shape))
+
+
+def sample_hits_plainly(values, reference_points, offsets, logits, query, prediction, level_shapes, counts):  # type: ignore[no-untyped-def]
+    """The weighted sums of hits by tables of locations and weights, see `compiled.sample_hits`."""
+    offsets, logits = (each.transpose(1, 2)[query, prediction] for each in (offsets, logits))  # (M, heads, L, P, …)
+    weights = logits.flatten(-2).softmax(-1).view_as(logits)
+    points = reference_points.repeat(1, logits.shape[-1] // reference_points.shape[1], 1)
+    locations = sampling_locations(points[:, None, None], offsets, level_sizes(level_shapes, CPU))
+    return GridSampling()(values, level_shapes, locations, weights, [int(count) for count in counts])
+
+
+def pool(values, bias, out, elements, *sizes, **constants):  # type: ignore[no-untyped-def]
     """The numbers of the kernel of this name, from PyTorch's own operations."""
-    assert elements == values.held.numel()
-    assert values.held.shape[1] == channels
-    total = values.held.float() + bias.held.float()[:, None, None]
-    values.held.copy_((total + shortcut.held.float() if HAS_SHORTCUT else total).relu())
+    assert elements == out.held[0].numel()
+    assert sizes == (*values.held.shape[2:], *out.held.shape[2:])
+    out.held.copy_((F.max_pool2d(values.held, 3, 2, 1) + bias.held[:, None, None]).relu())
+
+
+def convolution_relu(x, weight, bias, *rest):  # type: ignore[no-untyped-def]
+    """`torch.cudnn_convolution_relu` from other operations."""
+    return F.conv2d(x, weight, bias, *rest).relu()
+
+
+def convolution_add_relu(x, weight, shortcut, alpha, bias, *rest):  # type: ignore[no-untyped-def]
+    """`torch.cudnn_convolution_add_relu` from other operations."""
+    return (F.conv2d(x, weight, bias, *rest) + alpha * shortcut).relu()
 
 
 def provide_triton(monkeypatch: Any) -> None:
@@ -280,12 +313,15 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention, triton_bottleneck, triton_convolution
+        from bevcli.model.kernels import triton_attention, triton_convolution, triton_stem
 
         monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
+        monkeypatch.setattr(torch, "cudnn_convolution_relu", convolution_relu)
+        monkeypatch.setattr(torch, "cudnn_convolution_add_relu", convolution_add_relu)
         for module, name, plain in (
             (triton_attention, "_sample", sample),
-            (triton_bottleneck, "_add_and_relu", add_and_relu),
+            (triton_attention, "_sample_hits", hits_plainly),
+            (triton_stem, "_pool", pool),
         ):
             monkeypatch.setattr(module, name, Kernel(device, plain))
     with device:

@@ -37,13 +37,13 @@ def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFr
 def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
     """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
 
-    All copies from a CUDA GPU share one wait. What `ModelOutputs.stay_on_device` names stays there. On a CPU the input
-    images must be finite too: the ReLU of oneDNN turns NaN into zero, so NaN in the images may not reach the outputs.
+    All copies from a CUDA GPU share one wait. What `ModelOutputs.stay_on_device` names stays there. The input images
+    must be finite too: the ReLU of oneDNN, and of cuDNN, turns NaN into zero, so that it may not reach the outputs.
     Weights are checked when they are read and when they are prepared. Not seen are numbers inside of the backbone that
     grow beyond the range of their type and that ReLU then turns into zeros.
     """
     last = outputs.last_layers()
-    checked = [last.bev, last.class_logits, last.box_codes, *([images] if last.bev.device.type == "cpu" else [])]
+    checked = [last.bev, last.class_logits, last.box_codes, upload(images, last.bev.device)]
     sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
     sums, *copies = _on_cpu([sums, *(tensor for _, tensor in tensors_in(list(moved.values())))])

@@ -65,8 +65,9 @@ class Captured:
         """function: a method of the model, which is complete. rounds: see `rounded_products`."""
         self._function, self._device, self._rounds = function, device, rounds
         parts = [module for module in model.modules() if module is not model]
-        self._hooks = [hooks for part in parts for hooks in (part._forward_hooks, part._forward_pre_hooks)]
-        self._own_hooks = self._count_hooks()
+        hooks = [hooks for part in parts for hooks in (part._forward_hooks, part._forward_pre_hooks)]
+        self._no_hooks, self._own = [each for each in hooks if not each], [each for each in hooks if each]
+        self._own_hooks = sum(map(len, self._own))
         self.graphs: OrderedDict[Any, CudaGraph | None] = OrderedDict()
         self._pool: Any = None
         self._lock = threading.Lock()  # runs in several threads share the inputs of a graph
@@ -75,7 +76,7 @@ class Captured:
     def __call__(self, *arguments: Any) -> Any:
         """As the method itself. Arguments may be nested tuples and frozen dataclasses; tensors must not change."""
         with torch.inference_mode():
-            if self.failure is None and self._count_hooks() == self._own_hooks:
+            if self.failure is None and not self._is_observed():
                 with self._lock:
                     graph = self._graph_for(arguments)
                     if graph is not None:
@@ -109,8 +110,8 @@ class Captured:
             logging.getLogger("bevcli").warning("no CUDA graph could be captured, steps take longer: %s", reason)
             return None
 
-    def _count_hooks(self) -> int:
-        return sum(map(len, self._hooks))
+    def _is_observed(self) -> bool:
+        return any(self._no_hooks) or sum(map(len, self._own)) != self._own_hooks
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -217,9 +218,15 @@ class SpatialCrossAttention(nn.Module):
 def temporal_hits(reference_points: Tensor, queries_per_map: Sequence[int]) -> Hits:
     """The hits of the BEV cells in the history and the current map. reference_points: (B, 2, Y·X, 2)."""
     batch, maps, cells, _ = reference_points.shape
-    query = torch.arange(batch * cells).view(batch, 1, cells).expand(-1, maps, -1).flatten()
-    prediction = torch.arange(maps)[None, :, None].expand(batch, -1, cells).flatten()
+    query, prediction = map_queries(batch, maps, cells, reference_points.device)
     return Hits(query, reference_points.reshape(-1, 1, 2), queries_per_map, prediction)
+
+
+@cache
+def map_queries(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`Hits.query` and `Hits.prediction` of maps that all cells sample. They are kept: CUDA graphs hold addresses."""
+    query = torch.arange(batch * cells, device=device).view(batch, 1, cells).expand(-1, maps, -1).flatten()
+    return query, torch.arange(maps, device=device)[None, :, None].repeat(batch, 1, cells).flatten()
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

@@ -7,7 +7,7 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -17,15 +17,17 @@ from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
+from bevcli.model.kernels.cuda_layers import FusedBottleneck, TokensInOnePass, attention_by_products
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
+from bevcli.model.segmentation import MaskDecoderLayer
 from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
@@ -57,12 +59,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
-    if has_triton(device):
-        from bevcli.model.kernels.triton_bottleneck import FusedBottleneck  # only where Triton is installed
-
-        for module in network.modules():
-            if isinstance(module, Bottleneck):
-                add_to_class(module, FusedBottleneck)
+    if device.type == "cuda":
+        _use_cuda_layers(network, device)
     dtype = DTYPES[precision]
     for part in network.image_parts:
         part.to(dtype)
@@ -105,6 +103,26 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         loading.start()
         atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return network
+
+
+def _use_cuda_layers(network: nn.Module, device: torch.device) -> None:
+    """Exchanges layers, in place, for those of `cuda_layers` and of the Triton kernels."""
+    for module in network.modules():
+        if isinstance(module, Bottleneck) and torch.version.hip is None:  # cuDNN is NVIDIA's
+            add_to_class(module, FusedBottleneck)
+            cast(FusedBottleneck, module).fuse()
+        elif isinstance(module, ResNet) and has_triton(device):
+            from bevcli.model.kernels.triton_stem import FusedStem  # only where Triton is installed
+
+            add_to_class(module, FusedStem)
+        elif type(module) is DeformableAttention and has_triton(device):
+            from bevcli.model.kernels.triton_attention import AttentionByHits  # only where Triton is installed
+
+            add_to_class(module, AttentionByHits)
+        elif isinstance(module, ImageTokens):
+            add_to_class(module, TokensInOnePass)
+        elif isinstance(module, MaskDecoderLayer):
+            module.attend = attention_by_products
 
 
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from typing import Any
 
 from torch import Tensor
@@ -14,9 +15,9 @@ def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
     elif isinstance(value, tuple | list):
         for part in value:
             yield from tensors_in(part, name)
-    elif is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from tensors_in(getattr(value, field.name), field.name)
+    else:
+        for field in _field_names(value):
+            yield from tensors_in(getattr(value, field), field)
 
 
 def exchanged(value: Any, others: Iterator[Any]) -> Any:
@@ -25,6 +26,16 @@ def exchanged(value: Any, others: Iterator[Any]) -> Any:
         return next(others)
     if isinstance(value, tuple | list):
         return type(value)(exchanged(part, others) for part in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{part.name: exchanged(getattr(value, part.name), others) for part in fields(value)})
-    return value
+    names = _field_names(value)
+    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
+
+
+def _field_names(value: object) -> tuple[str, ...]:
+    """Of a dataclass; () for another value. They are kept: asking a dataclass takes longer than copying a tensor."""
+    kind: Any = type(value)
+    return _fields_of(kind)
+
+
+@cache
+def _fields_of(kind: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()

@@ -6,16 +6,19 @@ It prints one line for each case. The results and the gradients of the two versi
 from __future__ import annotations
 
 import contextlib
+import copy
 from collections.abc import Callable, Sequence
 
 import torch
+from simulated_device import sample_hits_plainly
 from torch import Tensor, nn
 
 from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import GridSampling
+from bevcli.model.deformable_attention import GridSampling, Hits
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
-from bevcli.model.resnet import ResNet
+from bevcli.model.prepare import add_to_class
+from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
 FAR = 1e6  # where positions have no gradients
@@ -112,20 +115,57 @@ def main() -> None:
         "attention in half precision", inputs, *(sampling(each(), 1, (3,)) for each in (GridSampling, TritonSampling))
     )
 
+    for case in ((2, 6, 4, 8, 1, 4), (2, 6, 1, 4, 2, 1), (1, 8, 3, 5, 1, 1)):
+        compare_hits(*case)
+
     def convolutions(stride: int) -> list[Callable[..., Tensor]]:
         versions = (predicted_deformable_convolution, convolution.deformable_convolution)
         return [lambda *inputs, each=each: each(*inputs, stride) for each in versions]
 
     shapes = sorted({(c // SCALE, o // SCALE, s) for each in configs for c, o, s in convolution_shapes(each)})
     cases = [*shapes, (6, 5, 1), (20, 17, 2), (3, 4, 1, (1, 1)), (3, 4, 2, (4, 4), 0)]
-    convolution._has_matrix_units = lambda device: False
+    for case in cases:
+        compare(f"convolution {case}", convolution_case(*case), *convolutions(case[2]))
     halves = [each.half() for each in convolution_case(16, 16, 1)]
-    for kernel in ("columns", "one kernel"):
-        if kernel == "one kernel":
-            convolution._by_columns = convolution._in_one_kernel  # in float32 its products are exact too
-        for case in cases:
-            compare(f"convolution {case}, {kernel}", convolution_case(*case), *convolutions(case[2]))
-        compare(f"convolution in half precision, {kernel}", halves, *convolutions(1))
+    compare("convolution in half precision", halves, *convolutions(1))
+    compare_stems()
+
+
+def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: int, pillar_points: int) -> None:
+    """Compare the sums of hits with those by tables; some hits lie far outside."""
+    from bevcli.model.kernels.triton_attention import sample_hits
+
+    counts, queries = (0, 40, 0, 3), 9
+    values, locations, _ = attention_case(heads, depth, levels, points, counts)
+    reference_points = locations[:, 0, 0, :pillar_points].contiguous()
+    random = torch.Generator().manual_seed(levels)
+    offsets = 3 * torch.randn(queries, heads, predictions, levels, points, 2, generator=random)
+    logits = 4 * torch.randn(queries, heads, predictions, levels, points, generator=random)
+    query = torch.randint(queries, (sum(counts),), generator=random)
+    prediction = torch.randint(predictions, (sum(counts),), generator=random)
+    shapes = LEVEL_SHAPES[:levels]
+    found = sample_hits(values, shapes, Hits(query, reference_points, counts, prediction), offsets, logits)
+    read = (values, reference_points, offsets, logits, query, prediction)
+    torch.testing.assert_close(found, sample_hits_plainly(*read, shapes, counts), rtol=1e-4, atol=1e-4)
+    print(f"hits {heads, depth, levels, points, predictions, pillar_points}", flush=True)
+
+
+def compare_stems() -> None:
+    """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
+    from bevcli.model.kernels.choose import fold_batch_norms
+    from bevcli.model.kernels.triton_stem import FusedStem
+
+    torch.manual_seed(0)
+    backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)
+    backbone.bn1.bias.normal_()
+    fused = copy.deepcopy(backbone)
+    fold_batch_norms(fused, torch.device("meta"))
+    add_to_class(fused, FusedStem)
+    for batch, height, width in ((2, 32, 64), (1, 33, 47), (1, 2, 2), (0, 32, 32)):
+        images = torch.randn(batch, 3, height, width)
+        images[:, 0, 0, 0] = torch.nan
+        torch.testing.assert_close(fused.stem(images), backbone.stem(images), equal_nan=True)
+        print(f"stem {batch, height, width}", flush=True)
 
 
 if __name__ == "__main__":

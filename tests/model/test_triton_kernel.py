@@ -25,7 +25,9 @@ ATTENTIONS = sorted(
     for dtype in (("fp32", "bf16", "fp16") if shape[4] else ("fp32",))
 )
 CONVOLUTIONS = sorted(
-    (*shape, dtype) for shape in set().union(*map(convolution_shapes, CONFIGS)) for dtype in ("fp32", "bf16", "fp16")
+    (*shape, dtype)
+    for shape in {(c, s) for config in CONFIGS for c, _, s in convolution_shapes(config)}
+    for dtype in ("fp32", "bf16", "fp16")
 )
 
 
@@ -48,28 +50,38 @@ def compile_kernel(kernel: Any, generation: int, types: dict[str, str], constant
 
 
 def compile_attention(generation: int, heads: int, depth: int, levels: int, points: int, dtype: str) -> list[bytes]:
-    """The machine codes of the results and of the gradients."""
-    from bevcli.model.kernels.triton_attention import _sample, _sample_backward, constants
+    """The machine codes of the results, of those of hits, and of the gradients."""
+    from bevcli.model.kernels.triton_attention import _sample, _sample_backward, _sample_hits, constants
 
     types = dict.fromkeys(("locations", "weights", "out", "out_gradient"), "fp32")
     types |= dict.fromkeys(("values_gradient", "locations_gradient", "weights_gradient"), "fp32")
     types |= {"values": dtype, "shapes": "i32", "ends": "i32"}
     chosen = constants(heads, depth, levels, points)
-    return [compile_kernel(kernel, generation, types, chosen) for kernel in (_sample, _sample_backward)]
+    codes = [compile_kernel(kernel, generation, types, chosen) for kernel in (_sample, _sample_backward)]
+    types |= dict.fromkeys(("reference_points", "offsets", "logits"), "fp32")
+    types |= dict.fromkeys(("query_of_hit", "prediction_of_hit"), "i64")
+    chosen |= {"PREDICTIONS": 2, "PILLAR_POINTS": 1, "SAMPLES": 1 << (levels * points - 1).bit_length()}
+    return [*codes, compile_kernel(_sample_hits, generation, types, chosen)]
 
 
-def compile_convolution(generation: int, channels: int, outputs: int, stride: int, dtype: str) -> list[bytes]:
-    """The machine codes of the columns, of the gradients and, for halves on matrix units, of the one kernel."""
+def compile_stem(generation: int, dtype: str) -> list[bytes]:
+    """The machine code of the pooling of a ResNet's stem."""
+    from bevcli.model.kernels.triton_stem import ELEMENTS_PER_PROGRAM, _pool
+
+    types = dict.fromkeys(("values", "bias", "out"), dtype)
+    return [compile_kernel(_pool, generation, types, {"CHANNELS": 64, "BLOCK": ELEMENTS_PER_PROGRAM})]
+
+
+def compile_convolution(generation: int, channels: int, stride: int, dtype: str) -> list[bytes]:
+    """The machine codes of the columns and of the gradients."""
     import bevcli.model.kernels.triton_convolution as convolution
 
-    types = dict.fromkeys(("values", "predicted", "weight", "bias", "out", "columns", "columns_gradient"), dtype)
+    types = dict.fromkeys(("values", "predicted", "columns", "columns_gradient"), dtype)
     types |= dict.fromkeys(("values_gradient", "predicted_gradient"), "fp32")
     kernels = {
         convolution._write_columns: convolution.COLUMN_TILES,
         convolution._add_gradients: convolution.GRADIENT_TILES,
     }
-    if dtype != "fp32" and generation >= 10 * convolution.FIRST_WITH_MATRIX_UNITS[0]:
-        kernels[convolution._convolve] = convolution.output_tiles(outputs)
     return [
         compile_kernel(kernel, generation, types, convolution.constants(channels, stride, tiles))
         for kernel, tiles in kernels.items()
@@ -84,6 +96,7 @@ def no_cache(tmp_path, monkeypatch):
 @pytest.mark.parametrize("generation", [GENERATIONS[0], GENERATIONS[-1]])
 def test_the_kernels_compile_for_the_oldest_and_newest_cards(generation):
     codes = compile_attention(generation, *max(ATTENTIONS)) + compile_convolution(generation, *max(CONVOLUTIONS))
+    codes += compile_stem(generation, "fp16")
     assert all(code.startswith(b"\x7fELF") for code in codes)
 
 

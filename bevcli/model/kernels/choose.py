@@ -35,6 +35,10 @@ def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: boo
                 module.level_sizes = kept_sizes
             if not gradients and device.type == "cpu":
                 module.softmax, module.sample_hits = softmax_of_few, sample_hits
+            elif not gradients and has_triton(device):
+                from bevcli.model.kernels import triton_attention  # only where Triton is installed
+
+                module.sample_hits = triton_attention.sample_hits
         elif isinstance(module, ModulatedDeformableConvolution):
             module.convolve = fastest_convolution(device)
 

@@ -12,7 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.deformable_attention import DeformableAttention, Hits, LevelShapes
+from bevcli.model.encoder import map_queries
 from bevcli.model.kernels.triton_bilinear import corner_of
 from bevcli.model.upload import upload
 
@@ -33,6 +34,50 @@ class TritonSampling(nn.Module):
         """Arguments and result as for `GridSampling`."""
         sums = _WeightedSums.apply(values, locations, weights, level_shapes, tuple(queries_per_map))
         return sums.flatten(1)
+
+
+def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: Tensor, logits: Tensor) -> Tensor:
+    """As `compiled.sample_hits`, on a GPU. No gradients."""
+    maps, cells, heads, depth = values.shape
+    predictions, levels, points = logits.shape[2:]
+    out = values.new_empty(len(hits.query), heads, depth, dtype=torch.float32)
+    if len(out):
+        # Triton launches on the current GPU, which need not be that of the tensors.
+        with torch.cuda.device(values.device):
+            _sample_hits[(triton.cdiv(len(out), QUERIES_PER_PROGRAM), heads)](
+                values.contiguous(),
+                _table(level_shapes, values.device),
+                hits.reference_points.float().contiguous(),
+                offsets.float().contiguous(),
+                logits.float().contiguous(),
+                hits.query,
+                hits.prediction,
+                _table(tuple(accumulate(hits.hits_per_map)), values.device),
+                out,
+                len(out),
+                maps,
+                cells,
+                PREDICTIONS=predictions,
+                PILLAR_POINTS=hits.reference_points.shape[1],
+                SAMPLES=triton.next_power_of_2(levels * points),
+                **constants(heads, depth, levels, points),
+            )
+    return out.flatten(1)
+
+
+class AttentionByHits(DeformableAttention):
+    """Added to attentions whose `attend` samples around points: it makes no tables of locations and weights either."""
+
+    def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
+        """As `DeformableAttention.attend`."""
+        if self.sample_hits is None:  # someone looks at the tables
+            return super().attend(query, reference_points, tokens, level_shapes)
+        batch, queries, _ = query.shape
+        of_hit = map_queries(1, 1, batch * queries, query.device)
+        hits = Hits(of_hit[0], reference_points.reshape(-1, 1, 2), [queries] * batch, of_hit[1])
+        sampled = self.sample_hits(self.values(tokens), level_shapes, hits, *self.predict(query.flatten(0, 1)))
+        result: Tensor = self.output_projection(sampled.view(batch, queries, -1))
+        return result
 
 
 class _WeightedSums(torch.autograd.Function):
@@ -151,6 +196,69 @@ def _sample(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def _sample_hits(  # type: ignore[no-untyped-def]
+    values,
+    shapes,
+    reference_points,
+    offsets,
+    logits,
+    query_of_hit,
+    prediction_of_hit,
+    ends,
+    out,
+    hits,
+    maps,
+    cells,
+    PREDICTIONS: tl.constexpr,
+    PILLAR_POINTS: tl.constexpr,
+    SAMPLES: tl.constexpr,
+    HEADS: tl.constexpr,
+    DEPTH: tl.constexpr,
+    PADDED_DEPTH: tl.constexpr,
+    LEVELS: tl.constexpr,
+    POINTS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """One program sums the samples of BLOCK hits in one head; tensors are laid out as for `sample_hits`.
+
+    ends: (maps,) int32, for each map the number of hits up to and with its own. SAMPLES: at least LEVELS · POINTS.
+    """
+    hit = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    head = tl.program_id(1)
+    channel = tl.arange(0, PADDED_DEPTH)
+    exists = hit < hits
+    has_channel = channel < DEPTH
+    first_cell = _map_of(hit, ends, maps, BLOCK) * cells
+    query = tl.load(query_of_hit + hit, exists, 0)
+    prediction = (query * HEADS + head) * PREDICTIONS + tl.load(prediction_of_hit + hit, exists, 0)
+    first_sample = prediction * (LEVELS * POINTS)
+    sample = tl.arange(0, SAMPLES)
+    is_sample = exists[:, None] & (sample < LEVELS * POINTS)[None, :]
+    all_logits = tl.load(logits + first_sample[:, None] + sample[None, :], is_sample, float("-inf"))
+    largest = tl.where(exists, tl.max(all_logits, 1), 0.0)
+    sum_of_weights = tl.sum(tl.exp(all_logits - largest[:, None]), 1)
+    total = tl.zeros((BLOCK, PADDED_DEPTH), tl.float32)
+    for level in range(LEVELS):
+        height = tl.load(shapes + 2 * level)
+        width = tl.load(shapes + 2 * level + 1)
+        for point in range(POINTS):
+            place = first_sample + level * POINTS + point
+            reference = reference_points + 2 * (hit * PILLAR_POINTS + point % PILLAR_POINTS)
+            x = tl.load(reference, exists, -1.0) + tl.load(offsets + 2 * place, exists, 0.0) / width
+            y = tl.load(reference + 1, exists, -1.0) + tl.load(offsets + 2 * place + 1, exists, 0.0) / height
+            y, x = _cells(y, x, height, width)
+            weight = tl.exp(tl.load(logits + place, exists, 0.0) - largest) / sum_of_weights
+            for corner in tl.static_range(4):
+                cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
+                address = values + (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
+                value = tl.load(address, inside[:, None] & has_channel[None, :], 0.0)
+                total += (of_columns * of_rows * weight)[:, None] * value.to(tl.float32)
+        first_cell += height * width
+    target = out + (hit[:, None] * HEADS + head) * DEPTH + channel[None, :]
+    tl.store(target, total, exists[:, None] & has_channel[None, :])
+
+
+@triton.jit
 def _sample_backward(  # type: ignore[no-untyped-def]
     values,
     shapes,
@@ -218,7 +326,14 @@ def _map_of(query, ends, maps, BLOCK: tl.constexpr):  # type: ignore[no-untyped-
 @triton.jit
 def _position(locations, sample, exists, height, width):  # type: ignore[no-untyped-def]
     """y and x of samples, in cells of a level."""
+    x = tl.load(locations + 2 * sample, exists, -1.0)
+    y = tl.load(locations + 2 * sample + 1, exists, -1.0)
+    return _cells(y, x, height, width)
+
+
+@triton.jit
+def _cells(y, x, height, width):  # type: ignore[no-untyped-def]
+    """y and x, 0 to 1 over a level, in its cells, 0 at the centre of the first."""
     # Locations more than a cell outside the map contribute nothing; the clamp keeps them within an int32.
-    x = tl.load(locations + 2 * sample, exists, -1.0) * width - 0.5
-    y = tl.load(locations + 2 * sample + 1, exists, -1.0) * height - 0.5
+    y, x = y * height - 0.5, x * width - 0.5
     return tl.minimum(tl.maximum(y, -2.0), height + 1.0), tl.minimum(tl.maximum(x, -2.0), width + 1.0)

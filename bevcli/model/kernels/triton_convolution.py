@@ -16,11 +16,9 @@ from torch import Tensor
 
 from bevcli.model.kernels.triton_bilinear import corner_of
 
-# Positions, channels, taps and outputs that a program takes, or takes at a time; its warps and stages.
-COLUMN_TILES = {"BLOCK": 16, "BLOCK_CHANNELS": 128, "TAPS": 9}
+# Positions, channels and taps that a program takes at a time.
+COLUMN_TILES = {"BLOCK": 8, "BLOCK_CHANNELS": 128, "TAPS": 9}
 GRADIENT_TILES = {"BLOCK": 16, "BLOCK_CHANNELS": 64, "TAPS": 1}
-CONVOLUTION_TILES = {"BLOCK": 64, "BLOCK_CHANNELS": 64, "BLOCK_OUTPUTS": 256, "num_warps": 8, "num_stages": 1}
-FIRST_WITH_MATRIX_UNITS = (8, 0)  # compute capability, of those that Triton uses
 COLUMN_BYTES = 512 << 20  # of the columns that exist at a time
 
 
@@ -43,10 +41,9 @@ class _Convolution(torch.autograd.Function):
         out = x.new_empty(shape)
         # Triton launches on the current GPU, which need not be that of the tensors.
         with torch.cuda.device(x.device):
-            if x.dtype == torch.float32 or not _has_matrix_units(x.device):
-                _by_columns(x, predicted, weight, bias, stride, out)
-            else:
-                _in_one_kernel(x, predicted, weight, bias, stride, out)
+            for part in _parts(x, predicted):
+                columns = _columns(x[part], predicted[part], stride)
+                torch.addmm(bias, columns, _rows(weight).T, out=out[part].flatten(0, 2))
         return out.permute(0, 3, 1, 2)  # (B, O, H', W')
 
     @staticmethod
@@ -70,11 +67,6 @@ class _Convolution(torch.autograd.Function):
         return *(each.to(dtype) for each, dtype in zip(learned, dtypes, strict=True)), None
 
 
-def _has_matrix_units(device: torch.device) -> bool:
-    """Whether Triton multiplies halves on the matrix units of the GPU."""
-    return torch.cuda.get_device_capability(device) >= FIRST_WITH_MATRIX_UNITS
-
-
 def _channels_last(x: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last)
 
@@ -91,13 +83,6 @@ def _parts(x: Tensor, predicted: Tensor) -> Iterator[slice]:
     return (slice(first, first + step) for first in range(0, len(x), step))
 
 
-def _by_columns(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stride: int, out: Tensor) -> None:
-    """Writes the result to out (B, H', W', O): the samples of all taps in memory, then one matrix product."""
-    for part in _parts(x, predicted):
-        columns = _columns(x[part], predicted[part], stride)
-        torch.addmm(bias, columns, _rows(weight).T, out=out[part].flatten(0, 2))
-
-
 def _columns(x: Tensor, predicted: Tensor, stride: int) -> Tensor:
     """The samples of all taps times their masks: (positions, 9 · C)."""
     columns = x.new_empty(predicted[:, 0].numel(), 9 * x.shape[1])
@@ -106,7 +91,7 @@ def _columns(x: Tensor, predicted: Tensor, stride: int) -> Tensor:
 
 
 def _launch(kernel: Any, tensors: Sequence[Tensor], stride: int, tiles: Mapping[str, int]) -> None:
-    """Starts a program for each block of positions, and each group of taps or block of outputs.
+    """Starts a program for each block of positions and each group of taps.
 
     tensors: x, what is predicted, and the others that the kernel takes. tiles: as for `constants`.
     """
@@ -114,27 +99,14 @@ def _launch(kernel: Any, tensors: Sequence[Tensor], stride: int, tiles: Mapping[
     positions = predicted[:, 0].numel()
     if positions:
         chosen = constants(x.shape[1], stride, tiles)
-        rest = 9 // chosen["TAPS"] if "TAPS" in chosen else triton.cdiv(chosen["OUTPUTS"], chosen["BLOCK_OUTPUTS"])
-        grid = (triton.cdiv(positions, chosen["BLOCK"]) * rest,)
+        grid = (triton.cdiv(positions, chosen["BLOCK"]) * 9 // chosen["TAPS"],)
         kernel[grid](*tensors, positions, *x.shape[2:], *predicted.shape[2:], **chosen)
 
 
-def _in_one_kernel(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor, stride: int, out: Tensor) -> None:
-    """Writes the result to out (B, H', W', O); the samples stay on the chip."""
-    _launch(_convolve, (x, predicted, _rows(weight), bias, out), stride, output_tiles(len(weight)))
-
-
 def constants(channels: int, stride: int, tiles: Mapping[str, int]) -> dict[str, int]:
-    """The arguments that a kernel is compiled for: `COLUMN_TILES`, `GRADIENT_TILES` or `output_tiles`."""
-    # A matrix unit multiplies tiles of at least 16.
+    """The arguments that a kernel is compiled for: `COLUMN_TILES` or `GRADIENT_TILES`."""
     block = min(max(triton.next_power_of_2(channels), 16), tiles["BLOCK_CHANNELS"])
     return {"CHANNELS": channels, "STRIDE": stride, **tiles, "BLOCK_CHANNELS": block}
-
-
-def output_tiles(outputs: int) -> dict[str, int]:
-    """The tiles of the kernel that convolves."""
-    block = min(max(triton.next_power_of_2(outputs), 16), CONVOLUTION_TILES["BLOCK_OUTPUTS"])
-    return {"OUTPUTS": outputs, **CONVOLUTION_TILES, "BLOCK_OUTPUTS": block}
 
 
 @triton.jit
@@ -172,48 +144,6 @@ def _sampled(  # type: ignore[no-untyped-def]
             value = tl.load(address, inside[:, None] & (channel < CHANNELS)[None, :], 0.0)
         total += (of_rows * of_columns * mask)[:, None] * value.to(tl.float32)
     return total
-
-
-@triton.jit
-def _convolve(  # type: ignore[no-untyped-def]
-    values,
-    predicted,
-    weight,
-    bias,
-    out,
-    positions,
-    height,
-    width,
-    out_height,
-    out_width,
-    CHANNELS: tl.constexpr,
-    OUTPUTS: tl.constexpr,
-    STRIDE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    BLOCK_CHANNELS: tl.constexpr,
-    BLOCK_OUTPUTS: tl.constexpr,
-):
-    """One program computes BLOCK_OUTPUTS channels at BLOCK positions.
-
-    values (B, H, W, C), predicted (positions, 27), weight (O, 9, C), bias (O,), out (positions, O).
-    """
-    blocks: tl.constexpr = (OUTPUTS + BLOCK_OUTPUTS - 1) // BLOCK_OUTPUTS
-    position = tl.program_id(0) // blocks * BLOCK + tl.arange(0, BLOCK)
-    output = tl.program_id(0) % blocks * BLOCK_OUTPUTS + tl.arange(0, BLOCK_OUTPUTS)
-    exists = position < positions
-    has_output = output < OUTPUTS
-    total = tl.zeros((BLOCK, BLOCK_OUTPUTS), tl.float32)
-    for tap in range(9):
-        first_cell, y, x, mask = _tap(predicted, position, exists, tap, height, width, out_height, out_width, STRIDE)
-        for first in range(0, CHANNELS, BLOCK_CHANNELS):
-            channel = first + tl.arange(0, BLOCK_CHANNELS)
-            sampled = _sampled(values, first_cell, y, x, mask, exists, channel, height, width, CHANNELS, BLOCK_CHANNELS)
-            address = weight + (output[None, :] * 9 + tap) * CHANNELS + channel[:, None]
-            part = tl.load(address, has_output[None, :] & (channel < CHANNELS)[:, None], 0.0)
-            total = tl.dot(sampled.to(part.dtype), part, total, input_precision="ieee")
-    total += tl.load(bias + output, has_output, 0.0).to(tl.float32)[None, :]
-    address = out + position.to(tl.int64)[:, None] * OUTPUTS + output[None, :]
-    tl.store(address, total.to(out.dtype.element_ty), exists[:, None] & has_output[None, :])
 
 
 @triton.jit

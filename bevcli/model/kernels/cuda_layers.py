@@ -1,0 +1,70 @@
+"""Layers of a model prepared for inference on a CUDA GPU that take fewer passes over the memory than the plain ones."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.image_tokens import ImageTokens
+from bevcli.model.resnet import Bottleneck
+
+
+class FusedBottleneck(Bottleneck):
+    """Added to the bottlenecks with folded batch norms: cuDNN adds bias and shortcut, and applies ReLU, at once."""
+
+    def fuse(self) -> None:
+        """Moves the bias of the shortcut's convolution into the last one, in place, as both are added to the result."""
+        if isinstance(self.downsample, nn.Sequential):
+            shortcut = self.downsample[0]
+            assert isinstance(shortcut, nn.Conv2d)
+            assert shortcut.bias is not None
+            assert self.conv3.bias is not None
+            self.conv3.bias = nn.Parameter(self.conv3.bias + shortcut.bias, requires_grad=False)
+            shortcut.bias = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As `Bottleneck.forward`."""
+        y = convolution_with_relu(self.conv1, x)
+        y = convolution_with_relu(self.conv2, y)
+        return convolution_with_relu(self.conv3, y, self.downsample(x))
+
+
+def convolution_with_relu(convolution: nn.Module, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+    """ReLU of the convolution of x plus the shortcut, which has the shape of the result."""
+    if not isinstance(convolution, nn.Conv2d):
+        assert shortcut is None
+        result: Tensor = convolution(x)
+        return result.relu_()
+    assert not isinstance(convolution.padding, str)
+    rest = convolution.stride, convolution.padding, convolution.dilation, convolution.groups
+    if shortcut is None:
+        return torch.cudnn_convolution_relu(x, convolution.weight, convolution.bias, *rest)
+    return torch.cudnn_convolution_add_relu(x, convolution.weight, shortcut, 1.0, convolution.bias, *rest)
+
+
+class TokensInOnePass(ImageTokens):
+    """Added to the image tokens: each level is read once, and written to its place with both embeddings added."""
+
+    def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
+        """As `ImageTokens.forward`."""
+        images, channels = maps[0].shape[:2]
+        levels = [x.flatten(2).transpose(1, 2) for x in maps]  # (B·N, S_l, C)
+        tokens = maps[0].new_empty(images, sum(x.shape[1] for x in levels), channels)
+        embedding = self.level_embedding[: len(maps), None]  # (L, 1, C)
+        if self.camera_embedding is not None:
+            of_cameras = self.camera_embedding[camera_index].reshape(-1, channels)  # (N, C) or (B·N, C)
+            embedding = embedding + of_cameras.repeat(images // len(of_cameras), 1)  # (L, B·N, C)
+        parts = tokens.split([x.shape[1] for x in levels], dim=1)
+        for level, part, added in zip(levels, parts, embedding, strict=True):
+            torch.add(level, added[:, None], out=part)
+        return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
+
+
+def attention_by_products(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+    """`scaled_dot_product_attention` with its table of weights in memory.
+
+    With few queries and many keys this is faster: PyTorch's kernel gives each block of queries to one multiprocessor.
+    """
+    scores = (queries * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)
+    return scores.softmax(-1) @ values
