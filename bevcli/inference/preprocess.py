@@ -27,16 +27,22 @@ from bevcli.model.step import PreparedFrame
 class Preprocessor:
     """Prepares the frames of a sequence for one model, with threads of its own that end with it.
 
-    chosen_cameras: camera -> model camera whose embedding it uses. Other cameras are assigned by viewing direction.
+    Args:
+        chosen_cameras: camera -> model camera whose embedding it uses. Others are assigned by viewing direction.
+        threads: 1 for that of the caller, None for one a processor core.
     """
 
-    def __init__(self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None, *, threads: int | None = None
+    ) -> None:
         self.config = config
         self._chosen_cameras = chosen_cameras
         self._of_rig: _OfRig | None = None  # replaced as a whole: frames may be prepared in several threads
         # In sequence, preparing the images takes longer than the model on a GPU.
-        self._threads = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="preprocess")
-        weakref.finalize(self, self._threads.shutdown, wait=False)
+        self._threads: ThreadPoolExecutor | None = None
+        if threads != 1:
+            self._threads = ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="preprocess")
+            weakref.finalize(self, self._threads.shutdown, wait=False)
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
@@ -52,9 +58,13 @@ class Preprocessor:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
             write_network_image(pixels, image, out=images[0, place].numpy())
 
-        tasks = [self._threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
-        for task in wait(tasks).done:
-            task.result()
+        present = [(place, name) for place, name in enumerate(names) if name in frame.images]
+        if self._threads is None:
+            for place, name in present:
+                write(place, name)
+        else:
+            for task in wait([self._threads.submit(write, *each) for each in present]).done:
+                task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bevcli.jit import njit
 from bevcli.model.config import ImageConfig
 
 
@@ -17,13 +18,19 @@ def images_as_bytes(images: Tensor, image: ImageConfig) -> Tensor:
 
     So padding and missing images, which are 0, become 0. Pixels that were not resized lose nothing.
     """
-    values = images.numpy()
-    out = np.empty(values.shape, np.uint8)
-    for channel, grey in enumerate(_grey(image)):
-        pixels = values[..., channel, :, :] * np.float32(image.std[channel])
-        pixels += np.float32(image.mean[channel] + 0.5)
-        np.subtract(pixels.astype(np.uint8), grey, out=out[..., channel, :, :])
-    return torch.from_numpy(out)
+    values = images.movedim(-3, -1).contiguous().numpy()  # (..., H, W, 3)
+    out, width = np.empty(values.shape, np.uint8), values.shape[-2]
+    std, mean = (np.tile(np.asarray(of_channels, np.float32), width) for of_channels in (image.std, image.mean))
+    grey = np.tile(_grey(image).astype(np.int32), width)
+    _write_bytes(values.reshape(-1, 3 * width), std, mean + np.float32(0.5), grey, out.reshape(-1, 3 * width))
+    return torch.from_numpy(out).movedim(-1, -3)
+
+
+@njit(nogil=True)
+def _write_bytes(rows, std, mean, grey, out) -> None:  # type: ignore[no-untyped-def]
+    for row in range(len(rows)):
+        for place in range(len(std)):
+            out[row, place] = np.uint8(np.int32(rows[row, place] * std[place] + mean[place]) - grey[place])
 
 
 def images_from_bytes(images: Tensor, image: ImageConfig) -> Tensor:

@@ -104,8 +104,8 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
 
 def test_a_step_costs_its_updates_or_the_reading_of_its_batches() -> None:
     config = TrainingConfig(steps=10, loaders=2, clips=ClipConfig(frames=4, learn="all", in_turn=2))
-    assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0
-    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 6.0
+    assert Cost(config, "cpu", 2, 0.5, 2.0, 0).step_s == 4.0
+    assert Cost(config, "cpu", 2, 0.5, 6.0, 0).step_s == 6.0
 
 
 def test_a_class_is_like_that_of_the_nearest_size() -> None:
