@@ -33,8 +33,8 @@ class _Component(rr.DescribedComponentBatch):
         return self._array
 
 
-def components(archetype: type[Any], **fields: Any) -> Components:
-    """The components of an archetype. fields: by the names of `archetype.from_fields`; None leaves one out.
+def components(archetype: Any, **fields: Any) -> Components:
+    """The components of an archetype, a class of rerun. fields: by the names of `archetype.from_fields`; None leaves one out.
 
     A field is an Arrow array of the component's type, an array of numbers (colours as `packed` takes or returns them),
     a list of texts, or whatever rerun takes. A value that can be hashed is converted once.
@@ -82,7 +82,7 @@ def rgb_format(width: int, height: int) -> pa.Array:
 
 
 @cache
-def _field(archetype: type[Any], name: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
+def _field(archetype: Any, name: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     (batch,) = archetype.from_fields(**{name: []}).as_component_batches()
     return batch.component_descriptor(), batch.as_arrow_array().type
 
@@ -92,7 +92,7 @@ def _plain(name: str) -> rr.ComponentDescriptor:
     return rr.ComponentDescriptor(name)
 
 
-def _converted(archetype: type[Any], name: str, kind: pa.DataType, value: Any) -> pa.Array:
+def _converted(archetype: Any, name: str, kind: pa.DataType, value: Any) -> pa.Array:
     if isinstance(value, pa.Array):
         return value
     if isinstance(value, np.ndarray):
@@ -102,7 +102,7 @@ def _converted(archetype: type[Any], name: str, kind: pa.DataType, value: Any) -
     return _constant(archetype, name, value) if isinstance(value, Hashable) else _by_rerun(archetype, name, value)
 
 
-def _by_rerun(archetype: type[Any], name: str, value: Any) -> pa.Array:
+def _by_rerun(archetype: Any, name: str, value: Any) -> pa.Array:
     (batch,) = archetype.from_fields(**{name: value}).as_component_batches()
     return batch.as_arrow_array()
 
