@@ -2,11 +2,11 @@
 
 import os
 import weakref
-from collections.abc import Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.export_form import raw_images
 from bevcli.model.step import PreparedFrame
 
+WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
+
 
 class Preprocessor:
     """Prepares the frames of a sequence for one model, with threads of its own that end with it.
@@ -30,13 +32,22 @@ class Preprocessor:
     Args:
         chosen_cameras: camera -> model camera whose embedding it uses. Others are assigned by viewing direction.
         threads: 1 for that of the caller, None for one a processor core.
+        write: writes an image as the network takes it to the top left corner of (3, H, W) zeros of `dtype`. Default:
+            `write_network_image`.
     """
 
     def __init__(
-        self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None, *, threads: int | None = None
+        self,
+        config: ModelConfig,
+        chosen_cameras: Mapping[str, str] | None = None,
+        *,
+        threads: int | None = None,
+        write: WriteImage | None = None,
+        dtype: type[np.generic] = np.float32,
     ) -> None:
         self.config = config
         self._chosen_cameras = chosen_cameras
+        self._write, self._dtype = write or write_network_image, dtype
         self._of_rig: _OfRig | None = None  # replaced as a whole: frames may be prepared in several threads
         # In sequence, preparing the images takes longer than the model on a GPU.
         self._threads: ThreadPoolExecutor | None = None
@@ -52,11 +63,11 @@ class Preprocessor:
         width, height = image.padded_size
         # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
         # here, and where it has more threads than there are processors, those of the model no longer spin.
-        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), np.float32)).movedim(-1, 2)
+        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), self._dtype)).movedim(-1, 2)
 
         def write(place: int, name: str) -> None:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
-            write_network_image(pixels, image, out=images[0, place].numpy())
+            self._write(pixels, image, images[0, place].numpy())
 
         present = [(place, name) for place, name in enumerate(names) if name in frame.images]
         if self._threads is None:

@@ -54,7 +54,7 @@ class BatchMaker:
         rank: of this process among those that train together.
         with_gap: leave out a frame of the clips, see `draw_clips`.
         plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `images_as_bytes`.
+        in_bytes: give images as bytes, see `write_bytes`.
     """
 
     drives: Drives

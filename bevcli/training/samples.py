@@ -27,7 +27,7 @@ from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
 from bevcli.training.frame_truth import frame_truth
-from bevcli.training.pixels import images_as_bytes, images_from_bytes
+from bevcli.training.pixels import images_from_bytes, write_bytes
 from bevcli.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
@@ -229,7 +229,7 @@ def load_batch(
     Args:
         learn_all: give targets for every frame, not for the last one only.
         plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `images_as_bytes`.
+        in_bytes: give images as bytes, see `write_bytes`.
 
     Raises InputError where a frame to train on has no ground truth.
     """
@@ -311,8 +311,8 @@ def _targets(frame: Frame, drive: Sequence, place: int, config: ModelConfig) -> 
 
 
 def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
-    frames = map(Preprocessor(config, threads=1), clip)
-    return [replace(one, images=images_as_bytes(one.images, config.image)) if in_bytes else one for one in frames]
+    written: dict[str, Any] = {"write": write_bytes, "dtype": np.uint8} if in_bytes else {}
+    return [*map(Preprocessor(config, threads=1, **written), clip)]
 
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:

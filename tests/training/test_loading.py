@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,15 @@ import torch
 from painted_drives import CONFIG, PaintedDrives
 from torch import Tensor
 
+from bevcli.inference.preprocess import write_network_image
+from bevcli.model.config import ImageConfig
 from bevcli.training.augmentation import AugmentationConfig, noisy
 from bevcli.training.loading import BatchMaker, loaded_batches
-from bevcli.training.pixels import images_as_bytes, images_from_bytes
+from bevcli.training.pixels import images_from_bytes, write_bytes
 from bevcli.training.samples import ClipConfig
 
 NOTHING, NOISE = AugmentationConfig(0, 0), AugmentationConfig(0.5, 0.5, exposure=1.0, noise=6.0, calibration_share=0.5)
+LITE = ImageConfig((64, 48), mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), color_order="rgb")
 CLIPS = ClipConfig(frames=2, batch=3, learn="all", short_share=0.0)
 
 
@@ -72,19 +76,29 @@ def test_unchanged_clips_are_prepared_once_for_the_teacher() -> None:
     assert not torch.equal(changed.plain.inputs[0].images, changed.inputs[0].images)
 
 
-def test_whole_pixel_values_survive_as_bytes_and_zero_nearly() -> None:
-    image = CONFIG.image
-    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (image.mean, image.std))
-    pixels = torch.arange(256.0).view(1, 1, 1, 16, 16).expand(2, 3, 3, 16, 16).clone()
-    images = (pixels - mean) / std
-    images[1, 2] = 0  # a missing image
-    in_bytes = images_as_bytes(images, image)
-    assert not in_bytes[1, 2].any()
-    back = images_from_bytes(in_bytes, image)
-    torch.testing.assert_close(back[0], images[0], atol=1e-5, rtol=0)
-    assert (back[1, 2] * std).abs().max() <= 0.5
-    between = images_from_bytes(images_as_bytes(images + 0.3 / std, image), image)
-    assert ((between - images - 0.3 / std)[0] * std)[..., :-1].abs().max() <= 0.501  # 255.3 is no byte
+@pytest.mark.parametrize(
+    ("size", "changes"),
+    [
+        ((64, 48), {}),
+        ((64, 48), {"color_order": "bgr", "crop": (0, 0, 60, 40)}),
+        ((64, 40), {}),  # fits with a margin below
+        ((160, 96), {"resize": "area"}),
+        ((50, 40), {"crop": (3, 5, 60, 45)}),
+    ],
+)
+def test_images_as_bytes_are_the_normalised_ones_rounded(size: tuple[int, int], changes: dict[str, Any]) -> None:
+    image = replace(LITE, size=(64, 48), pad_divisor=32, **changes)
+    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    width, height = image.padded_size
+    floats, in_bytes = (np.zeros((height, width, 3), dtype).transpose(2, 0, 1) for dtype in (np.float32, np.uint8))
+    write_network_image(pixels, image, floats)
+    write_bytes(pixels, image, in_bytes)
+    assert not in_bytes[floats == 0].any()
+    back = images_from_bytes(torch.from_numpy(in_bytes)[None, None], image)[0, 0].numpy()
+    errors = np.abs(back - floats) * np.array(image.std)[:, None, None]
+    assert errors.max() <= 0.501
+    if size[0] == image.size[0]:  # not resized
+        assert errors[floats != 0].max() < 1e-4
 
 
 def test_noise_is_normal_and_independent() -> None:
