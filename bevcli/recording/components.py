@@ -34,10 +34,11 @@ class _Component(rr.DescribedComponentBatch):
 
 
 def components(archetype: Any, **fields: Any) -> Components:
-    """The components of an archetype of rerun. fields: by the names of `archetype.from_fields`; None leaves one out.
+    """The components of an archetype, a class of rerun such as `rr.Points2D`.
 
-    A field is an Arrow array of the component's type, an array of numbers (colours as `packed` takes or returns them),
-    a list of texts, or whatever rerun takes. A value that can be hashed is converted once.
+    fields: by the names of `archetype.from_fields`; None leaves one out. A field is an Arrow array of the component's
+    type, an array of numbers (colours as `packed` takes or returns them), a list of texts, or whatever rerun takes. A
+    value that can be hashed is converted once.
     """
     found: Components = []
     for name, value in fields.items():
