@@ -2,11 +2,11 @@
 
 import os
 import weakref
-from collections.abc import Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -24,20 +24,37 @@ from bevcli.model.export_form import raw_images
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
 
+WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
+
 
 class Preprocessor:
     """Prepares the frames of a sequence for one model, with threads of its own that end with it.
 
-    chosen_cameras: camera -> model camera whose embedding it uses. Other cameras are assigned by viewing direction.
+    Args:
+        chosen_cameras: camera -> model camera whose embedding it uses. Others are assigned by viewing direction.
+        threads: 1 for that of the caller, None for one a processor core.
+        write: writes an image as the network takes it to the top left corner of (3, H, W) zeros of `dtype`. Default:
+            `write_network_image`.
     """
 
-    def __init__(self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        config: ModelConfig,
+        chosen_cameras: Mapping[str, str] | None = None,
+        *,
+        threads: int | None = None,
+        write: WriteImage | None = None,
+        dtype: type[np.generic] = np.float32,
+    ) -> None:
         self.config = config
         self._chosen_cameras = chosen_cameras
+        self._write, self._dtype = write or write_network_image, dtype
         self._of_rig: _OfRig | None = None  # replaced as a whole: frames may be prepared in several threads
         # In sequence, preparing the images takes longer than the model on a GPU.
-        self._threads = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="preprocess")
-        weakref.finalize(self, self._threads.shutdown, wait=False)
+        self._threads: ThreadPoolExecutor | None = None
+        if threads != 1:
+            self._threads = ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="preprocess")
+            weakref.finalize(self, self._threads.shutdown, wait=False)
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
@@ -47,15 +64,19 @@ class Preprocessor:
         width, height = image.padded_size
         # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
         # here, and where it has more threads than there are processors, those of the model no longer spin.
-        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), np.float32)).movedim(-1, 2)
+        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), self._dtype)).movedim(-1, 2)
 
         def write(place: int, name: str) -> None:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
-            write_network_image(pixels, image, out=images[0, place].numpy())
+            self._write(pixels, image, images[0, place].numpy())
 
-        tasks = [self._threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
-        for task in wait(tasks).done:
-            task.result()
+        present = [(place, name) for place, name in enumerate(names) if name in frame.images]
+        if self._threads is None:
+            for place, name in present:
+                write(place, name)
+        else:
+            for task in wait([self._threads.submit(write, *each) for each in present]).done:
+                task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(

@@ -200,7 +200,33 @@ def model_inputs(
     )
 
 
+def joined_inputs(parts: Sequence[ModelInputs]) -> ModelInputs:
+    """The inputs of several batches as one batch. Raises InputError where they have different numbers of cameras."""
+    counts = sorted({part.has_image.shape[1] for part in parts})
+    if len(counts) > 1:
+        raise InputError(
+            f"{counts[0]} and {counts[-1]} cameras cannot go into one batch: use sequences with the same number of "
+            "cameras, or batches of 1"
+        )
+    tensors = {field.name: [getattr(part, field.name) for part in parts] for field in fields(ModelInputs)}
+    images, indices = tensors.pop("images"), tensors.pop("camera_index")
+    same = all(torch.equal(index, indices[0]) for index in indices)
+    rows = [index.expand(len(part.has_image), -1) for index, part in zip(indices, parts, strict=True)]
+    index = indices[0] if same and indices[0].ndim == 1 else torch.cat(rows)
+    return ModelInputs(
+        images=_together(images), camera_index=index, **{name: torch.cat(values) for name, values in tensors.items()}
+    )
+
+
 def _together(images: list[Tensor]) -> Tensor:
-    """Images (1, N, 3, H, W) of several frames, padded with zeros at right and bottom to the largest of them."""
-    height, width = (max(of_frame.shape[axis] for of_frame in images) for axis in (-2, -1))
-    return torch.cat([F.pad(one, (0, width - one.shape[-1], 0, height - one.shape[-2])) for one in images])
+    """Images (B, N, 3, H, W) of several batches, padded with zeros at right and bottom to the largest of them.
+
+    They are joined channels last, as they lie in memory.
+    """
+    height, width = (max(of_batch.shape[axis] for of_batch in images) for axis in (-2, -1))
+
+    def padded(one: Tensor) -> Tensor:
+        missing = (0, width - one.shape[-1], 0, height - one.shape[-2])
+        return (F.pad(one, missing) if any(missing) else one).movedim(2, -1)
+
+    return torch.cat([padded(one) for one in images]).movedim(-1, 2)

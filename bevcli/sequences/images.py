@@ -94,7 +94,9 @@ class ImageReader:
         self._inside = None if inside is None else os.path.realpath(inside)
         self._fitting: set[str] = set()  # cameras that had an image of the calibration's size
         self._videos: dict[str, VideoReader] = {}  # by camera, so that only one thread at a time uses a reader
-        self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
+        # One thread where OpenCV has one, as in a process that makes clips of many drives, all of them open.
+        threads = DECODING_THREADS if cv2.getNumThreads() > 1 else 1
+        self._threads = ThreadPoolExecutor(threads, thread_name_prefix="decode")
 
     def read(
         self, sources: Mapping[str, Source], rig: CameraRig, dropped: Mapping[str, str]

@@ -1,6 +1,7 @@
 """Batches of clips, made ahead of the training: by a thread, or by processes that share no lock with it.
 
-A batch from a process comes through a file in memory or, where that is small, in the folder for temporary files.
+Each process makes one clip at a time, so that all of them work for the first batch. A clip from a process comes through
+a file in memory or, where that is small, in the folder for temporary files.
 """
 
 import mmap
@@ -24,6 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import OutputError
@@ -32,10 +34,10 @@ from bevcli.model.config import ModelConfig
 from bevcli.synth.drives import Drives
 from bevcli.synth.workers import blocked_interrupts
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.samples import Batch, ClipConfig, draw_clips, load_batch
+from bevcli.training.samples import Batch, ClipConfig, draw_clip, joined, load_batch
 
 MEMORY_FOLDER = Path("/dev/shm")  # files in memory, on Linux
-FREE_BATCHES = 16  # for so many, that folder has to have space
+FREE_CLIPS = 64  # for so many, that folder has to have space
 ALIGNMENT = 64  # bytes
 
 
@@ -52,7 +54,7 @@ class BatchMaker:
         rank: of this process among those that train together.
         with_gap: leave out a frame of the clips, see `draw_clips`.
         plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `images_as_bytes`.
+        in_bytes: give images as bytes, see `write_bytes`.
     """
 
     drives: Drives
@@ -65,12 +67,16 @@ class BatchMaker:
     plain: bool
     in_bytes: bool
 
-    def __call__(self, step: int, place: int) -> Batch:
-        """The batch at a place (0 to `clips.in_turn` - 1) of a step. It depends on no other batch."""
-        random = np.random.default_rng([self.seed, step, self.rank, place])
-        clips = draw_clips(self.drives, self.clips, random, with_gap=self.with_gap)
+    def __call__(self, step: int, turn: int) -> Batch:
+        """The batch of a step (0 to `clips.in_turn` - 1 are its turns). It depends on no other batch."""
+        return joined([self.clip(step, turn, place) for place in range(self.clips.batch)])
+
+    def clip(self, step: int, turn: int, place: int) -> Batch:
+        """The clip at a place (0 to `clips.batch` - 1) of that batch. It depends on no other clip."""
+        seed = [self.seed, step, self.rank, turn]
+        clip, random = draw_clip(self.drives, self.clips, seed, place, with_gap=self.with_gap)
         return load_batch(
-            self.drives, clips, self.model, self.augmentation, random,
+            self.drives, [clip], self.model, self.augmentation, random,
             learn_all=self.clips.learn == "all", plain=self.plain, in_bytes=self.in_bytes,
         )  # fmt: skip
 
@@ -78,12 +84,13 @@ class BatchMaker:
 def loaded_batches(
     maker: BatchMaker, places: Iterable[tuple[int, int]], loaders: int, *, pin: bool = False
 ) -> Generator[Batch]:
-    """The batches at these places (step, place), in order, made ahead by `loaders`: one thread, or several processes.
+    """The batches at these places (step, turn), in order, made ahead by `loaders`: one thread, or several processes.
 
     pin: copy them to memory that a GPU reads by itself. Close the generator to end the processes.
     Raises what making a batch raises, and OutputError where a process ends early.
     """
-    depth = max(loaders, maker.clips.in_turn)
+    count = maker.clips.batch
+    depth = max(maker.clips.in_turn, -(-2 * loaders // count))  # two clips a process are waiting
     if loaders == 1:
         yield from read_ahead(lambda place: maker(*place), places, depth)
         return
@@ -95,12 +102,13 @@ def loaded_batches(
 
     def load(place: tuple[int, int]) -> Batch:
         try:
-            packed = pool.submit(_make_packed, place).result()
+            packed = [pool.submit(_make_packed, (*place, index)) for index in range(count)]
+            clips = [clip.result().unpack() for clip in packed]
         except BrokenProcessPool:
             raise OutputError(
                 "a process that makes batches ended early (out of memory?): use fewer `loaders`"
             ) from None
-        batch = packed.unpack()
+        batch = joined(clips)
         return batch.pinned() if pin else batch
 
     try:
@@ -115,7 +123,7 @@ def loaded_batches(
         _remove(folders)
 
 
-_loader: tuple[BatchMaker, tuple[Path, ...]]  # of a process that makes batches
+_loader: tuple[BatchMaker, tuple[Path, ...]]  # of a process that makes clips
 
 
 def _remove(folders: Iterable[Path]) -> None:
@@ -141,12 +149,12 @@ def _start_loader(maker: BatchMaker, line: Connection, folders: tuple[Path, ...]
 
 @dataclass(frozen=True)
 class _Packed:
-    """A batch in a file.
+    """A clip in a file.
 
     Attributes:
         path: of the file, which holds the contents of all arrays.
         ends: where each begins and ends in the file.
-        rest: the batch without them, pickled.
+        rest: the clip without them, pickled.
     """
 
     path: Path
@@ -154,7 +162,7 @@ class _Packed:
     rest: bytes
 
     def unpack(self) -> Batch:
-        """The batch; its tensors are views of the file, which loses its name."""
+        """The clip; its tensors are views of the file, which loses its name."""
         with open(self.path, "r+b") as file:
             contents = memoryview(mmap.mmap(file.fileno(), 0))
         self.path.unlink()
@@ -162,12 +170,13 @@ class _Packed:
         return batch
 
 
-def _make_packed(place: tuple[int, int]) -> _Packed:
+def _make_packed(place: tuple[int, int, int]) -> _Packed:
+    """place: step, turn, and place in the batch."""
     maker, folders = _loader
     arrays: list[pickle.PickleBuffer] = []
     rest = BytesIO()
-    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker(*place))
-    needed = FREE_BATCHES * sum(array.raw().nbytes for array in arrays)
+    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker.clip(*place))
+    needed = FREE_CLIPS * sum(array.raw().nbytes for array in arrays)
     roomy = (folder for folder in folders if shutil.disk_usage(folder).free >= needed)
     path, ends = next(roomy, folders[-1]) / "-".join(map(str, place)), []
     with open(path, "wb") as file:
@@ -185,5 +194,11 @@ class _Pickler(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, Tensor):
-            return torch.from_numpy, (value.contiguous().numpy(),)
+            strides = value.stride()
+            order = sorted(range(value.ndim), key=lambda axis: -strides[axis])  # as it lies in memory
+            return _from_array, (value.permute(order).contiguous().numpy(), order)
         return NotImplemented
+
+
+def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
+    return torch.from_numpy(array).permute(np.argsort(order).tolist())

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from bevcli.config import load_config
+from bevcli.config import TRAINING, load_config
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -30,6 +30,8 @@ from bevcli.training.trainer import Trainer
 from bevcli.writing import write_whole
 
 LONGEST_S = 10.0  # of the measurement of the cost; an update that takes longer is still finished
+MEMORY_SHARE = 0.7  # of a GPU's memory, that a batch may take
+LARGEST_BATCH = 32  # clips; more keep no GPU busier
 
 
 def write_model_file(
@@ -53,15 +55,35 @@ def write_model_file(
     facts = look_at(_open_drives(data), load_config(PRESETS[preset][0]).bev_frame)
     table = model_table(name, preset, facts)
     lines = [f"Model {name} for {len(facts.drives)} drives, preset {preset}.", *_facts_lines(facts, table)]
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / "model.toml"
-        trial.write_text(_toml(table), encoding="utf-8")
-        job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
-        cost = measure_cost(job, longest_s)
+    cost = _cost_of(table, device, data, longest_s)
+    if device.type == "cuda":
+        clips, card_bytes = cost.config.clips, torch.cuda.get_device_properties(device).total_memory
+        most = min(LARGEST_BATCH, facts.frames // clips.frames)
+        batch = fitting_batch(clips.batch, cost.memory_bytes, card_bytes, most)
+        if batch > clips.batch:
+            table[TRAINING]["clips"]["batch"] = batch
+            cost = _cost_of(table, device, data, longest_s)
     lines += [f"Cost, measured on this machine: {cost}.", f"In this file {cost.config.clips}."]
     text = "\n".join([*(f"# {line}" for line in lines), _toml(table)])
     write_whole(path, text.encode(), parents=True)
     return lines
+
+
+def _cost_of(table: Mapping[str, Any], device: torch.device, data: DriveOptions, longest_s: float) -> "Cost":
+    """The cost of the training of a model's file with these contents."""
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / "model.toml"
+        trial.write_text(_toml(table), encoding="utf-8")
+        job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
+        return measure_cost(job, longest_s)
+
+
+def fitting_batch(batch: int, used_bytes: int, card_bytes: int, most: int) -> int:
+    """The clips of a batch that fill a card, at least `batch`, which used so much memory, and else at most `most`.
+
+    The memory of a clip is overestimated by its share of the memory that does not depend on the batch.
+    """
+    return max(batch, min(most, int(MEMORY_SHARE * card_bytes * batch / used_bytes)))
 
 
 def _open_drives(data: DriveOptions) -> list[Sequence]:
@@ -127,15 +149,13 @@ class Cost:
     Attributes:
         config: its settings.
         machine: the device, in words.
-        loaders: processes or threads that make batches.
         update_s: time of an update of the weights, while another thread reads the next batch.
-        reading_s: time until the first batch was read, at most.
+        reading_s: time until the first batch was read, at most; 0 where processes read, for which `update_s` waits.
         memory_bytes: the largest memory, of the process or of a GPU.
     """
 
     config: TrainingConfig
     machine: str
-    loaders: int
     update_s: float
     reading_s: float
     memory_bytes: int
@@ -144,7 +164,7 @@ class Cost:
     def step_s(self) -> float:
         """Time of a step: of its updates, or of reading its batches where this takes longer."""
         clips = self.config.clips
-        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s / self.loaders)
+        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s)
 
     def __str__(self) -> str:
         """The cost on one line."""
@@ -178,5 +198,5 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
         Trainer(replace(job, config=config)).run(after_update=after_update)
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
-    reading_s = max(spans[0] - update_s, 0.0)
-    return Cost(job.config, machine, job.loaders, update_s, reading_s, peak_memory(job.device))
+    reading_s = max(spans[0] - update_s, 0.0) if job.loaders == 1 else 0.0  # processes take seconds to start
+    return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))

@@ -5,7 +5,7 @@ As in the paper, the last frame of a clip is trained on; the others are its hist
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Sequence as Items
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,17 +17,17 @@ from torch import Tensor
 from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.transforms import inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, model_inputs
+from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, joined_inputs, model_inputs
 from bevcli.model.upload import pinned, upload
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
 from bevcli.training.frame_truth import frame_truth
-from bevcli.training.pixels import images_as_bytes, images_from_bytes
+from bevcli.training.pixels import images_from_bytes, write_bytes
 from bevcli.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
@@ -90,21 +90,26 @@ class Clip:
     frames: tuple[int, ...]
 
 
-def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, *, with_gap: bool = True) -> list[Clip]:
-    """The clips of one batch, all of the same length. Raises InputError if a drive is too short.
+def draw_clip(
+    drives: Drives, config: ClipConfig, seed: Items[int], place: int, *, with_gap: bool = True
+) -> tuple[Clip, np.random.Generator]:
+    """The clip at a place of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
 
-    with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
+    It depends on no other clip, but all clips of a batch have the same length, and images that fit into one batch.
+
+    Args:
+        seed: of the batch.
+        with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
     """
+    of_batch, random = np.random.default_rng(seed), np.random.default_rng([*seed, place + 1])
     frames = config.frames
-    if frames > 1 and random.random() < config.short_share:
-        frames = int(random.integers(1, frames))
-    clips: list[Clip] = []
-    shapes, leave_out = drives.input_shapes, with_gap and config.learn == "last"
-    for _ in range(config.batch):
-        alike = range(len(drives)) if not clips or shapes is None else _similar_drives(shapes, clips[0].drive)
-        drive = int(alike[random.integers(len(alike))])
-        clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)))
-    return clips
+    if frames > 1 and of_batch.random() < config.short_share:
+        frames = int(of_batch.integers(1, frames))
+    first, shapes = int(of_batch.integers(len(drives))), drives.input_shapes
+    alike = range(len(drives)) if shapes is None else _similar_drives(shapes, first)
+    drive = int(alike[random.integers(len(alike))]) if place else first
+    leave_out = with_gap and config.learn == "last"
+    return Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)), random
 
 
 def _similar_drives(shapes: tuple[InputShape, ...], drive: int) -> NDArray[np.intp]:
@@ -168,9 +173,8 @@ class Targets:
             tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
             return replace(part, **{name: change(x) for name, x in tensors.items()})
 
-        parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
-        moved: dict[str, Any] = {name: None if part is None else changed(part) for name, part in parts.items()}
-        return replace(self, **moved)
+        masks = None if self.segmentation is None else changed(self.segmentation)
+        return Targets(changed(self.detection), changed(self.perspective), masks, self.truths)
 
 
 @dataclass(frozen=True)
@@ -225,25 +229,64 @@ def load_batch(
     Args:
         learn_all: give targets for every frame, not for the last one only.
         plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `images_as_bytes`.
+        in_bytes: give images as bytes, see `write_bytes`.
 
     Raises InputError where a frame to train on has no ground truth.
     """
-    loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
-    frames = _prepared((augmented(of_clip, augmentation, random) for of_clip in loaded), config, in_bytes)
-    inputs = _inputs(frames, config)
+    return joined(
+        [_load_clip(drives, clip, config, augmentation, random, learn_all, plain, in_bytes) for clip in clips]
+    )
+
+
+def _load_clip(
+    drives: Drives,
+    clip: Clip,
+    config: ModelConfig,
+    augmentation: AugmentationConfig,
+    random: np.random.Generator,
+    learn_all: bool,
+    plain: bool,
+    in_bytes: bool,
+) -> Batch:
+    drive = drives.open(clip.drive)
+    loaded = [drive.load(index) for index in clip.frames]
+    shown = augmented(loaded, augmentation, random)
+    changed = augmentation.grid_mask > 0 or any(one is not before for one, before in zip(shown, loaded, strict=True))
+    prepared = _prepared(shown, config, in_bytes)
+    inputs = _inputs(prepared, config)
     for step in inputs:
         mask_images(step.images, augmentation.grid_mask, random)
-    learned = range(len(frames)) if learn_all else [len(frames) - 1]
-    poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev for one in prepared] for prepared in frames]
+    poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev] for one in prepared]
     world_from_bev = torch.from_numpy(np.array(poses))
-    targets = []
-    for index in learned:
-        of_clips = [one.frame for one in frames[index]]
-        places = [(drives.open(clip.drive), clip.frames[index]) for clip in clips]
-        targets.append(_targets(of_clips, places, config))
-    shown = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
-    return Batch(inputs, world_from_bev, tuple(targets), shown)
+    learned = slice(None) if learn_all else slice(-1, None)
+    places = list(zip(prepared, clip.frames, strict=True))[learned]
+    targets = tuple(_targets(one.frame, drive, index, config) for one, index in places)
+    before: Batch | None = None
+    if plain:
+        unchanged = _inputs(_prepared(loaded, config, in_bytes), config) if changed else inputs
+        before = Batch(unchanged, world_from_bev, ())
+    return Batch(inputs, world_from_bev, targets, before)
+
+
+def joined(batches: Items[Batch]) -> Batch:
+    """Batches with as many frames and cameras as one batch. Raises InputError where their cameras differ in number."""
+    if len(batches) == 1:
+        return batches[0]
+    inputs = tuple(joined_inputs(steps) for steps in zip(*(batch.inputs for batch in batches), strict=True))
+    targets = tuple(_joined_targets(steps) for steps in zip(*(batch.targets for batch in batches), strict=True))
+    plain = [batch.plain for batch in batches if batch.plain is not None]
+    world_from_bev = torch.cat([batch.world_from_bev for batch in batches], dim=1)
+    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None)
+
+
+def _joined_targets(parts: Items[Targets]) -> Targets:
+    masks = [one.segmentation[frame] for one in parts if one.segmentation for frame in range(len(one.segmentation))]
+    return Targets(
+        padded([one.detection[frame] for one in parts for frame in range(len(one.detection))]),
+        padded([one.perspective[frame] for one in parts for frame in range(len(one.perspective))]),
+        padded_masks(masks) if masks else None,
+        tuple(truth for one in parts for truth in one.truths),
+    )
 
 
 def ground_truth_boxes(frame: Frame) -> Boxes3D:
@@ -256,33 +299,22 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: ModelConfig) -> Targets:
-    """places: the drive and the place in it of each frame."""
-    boxes = [ground_truth_boxes(frame) for frame in frames]
-    detection = padded([detection_targets(of_frame, config) for of_frame in boxes])
-    perspective = padded([box_targets(of_frame, config.classes) for of_frame in boxes])
-    truths: tuple[FrameTruth, ...] = ()
-    if config.results:
-        truths = tuple(frame_truth(frame, *place, config) for frame, place in zip(frames, places, strict=True))
+def _targets(frame: Frame, drive: Sequence, place: int, config: ModelConfig) -> Targets:
+    """place: of the frame in the drive."""
+    boxes = ground_truth_boxes(frame)
+    detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
+    truths = (frame_truth(frame, drive, place, config),) if config.results else ()
     if "segmentation" not in config.heads:
         return Targets(detection, perspective, None, truths)
-    maps = [frame.ground_truth_map for frame in frames]
-    grid, classes = config.bev_grid, config.object_classes
-    segmentation = [segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True)]
-    return Targets(detection, perspective, padded_masks(segmentation), truths)
+    masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
+    return Targets(detection, perspective, padded_masks([masks]), truths)
 
 
-def _prepared(clips: Iterable[list[Frame]], config: ModelConfig, in_bytes: bool) -> list[tuple[PreparedFrame, ...]]:
-    """For each frame of the clips, that of every clip."""
-
-    def prepared(clip: list[Frame]) -> Iterator[PreparedFrame]:
-        for frame in map(Preprocessor(config), clip):
-            yield replace(frame, images=images_as_bytes(frame.images, config.image)) if in_bytes else frame
-
-    return list(zip(*([*prepared(clip)] for clip in clips), strict=True))
+def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
+    written: dict[str, Any] = {"write": write_bytes, "dtype": np.uint8} if in_bytes else {}
+    return [*map(Preprocessor(config, threads=1, **written), clip)]
 
 
-def _inputs(frames: list[tuple[PreparedFrame, ...]], config: ModelConfig) -> tuple[ModelInputs, ...]:
-    poses: list[list[Pose | None]] = [[None] * len(frames[0])]
-    poses += [[one.frame.world_from_ego for one in prepared] for prepared in frames[:-1]]
-    return tuple(model_inputs(prepared, before, config) for prepared, before in zip(frames, poses, strict=True))
+def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
+    poses = [None, *(one.frame.world_from_ego for one in frames[:-1])]
+    return tuple(model_inputs([one], [pose], config) for one, pose in zip(frames, poses, strict=True))

@@ -112,8 +112,8 @@ def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     cells = bev_map.cells[::-1][rows[:, None], columns]  # the map's rows start at the largest y
     sampled = replace(bev_map, cells=cells)
     layers = np.stack([sampled.layer(name) for name in STUFF_CLASSES]).view(np.uint8)
-    counts = layers.reshape(-1, SAMPLES).sum(1, dtype=np.uint8).reshape(len(layers), grid.rows, SAMPLES, grid.columns)
-    shares = counts.sum(2, dtype=np.int64) / SAMPLES**2
+    counts = layers.reshape(len(layers), grid.rows, SAMPLES, -1).sum(2, dtype=np.uint8)  # whole rows: fast
+    shares = counts.reshape(len(layers), grid.rows, grid.columns, SAMPLES).sum(3, dtype=np.int64) / SAMPLES**2
     min_shares = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
     return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
 

@@ -224,8 +224,8 @@ class Trainer:
         """
         job, config = self.job, self.job.config
         remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
-        places = product(remaining, range(config.clips.in_turn))
-        loaded = loaded_batches(self.maker, places, job.loaders, pin=gpu)
+        turns = product(remaining, range(config.clips.in_turn))
+        loaded = loaded_batches(self.maker, turns, job.loaders, pin=gpu)
         with contextlib.closing(loaded) as batches, rounded_products(gpu):
             self._run(batches, after_step, after_validation, stop, after_update)
         job.model.eval()

@@ -9,7 +9,7 @@ import pytest
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.training.samples import ClipConfig, draw_clips, draw_frames
+from bevcli.training.samples import Clip, ClipConfig, draw_clip, draw_frames
 
 
 class Drives:
@@ -32,6 +32,11 @@ def drawn(sequence: MemorySequence, frames: int, times: int = 200) -> Counter[tu
     return Counter(draw_frames(sequence, frames, random) for _ in range(times))
 
 
+def clips_of(drives: Drives, config: ClipConfig, seed: int = 0) -> list[Clip]:
+    """The clips of one batch."""
+    return [draw_clip(drives, config, [seed], place)[0] for place in range(config.batch)]
+
+
 def test_one_earlier_frame_is_left_out_and_the_order_is_kept() -> None:
     expected = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}  # frame 1 has one frame before it, the others two
     assert set(drawn(MemorySequence(4), frames=2)) == expected
@@ -39,9 +44,8 @@ def test_one_earlier_frame_is_left_out_and_the_order_is_kept() -> None:
 
 
 def test_clips_trained_on_as_a_whole_have_no_gap() -> None:
-    random = np.random.default_rng(0)
     config = ClipConfig(frames=3, batch=50, short_share=0.0, learn="all")
-    found = {clip.frames for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
+    found = {clip.frames for clip in clips_of(Drives(MemorySequence(5)), config)}
     assert found == {(0, 1, 2), (1, 2, 3), (2, 3, 4)}
 
 
@@ -59,9 +63,9 @@ def test_a_drive_too_short_for_a_clip_is_rejected() -> None:
 
 
 def test_clips_of_a_batch_have_one_length_and_some_are_short() -> None:
-    random, lengths = np.random.default_rng(0), Counter()
-    for _ in range(300):
-        clips = draw_clips(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), random)
+    lengths = Counter()
+    for seed in range(300):
+        clips = clips_of(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), seed)
         assert len({len(clip.frames) for clip in clips}) == 1
         lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
@@ -69,10 +73,10 @@ def test_clips_of_a_batch_have_one_length_and_some_are_short() -> None:
 
 
 def test_clips_of_a_batch_share_camera_count_and_image_sizes() -> None:
-    drives, random = Drives(MemorySequence(5), 40), np.random.default_rng(0)
+    drives = Drives(MemorySequence(5), 40)
     sizes = [(4 + index % 2, 96 + 32 * (index // 2), 160) for index in range(40)]
     drives.input_shapes = tuple(sizes)
-    for _ in range(50):
-        shapes = [sizes[clip.drive] for clip in draw_clips(drives, ClipConfig(frames=2, batch=4), random)]
+    for seed in range(50):
+        shapes = [sizes[clip.drive] for clip in clips_of(drives, ClipConfig(frames=2, batch=4), seed)]
         assert len({cameras for cameras, _, _ in shapes}) == 1
         assert max(height for _, height, _ in shapes) - min(height for _, height, _ in shapes) <= 8 * 32

@@ -18,7 +18,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, cla
 from bevcli.model.config import BevFrameConfig
 from bevcli.synth.options import DriveOptions
 from bevcli.training.job import TrainingConfig
-from bevcli.training.model_file import Cost, _toml, write_model_file
+from bevcli.training.model_file import Cost, _toml, fitting_batch, write_model_file
 from bevcli.training.presets import PRESETS, look_at, model_table
 from bevcli.training.samples import ClipConfig
 
@@ -103,9 +103,17 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
 
 
 def test_a_step_costs_its_updates_or_the_reading_of_its_batches() -> None:
-    config = TrainingConfig(steps=10, loaders=2, clips=ClipConfig(frames=4, learn="all", in_turn=2))
+    config = TrainingConfig(steps=10, clips=ClipConfig(frames=4, learn="all", in_turn=2))
     assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0
-    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 6.0
+    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 12.0
+
+
+def test_a_batch_fills_the_card_but_never_shrinks() -> None:
+    gigabytes = 10**9
+    assert fitting_batch(4, 7 * gigabytes, 20 * gigabytes, 32) == 8
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 32) == 32
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 3) == 4
+    assert fitting_batch(1, 7 * gigabytes, 8 * gigabytes, 32) == 1
 
 
 def test_a_class_is_like_that_of_the_nearest_size() -> None:

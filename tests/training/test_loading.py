@@ -1,0 +1,113 @@
+"""Batches are the same whoever makes them, clip by clip, and images travel as bytes without a loss that matters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from painted_drives import CONFIG, PaintedDrives
+from torch import Tensor
+
+from bevcli.inference.preprocess import write_network_image
+from bevcli.model.config import ImageConfig
+from bevcli.training.augmentation import AugmentationConfig, noisy
+from bevcli.training.loading import BatchMaker, loaded_batches
+from bevcli.training.pixels import images_from_bytes, write_bytes
+from bevcli.training.samples import ClipConfig
+
+NOTHING, NOISE = AugmentationConfig(0, 0), AugmentationConfig(0.5, 0.5, exposure=1.0, noise=6.0, calibration_share=0.5)
+LITE = ImageConfig((64, 48), mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), color_order="rgb")
+CLIPS = ClipConfig(frames=2, batch=3, learn="all", short_share=0.0)
+
+
+def maker(augmentation: AugmentationConfig = NOISE, *, in_bytes: bool = False) -> BatchMaker:
+    drives = PaintedDrives(3, all_labelled=True)
+    return BatchMaker(drives, CONFIG, CLIPS, augmentation, 0, 0, with_gap=False, plain=True, in_bytes=in_bytes)
+
+
+def tensors(part: Any) -> Iterator[Tensor]:
+    """All tensors of a batch, in a fixed order."""
+    if isinstance(part, Tensor):
+        yield part
+    elif isinstance(part, tuple):
+        for one in part:
+            yield from tensors(one)
+    elif hasattr(part, "__dataclass_fields__"):
+        yield from tensors(tuple(vars(part).values()))
+
+
+def assert_equal(one: Any, other: Any) -> None:
+    pairs = list(zip(tensors(one), tensors(other), strict=True))
+    assert len(pairs) > 10
+    assert all(a.dtype == b.dtype and a.shape == b.shape for a, b in pairs)
+    assert all(np.array_equal(a.numpy(), b.numpy(), equal_nan=a.is_floating_point()) for a, b in pairs)
+
+
+def test_batches_are_equal_for_any_number_of_loaders() -> None:
+    turns, made = [(0, 0), (1, 0), (2, 0)], maker(in_bytes=True)
+    for loaders in (1, 2):
+        with closing(loaded_batches(made, turns, loaders)) as batches:
+            for turn, batch in zip(turns, batches, strict=True):
+                assert batch.inputs[0].images.dtype == torch.uint8
+                assert_equal(batch, made(*turn))
+
+
+def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:
+    batch, made = maker()(4, 0), maker()
+    for place in range(CLIPS.batch):
+        clip = made.clip(4, 0, place)
+        for alone, together in zip(clip.inputs, batch.inputs, strict=True):
+            assert torch.equal(alone.images[0], together.images[place])
+            assert torch.equal(alone.image_from_bev[0], together.image_from_bev[place])
+        for own, of_batch in zip(clip.targets, batch.targets, strict=True):
+            assert torch.equal(own.detection[0].labels, of_batch.detection[place].labels)
+
+
+def test_unchanged_clips_are_prepared_once_for_the_teacher() -> None:
+    unchanged, changed = maker(NOTHING).clip(0, 0, 0), maker().clip(0, 0, 0)
+    assert unchanged.plain is not None
+    assert changed.plain is not None
+    assert unchanged.plain.inputs is unchanged.inputs
+    assert not torch.equal(changed.plain.inputs[0].images, changed.inputs[0].images)
+
+
+@pytest.mark.parametrize(
+    ("size", "changes"),
+    [
+        ((64, 48), {}),
+        ((64, 48), {"color_order": "bgr", "crop": (0, 0, 60, 40)}),
+        ((64, 40), {}),  # fits with a margin below
+        ((160, 96), {"resize": "area"}),
+        ((50, 40), {"crop": (3, 5, 60, 45)}),
+    ],
+)
+def test_images_as_bytes_are_the_normalised_ones_rounded(size: tuple[int, int], changes: dict[str, Any]) -> None:
+    image = replace(LITE, size=(64, 48), pad_divisor=32, **changes)
+    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    width, height = image.padded_size
+    floats, in_bytes = (np.zeros((height, width, 3), dtype).transpose(2, 0, 1) for dtype in (np.float32, np.uint8))
+    write_network_image(pixels, image, floats)
+    write_bytes(pixels, image, in_bytes)
+    assert not in_bytes[floats == 0].any()
+    back = images_from_bytes(torch.from_numpy(in_bytes)[None, None], image)[0, 0].numpy()
+    errors = np.abs(back - floats) * np.array(image.std)[:, None, None]
+    assert errors.max() <= 0.501
+    if size[0] == image.size[0]:  # not resized
+        assert errors[floats != 0].max() < 1e-4
+
+
+def test_noise_is_normal_and_independent() -> None:
+    grey, random = np.full((200, 301, 3), 100, np.uint8), np.random.default_rng(0)
+    one, other = (noisy(grey, 5.0, random).astype(np.float64) - 100 for _ in range(2))
+    assert abs(one.mean()) < 0.05
+    assert one.std() == pytest.approx(5.0, rel=0.01)
+    flat = one.reshape(-1)
+    for shifted in (other.reshape(-1), *(np.roll(flat, step) for step in range(1, 7))):
+        assert abs(np.corrcoef(flat, shifted)[0, 1]) < 0.01
+    assert np.mean(np.abs(flat) > 10) == pytest.approx(0.0357, abs=0.01)  # beyond 10.5: 2.1 deviations
+    assert noisy(np.full((9, 9, 3), 255, np.uint8), 50.0, random).max() == 255
