@@ -18,6 +18,7 @@ import msgspec
 
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
+from bevcli.printing import counted
 from bevcli.writing import output_errors
 
 STALL_S, STALL_BYTES = 20, 4096  # a transfer that is slower than so many bytes in a second, for so long, is cut
@@ -113,7 +114,9 @@ class _Download:
             if failed >= ATTEMPTS or time.monotonic() + PAUSE_S * failed >= end:
                 is_kept = self._usable_part() is not None
                 kept = f"{self.done:,} bytes are kept: the same command goes on from there" if is_kept else "try later"
-                raise WeightsError(f"{self.url}: the download broke off {attempts} times ({problem}); {kept}")
+                raise WeightsError(
+                    f"{self.url}: the download broke off {counted(attempts, 'times')} ({problem}); {kept}"
+                )
             time.sleep(PAUSE_S * failed)
 
     def _attempt(self, seconds: float) -> None:
