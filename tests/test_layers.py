@@ -12,7 +12,7 @@ from source_code import ROOT, trees
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"_version", "findings", "printing"},
-    {"errors"},
+    {"errors", "registered"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},
     {"published"},

@@ -163,7 +163,7 @@ def load_exported(file: Path, engine: str, threads: int | None = None) -> Export
 
     Args:
         file: of `bevcli export-onnx` or `bevcli quantize`.
-        engine: the program that runs it, an entry point of `bevcli.engines`.
+        engine: the program that runs it, a name of `bevcli.engines`.
         threads: that it uses; None takes PyTorch's number.
 
     Raises:
