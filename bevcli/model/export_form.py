@@ -87,9 +87,9 @@ def camera_ports(
     left, top, right, bottom = image.crop_box
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
     cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
-    levels = ", their grey levels moved as by bevcli.inference.auto_levels" if image.auto_levels else ""
-    levels += ", fog removed as by bevcli.inference.defog" if image.defog else ""
-    levels += ", strong noise smoothed as by bevcli.inference.denoise" if image.denoise else ""
+    levels = ", their grey levels moved as by bevcli.inference.image_repair.auto_levels" if image.auto_levels else ""
+    levels += ", fog removed as by bevcli.inference.image_repair.defogged" if image.defog else ""
+    levels += ", strong noise smoothed as by bevcli.inference.image_repair.denoised" if image.denoise else ""
     level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
     return (
