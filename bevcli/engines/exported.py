@@ -12,7 +12,7 @@ from torch import Tensor
 from bevcli.config import config_of_table
 from bevcli.engines.engine import Engine
 from bevcli.errors import WeightsError
-from bevcli.frame import FrameResult
+from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import SegmentationOutputs
@@ -120,6 +120,9 @@ class ExportedModel(TemporalModel):
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
         return self.kind.decode_boxes(self, outputs)
+
+    def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
+        return self.kind.decode_map(self, outputs)
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         return self.kind.decode_results(self, outputs)

@@ -73,6 +73,13 @@ def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
     assert model.prepared is model.network
 
 
+@pytest.mark.parametrize("decoder", ["decode_boxes", "decode_map", "decode_results"])
+def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, decoder, monkeypatch):
+    exported, decoded = load_exported(small_file, "onnxruntime"), object()
+    monkeypatch.setattr(exported.kind, decoder, lambda model, outputs: (model, outputs, decoded))
+    assert getattr(exported, decoder)("outputs") == (exported, "outputs", decoded)
+
+
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
 def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"
