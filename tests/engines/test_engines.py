@@ -257,7 +257,7 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
 def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command("export-onnx", "--model", "demo")
-    command("quantize", "demo.onnx", "--calibrate", str(STREET), "--count", "4", "--check", str(STREET))
+    command("quantize", "demo.onnx", "--int8-drive", str(STREET), "--count", "4", "--check", str(STREET))
     expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
     for engine in entries("bevcli.engines"):
         command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)
