@@ -15,6 +15,7 @@ from bevcli.errors import WeightsError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.config import ModelConfig
+from bevcli.model.export_form import pixels_of
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
@@ -77,6 +78,7 @@ class ExportedModel(TemporalModel):
     """
 
     stages: Mapping[str, str] = {"engine": "engine"}
+    takes_pixels = True
     device = torch.device("cpu")
     digest: Tensor
 
@@ -114,6 +116,8 @@ class ExportedModel(TemporalModel):
                 f"{self.file}: takes {counted(self.cameras, 'cameras')}, but the sequence has {count}: "
                 f"use `bevcli export-onnx --cameras {count}`"
             )
+        if not prepared.pixels:  # prepared for the model itself, with which the file is compared
+            prepared = replace(prepared, images=pixels_of(prepared.images, self.config.image), pixels=True)
         found = self.outputs_by_name(self.form.feed(prepared, memory))
         return self(found), self.form.memory(prepared, memory, found)
 
