@@ -1,4 +1,4 @@
-"""What bevcli itself has: models, formats, engines and commands, by name; each is imported when it is used.
+"""Names of bevcli's own models, formats, engines and commands; each is imported when it is used.
 
 Packages of others add theirs by entry points (`registry.py`, docs/extend.md).
 """

@@ -77,7 +77,7 @@ class Runner:
         self.clock = StageClock(model, device, model.stages)
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
-        """What prepares frames for this model. cameras: see `Preprocessor`."""
+        """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
         return Preprocessor(self.config, cameras, pixels=self.model.takes_pixels)
 
     def step(
