@@ -351,9 +351,9 @@ class Prediction:
             where the frame has no image or its numbers are not finite.
         started_anew: the reason why no history was used; None where it was used.
         camera_embeddings: camera of the rig -> camera of the model whose embedding it took, in the model's order.
-        skipped: whether the frame has no image at all: no boxes, and the state was passed on.
+        skipped: whether the frame has no image at all: no boxes, and the history is kept.
         not_finite: the part of the model where numbers became NaN or infinite, such as "encoder layer 3 (…)": the frame
-            has no boxes, and the state was reset. "" where all numbers are finite.
+            has no boxes, and the history starts anew. "" where all numbers are finite.
         segmentation: the map of the segmentation head, None without one.
         attention: what the attentions sampled, where this was asked for.
         stage_seconds: stage of the pipeline -> seconds, in the order of execution.
@@ -374,6 +374,13 @@ class Prediction:
     attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     results: tuple[FrameResult, ...] = ()
+
+    @property
+    def failure(self) -> str:
+        """The reason why the model found nothing in the frame, and what becomes of the history; "" where it ran."""
+        if self.skipped:
+            return "no camera has an image; the model was not run, the history is kept"
+        return f"NaN or infinity in {self.not_finite}; no boxes, the history starts anew" if self.not_finite else ""
 
     @property
     def ground(self) -> "Ground":

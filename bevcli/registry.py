@@ -1,50 +1,37 @@
-"""Models, formats, engines and commands, found through entry points; our own are registered in pyproject.toml too.
+"""Models, formats, engines and commands by name: bevcli's own (`registered.py`), and those of other packages.
 
-An installed package adds one by an entry point of a group below (docs/extend.md). Nothing is imported before it is
-used.
+An installed package adds one by an entry point of a group (docs/extend.md). Nothing is imported before it is used.
 """
 
 from functools import cache
 from importlib import resources
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from bevcli.errors import BevcliError, InputError
-
-Group = Literal[
-    "bevcli.models",
-    "bevcli.sequences",
-    "bevcli.label_formats",
-    "bevcli.drive_writers",
-    "bevcli.box_formats",
-    "bevcli.engines",
-    "bevcli.commands",
-]
+from bevcli.registered import OWN, Group
 
 
 @cache
 def entries(group: Group) -> dict[str, EntryPoint]:
-    """The entry points of a group by name, in the order of their names.
-
-    Raises BevcliError where two packages register the same name, or where bevcli's own are missing.
-    """
-    found: dict[str, EntryPoint] = {}
-    for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
+    """The entries of a group by name, in the order of their names. Raises BevcliError where two have the same name."""
+    found = {name: EntryPoint(name, value, group) for name, value in OWN[group].items()}
+    for entry in entry_points(group=group):
+        if entry.value.startswith("bevcli."):  # of an earlier version, which an editable install may still list
+            continue
         other = found.setdefault(entry.name, entry)
         if other.value != entry.value:
             raise BevcliError(
                 f'entry point {group}: two packages register "{entry.name}": {other.value} and {entry.value}: '
                 "uninstall one of them"
             )
-    if not found:
-        raise BevcliError(f"entry point {group}: none is installed: install bevcli again (pip install bevcli)")
-    return found
+    return dict(sorted(found.items()))
 
 
 @cache
 def load(group: Group, name: str) -> Any:
-    """The object of an entry point. Raises BevcliError for an unknown name, or for one that cannot be imported."""
+    """The object of an entry. Raises BevcliError for an unknown name, or for one that cannot be imported."""
     known = entries(group)
     if name not in known:
         raise BevcliError(f'entry point {group}: "{name}" is unknown (expected {", ".join(known)})')

@@ -5,14 +5,19 @@ Tests have short names.
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
+from typing import get_args
 
 from source_code import ROOT, trees
+
+import bevcli
+from bevcli.registered import Group
 
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"_version", "findings", "printing"},
-    {"errors"},
+    {"errors", "registered"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},
     {"published"},
@@ -99,6 +104,40 @@ def test_no_function_has_more_than_10_parameters() -> None:
             compiled = any("jit" in ast.unparse(each) for each in function.decorator_list)  # kernels, which take arrays
             if len(set(names) - {"self", "cls"}) > 10 and not compiled and "kernels" not in module:
                 wrong.append(f"{module}.{function.name}: {len(names)}")
+    assert not wrong
+
+
+NAMED = re.compile(r"(?<![\w.-])bevcli(?:\.[A-Za-z_]\w*)+")
+
+
+def exists(name: str) -> bool:
+    """True for a module, a public name, an attribute that a module defines, or a group of the registry."""
+    module, _, attribute = name.rpartition(".")
+    return (
+        name in FILES
+        or name in get_args(Group)
+        or name in {f"bevcli.{each}" for each in bevcli.__all__}
+        or attribute in defined(module)
+    )
+
+
+@cache
+def defined(module: str) -> set[str]:
+    """The functions, classes and constants of a module; nothing of one that does not exist."""
+    nodes = ast.walk(trees()[FILES[module]]) if module in FILES else ()
+    return {getattr(node, "name", None) or getattr(node, "id", "") for node in nodes}
+
+
+def test_modules_and_names_that_texts_state_exist() -> None:
+    """Such as those in docstrings, and in the metadata of exported files."""
+    assert exists("bevcli.engines.engine.Engine")
+    assert not exists("bevcli.inference.defog")
+    wrong = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in FILES.values()
+        for name in NAMED.findall(path.read_text())
+        if not exists(name)
+    ]
     assert not wrong
 
 

@@ -1,12 +1,15 @@
-"""The registry: bevcli's own entries can be imported, and what is wrong with another package's is one clear line."""
+"""The registry: bevcli's own entries need no installation, and a fault of another package's is one clear line."""
 
+import tomllib
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from bevcli import registry
 from bevcli.errors import BevcliError
+from bevcli.registered import OWN, Group
 
 GROUP = "bevcli.sequences"
 
@@ -27,15 +30,28 @@ def installed(monkeypatch):
     registry.load.cache_clear()
 
 
-@pytest.mark.parametrize("group", get_args(registry.Group))
-def test_own_entries_are_found_in_the_order_of_names(group):
-    names = list(registry.entries(group))
-    assert names == sorted(names)
-    assert names
+@pytest.mark.parametrize("group", get_args(Group))
+def test_own_entries_need_no_metadata_of_an_installation(group, installed):
+    installed()
+    assert list(registry.entries(group)) == sorted(OWN[group])
+    assert all(registry.load(group, name) is not None for name in OWN[group])
 
 
-def test_own_formats_can_be_imported():
-    assert all(registry.load(GROUP, name).expected for name in registry.entries(GROUP))
+def test_bevcli_states_no_entry_points_of_its_own():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert "entry-points" not in project
+
+
+def test_a_new_format_of_bevcli_works_at_once(installed, monkeypatch):
+    installed()
+    monkeypatch.setitem(OWN[GROUP], "new", "json:loads")
+    assert registry.load(GROUP, "new")("[1]") == [1]
+
+
+def test_metadata_of_an_earlier_version_of_bevcli_are_ignored(installed):
+    installed(("native", "bevcli.native:FORMAT"), ("gone", "bevcli.sequences.gone:FORMAT"))
+    assert list(registry.entries(GROUP)) == sorted(OWN[GROUP])
+    assert registry.load(GROUP, "native").expected
 
 
 def test_an_unknown_name_is_named_with_those_that_exist():
@@ -55,10 +71,10 @@ def test_two_packages_with_the_same_name_are_refused(installed):
     with pytest.raises(BevcliError, match='two packages register "one"'):
         registry.entries(GROUP)
     installed(("one", "json:loads"), ("one", "json:loads"))
-    assert list(registry.entries(GROUP)) == ["one"]
+    assert list(registry.entries(GROUP)) == sorted([*OWN[GROUP], "one"])
 
 
-def test_a_group_without_any_entry_says_what_to_do(installed):
-    installed()
-    with pytest.raises(BevcliError, match="install bevcli again"):
+def test_a_package_cannot_replace_a_format_of_bevcli(installed):
+    installed(("ros", "json:loads"))
+    with pytest.raises(BevcliError, match=r'two packages register "ros": bevcli.sequences.ros.format:FORMAT and json:'):
         registry.entries(GROUP)

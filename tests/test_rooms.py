@@ -1,4 +1,4 @@
-"""Rooms: a model is known by its own folder only, and found through its entry point."""
+"""Rooms: a model is known by its own folder only, and found through the registry."""
 
 import ast
 from collections.abc import Iterator
@@ -9,6 +9,7 @@ import pytest
 from source_code import ROOT, trees
 
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.registered import OWN
 from bevcli.registry import entries, load
 
 MODEL = ROOT / "model"
@@ -43,8 +44,8 @@ def _names(tree: ast.Module) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
 
 
-def test_the_folders_of_models_are_those_of_the_entry_points():
-    folders = {entry.value.split(":")[0].split(".")[2] for entry in entries("bevcli.models").values()}
+def test_the_folders_of_models_are_those_registered():
+    folders = {value.split(".")[2] for value in OWN["bevcli.models"].values()}
     assert folders == {folder.name for folder in FOLDERS}
 
 
@@ -73,6 +74,6 @@ def test_no_other_room_asks_for_the_kind_of_a_model():
 
 
 @pytest.mark.parametrize("name", entries("bevcli.models"))
-def test_entry_point_and_configuration_name_the_same_model(name):
+def test_registry_and_configuration_name_the_same_model(name):
     model: type[TemporalModel] = load("bevcli.models", name)
     assert model.config_class.architecture == name

@@ -17,7 +17,6 @@ from bevcli.inference.in_engine import CALIBRATION_FRAMES, Report, in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
@@ -101,13 +100,14 @@ def compare_engines(config: ModelConfig, frames: int, report: Report = lambda do
             versions[EngineRow(engine, precision)] = _version(network, engine, precision, report)
         except BevcliError as error:
             failed.append(EngineRow(engine, precision, problem=str(error)))
-    drive, preprocess = MadeUpDrive(config.past_frames + WARM_UP_FRAMES + frames), Preprocessor(config)
+    drive = MadeUpDrive(config.past_frames + WARM_UP_FRAMES + frames)
+    preprocessors = {row: version.runner.preprocessor() for row, version in versions.items()}
     reference = next(iter(versions.values()))
     found: dict[EngineRow, list[Any]] = {row: [] for row in versions}
     for place in range(config.past_frames, len(drive.stamps)):
-        prepared = preprocess(drive.load(place))
+        frame = drive.load(place)
         for row, version in versions.items():
-            version.step(prepared)
+            version.step(preprocessors[row](frame))
             if place == config.past_frames:
                 version.fill_past(drive)
             if place >= config.past_frames + WARM_UP_FRAMES:

@@ -83,7 +83,7 @@ def run_benchmark(
 
 def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) -> dict[str, tuple[float, ...]]:
     """Seconds of each stage of the timed frames, after a warm-up from frame `first` on; no two stages run together."""
-    preprocessor = Preprocessor(fast.runner.config)
+    preprocessor = fast.runner.preprocessor()
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
         for place in range(first, timed.stop):
@@ -119,7 +119,7 @@ def time_runs(
     frame_s = median(fast.seconds)
     frames = max(frames, min(RUN_FRAMES, round(turns_s / RUNS / 2 / frame_s)))
     runs = max(1, min(RUNS, round(turns_s / (2 * frames * frame_s))))
-    preprocessor = Preprocessor(fast.runner.config)
+    preprocessor = fast.runner.preprocessor()
     fast.seconds = []
     in_runs: list[float] = []
     with _recording(drive, fast) as recording:

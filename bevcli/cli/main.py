@@ -36,7 +36,7 @@ OURS = str(Path(__file__).parents[1])
 
 
 class _Group(TyperGroup):
-    """The commands of the entry points, each built when it is asked for, and further ones. `--help` builds none."""
+    """The registered commands, each built when it is asked for, and further ones. `--help` builds none."""
 
     commands: dict[str, Any]
 
@@ -67,7 +67,7 @@ class _Group(TyperGroup):
 
 
 def click_command(name: str, found: Any) -> Any:
-    """The command of an entry point: a function, which may take dataclasses of options, or a Typer with several."""
+    """The command of an entry: a function, which may take dataclasses of options, or a Typer with several."""
     app = found
     if not isinstance(found, typer.Typer):
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)

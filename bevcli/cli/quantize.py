@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
+import typer
+
 from bevcli.cli.bridge import Part, argument
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
@@ -28,6 +30,8 @@ def quantize(
     from bevcli.inference.preprocess import calibration_images
     from bevcli.sequences.open import open_sequence
 
+    if not options.calibrate:
+        raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
     engine = model_options.engine or "onnxruntime"
     network = load_exported(model, engine)
     config = network.config

@@ -139,10 +139,8 @@ def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
     found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if frame.impossible_boxes:
         found.append(f"{where}: {frame.impossible_boxes} true boxes are left out: a size of 0 or less, or not finite")
-    if prediction.skipped:
-        found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
-    if prediction.not_finite:
-        found.append(f"{where}: NaN or infinity in {prediction.not_finite}; no boxes, the history starts anew")
+    if prediction.failure:
+        found.append(f"{where}: {prediction.failure}")
     if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:
-        found.append(f"{where}: {prediction.started_anew}; the history starts anew")
+        found.append(f"{where}: no history: {prediction.started_anew}")
     return found

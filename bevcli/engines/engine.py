@@ -62,7 +62,7 @@ def import_openvino() -> Any:
 class Engine(nn.Module):
     """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
 
-    An engine is an entry point of `bevcli.engines`: a subclass, made from the file and a number of threads.
+    An engine is registered under `bevcli.engines`: a subclass, made from the file and a number of threads.
 
     Attributes:
         packages: that it needs.

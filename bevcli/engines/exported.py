@@ -12,9 +12,10 @@ from torch import Tensor
 from bevcli.config import config_of_table
 from bevcli.engines.engine import Engine
 from bevcli.errors import WeightsError
-from bevcli.frame import FrameResult
+from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.config import ModelConfig
+from bevcli.model.export_form import pixels_of
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
@@ -77,6 +78,7 @@ class ExportedModel(TemporalModel):
     """
 
     stages: Mapping[str, str] = {"engine": "engine"}
+    takes_pixels = True
     device = torch.device("cpu")
     digest: Tensor
 
@@ -114,12 +116,17 @@ class ExportedModel(TemporalModel):
                 f"{self.file}: takes {counted(self.cameras, 'cameras')}, but the sequence has {count}: "
                 f"use `bevcli export-onnx --cameras {count}`"
             )
+        if not prepared.pixels:  # prepared for the model itself, with which the file is compared
+            prepared = replace(prepared, images=pixels_of(prepared.images, self.config.image), pixels=True)
         found = self.outputs_by_name(self.form.feed(prepared, memory))
         return self(found), self.form.memory(prepared, memory, found)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
         return self.kind.decode_boxes(self, outputs)
+
+    def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
+        return self.kind.decode_map(self, outputs)
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         return self.kind.decode_results(self, outputs)
@@ -163,7 +170,7 @@ def load_exported(file: Path, engine: str, threads: int | None = None) -> Export
 
     Args:
         file: of `bevcli export-onnx` or `bevcli quantize`.
-        engine: the program that runs it, an entry point of `bevcli.engines`.
+        engine: the program that runs it, a name of `bevcli.engines`.
         threads: that it uses; None takes PyTorch's number.
 
     Raises:

@@ -61,8 +61,11 @@ class QuantizeOptions:
 
     calibrate: tuple[Path, ...] = option(
         reads="path",
-        help="Drive whose images give the ranges of the numbers. Repeatable.",
+        default=(),
+        help="Drive whose images give the ranges of the numbers for int8; required. Repeatable.",
         metavar="SEQUENCE",
+        flag="--int8-drive",
+        old=("--calibrate",),
         repeatable=True,
     )
     frames: int = option(

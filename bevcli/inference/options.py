@@ -64,4 +64,6 @@ class ModelOptions:
         default=None,
         help="Drive whose first frames give the ranges of numbers for int8. Default: the first drive that is run.",
         metavar="SEQUENCE",
+        flag="--int8-drive",
+        old=("--calibrate-with",),
     )

@@ -20,7 +20,7 @@ from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.export_form import raw_images
+from bevcli.model.export_form import pad_value_bgr
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
 
@@ -35,6 +35,7 @@ class Preprocessor:
         threads: 1 for that of the caller, None for one a processor core.
         write: writes an image as the network takes it to the top left corner of (3, H, W) zeros of `dtype`. Default:
             `write_network_image`.
+        pixels: prepares images for an exported file: see `PreparedFrame.pixels`.
     """
 
     def __init__(
@@ -45,8 +46,9 @@ class Preprocessor:
         threads: int | None = None,
         write: WriteImage | None = None,
         dtype: type[np.generic] = np.float32,
+        pixels: bool = False,
     ) -> None:
-        self.config = config
+        self.config, self.pixels = config, pixels
         self._chosen_cameras = chosen_cameras
         self._write, self._dtype = write or write_network_image, dtype
         self._of_rig: _OfRig | None = None  # replaced as a whole: frames may be prepared in several threads
@@ -64,7 +66,10 @@ class Preprocessor:
         width, height = image.padded_size
         # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
         # here, and where it has more threads than there are processors, those of the model no longer spin.
-        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), self._dtype)).movedim(-1, 2)
+        empty = np.zeros((1, len(names), height, width, 3), self._dtype)
+        if self.pixels:
+            empty[:] = pad_value_bgr(self.config)
+        images = torch.from_numpy(empty).movedim(-1, 2)
 
         def write(place: int, name: str) -> None:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
@@ -87,6 +92,7 @@ class Preprocessor:
             image_from_bev=torch.from_numpy(np.stack(projections))[None],
             camera_index=torch.tensor([self.config.cameras.index(name) for name in known.assignment.embeddings]),
             has_image=torch.tensor([[name in frame.images for name in names]]),
+            pixels=self.pixels,
         )
 
     def _facts_of(self, rig: CameraRig) -> "_OfRig":
@@ -95,7 +101,10 @@ class Preprocessor:
             bev_frame = self.config.bev_frame
             model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
             assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
-            known = self._of_rig = _OfRig(rig, model_rig, assignment, image_for_rig(rig, self.config.image))
+            image = image_for_rig(rig, self.config.image)
+            if self.pixels:
+                image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
+            known = self._of_rig = _OfRig(rig, model_rig, assignment, image)
         return known
 
 
@@ -204,7 +213,7 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
     empty = True
     places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
     chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
-    preprocess = Preprocessor(config)
+    preprocess = Preprocessor(config, pixels=True)
     for drive, place in (places[index] for index in chosen):
         prepared = preprocess(drive.load(place))
         if len(prepared.assignment.cameras) != cameras:
@@ -212,7 +221,7 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
             raise InputError(f"{drive.name}: has {found} (the file takes {cameras})")
         if prepared.frame.images:
             empty = False
-            yield raw_images(prepared.images, config).numpy()
+            yield prepared.images.movedim(2, -1).numpy()
     if empty:
         names = ", ".join(drive.name for drive in drives)
         raise InputError(

@@ -6,7 +6,6 @@ from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
 
 
 def run(
@@ -47,5 +46,5 @@ def run(
     model = in_engine(model, sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
     asked = {"ask_attention": attention or bool(probes), "probes": tuple(probes)}
     runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
-    steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config, cameras))
+    steps = runner.run(sequence, range(len(sequence.stamps)), runner.preprocessor(cameras))
     return ((frame, prediction) for frame, prediction, _ in steps)

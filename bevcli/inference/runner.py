@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence as Items
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Generic, TypeVar
@@ -75,6 +75,10 @@ class Runner:
         self.device = device
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model, device, model.stages)
+
+    def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
+        """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
+        return Preprocessor(self.config, cameras, pixels=self.model.takes_pixels)
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()

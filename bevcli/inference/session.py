@@ -16,7 +16,6 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 
 ColorOrder = Literal["bgr", "rgb"]
@@ -88,7 +87,7 @@ class Session:
         self._color_order = color_order
         commands = read_commands(command, model.config)
         self._runner = model.runner(track=track, temporal=temporal, commands=commands)
-        self._prepare = self._runner.preparation(Preprocessor(model.config, cameras))
+        self._prepare = self._runner.preparation(self._runner.preprocessor(cameras))
         self._state: RunnerState[Any] = RunnerState()
         self._poses = RecentPoses()
         self._drive = 1

@@ -48,9 +48,11 @@ class ImageConfig:
             (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
         auto_levels: move the grey levels of dark, pale and foggy images into an ordinary range first
-            (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
-        defog: take away the light that fog adds to an image, before its levels are moved (`bevcli.inference.defog`).
-        denoise: smooth images with strong noise, as of a camera in the dark (`bevcli.inference.denoise`).
+            (`bevcli.inference.image_repair.auto_levels`), so that the model sees more in the dark and in fog.
+        defog: take away the light that fog adds to an image, before its levels are moved
+            (`bevcli.inference.image_repair.defogged`).
+        denoise: smooth images with strong noise, as of a camera in the dark
+            (`bevcli.inference.image_repair.denoised`).
     """
 
     size: tuple[int, int]

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.config import ModelConfig
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
 
@@ -62,7 +62,10 @@ class ExportForm:
         return {}
 
     def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
-        """The inputs of one frame by name. memory: after the frame before; None where the history starts anew."""
+        """The inputs of one frame by name.
+
+        prepared: with `pixels`. memory: after the frame before; None where the history starts anew.
+        """
         raise NotImplementedError
 
     def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> ModelOutputs:
@@ -87,9 +90,9 @@ def camera_ports(
     left, top, right, bottom = image.crop_box
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
     cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
-    levels = ", their grey levels moved as by bevcli.inference.auto_levels" if image.auto_levels else ""
-    levels += ", fog removed as by bevcli.inference.defog" if image.defog else ""
-    levels += ", strong noise smoothed as by bevcli.inference.denoise" if image.denoise else ""
+    levels = ", their grey levels moved as by bevcli.inference.image_repair.auto_levels" if image.auto_levels else ""
+    levels += ", fog removed as by bevcli.inference.image_repair.defogged" if image.defog else ""
+    levels += ", strong noise smoothed as by bevcli.inference.image_repair.denoised" if image.denoise else ""
     level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
     return (
@@ -159,23 +162,20 @@ def _box_ports(config: ModelConfig) -> Iterator[Port]:
     yield Port("classes", (1, count), "(1, K): index into the metadata's classes.", torch.int64)
 
 
-def camera_feed(inputs: ModelInputs, config: ModelConfig) -> dict[str, Tensor]:
-    """The inputs of `camera_ports` by name."""
+def camera_feed(inputs: ModelInputs) -> dict[str, Tensor]:
+    """The inputs of `camera_ports` by name. The images of `inputs` are those of `PreparedFrame.pixels`."""
     return {
-        "images": raw_images(inputs.images, config),
+        "images": inputs.images.movedim(2, -1).contiguous(),
         "image_from_bev": inputs.image_from_bev,
         "camera_index": inputs.camera_index,
         "has_image": inputs.has_image,
     }
 
 
-def raw_images(images: Tensor, config: ModelConfig) -> Tensor:
-    """(1, N, 3, H, W) as the model takes them -> (1, N, H, W, 3) B G R, 0 to 255, as an exported file takes them."""
-    image = config.image
+def pixels_of(images: Tensor, image: ImageConfig) -> Tensor:
+    """Normalised images (1, N, 3, H, W) -> the pixels of an exported file: B G R, 0 to 255."""
     pixels = images.movedim(2, -1) * torch.tensor(image.std) + torch.tensor(image.mean)
-    if image.color_order == "rgb":
-        pixels = pixels.flip(-1)
-    return pixels.contiguous()
+    return (pixels.flip(-1) if image.color_order == "rgb" else pixels).movedim(-1, 2)
 
 
 def _pixel(config: ModelConfig) -> str:

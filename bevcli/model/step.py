@@ -28,10 +28,12 @@ class PreparedFrame:
         frame: the frame as it was read, but for the bev frame of its rig: see `BevFrameConfig.level`.
         assignment: the N cameras and the model cameras whose embeddings they use.
         scales: (N,) pixels of the resized image per pixel of the camera's image.
-        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing. Uploaded ahead to a CUDA GPU.
+        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing. Uploaded ahead to a CUDA GPU. With
+            `pixels`, before normalisation: B G R, 0 to 255, the mean where an image is missing.
         image_from_bev: (1, N, 4, 4) float64, to network pixels.
         camera_index: (N,) int64, index of each camera's embedding.
         has_image: (1, N) bool.
+        pixels: the images are as an exported file takes them, which normalises them itself.
     """
 
     frame: Frame
@@ -41,6 +43,7 @@ class PreparedFrame:
     image_from_bev: Tensor
     camera_index: Tensor
     has_image: Tensor
+    pixels: bool = False
 
 
 @dataclass(frozen=True)

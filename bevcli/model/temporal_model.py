@@ -38,6 +38,7 @@ class TemporalModel(nn.Module):
         device_parts: names of the methods that are pure functions of tensors on the device: no wait for it, no upload,
             no shape that depends on a tensor's numbers. On a CUDA GPU each becomes a CUDA graph.
         figures: of `bevcli explain`, as texts "module:attribute", each of a dict of functions by step. () for none.
+        takes_pixels: the images enter before normalisation: see `PreparedFrame.pixels`.
         config: of the model.
     """
 
@@ -48,6 +49,7 @@ class TemporalModel(nn.Module):
     has_parts: bool = False
     device_parts: ClassVar[tuple[str, ...]] = ()
     figures: ClassVar[tuple[str, ...]] = ()
+    takes_pixels: ClassVar[bool] = False
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

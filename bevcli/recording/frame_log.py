@@ -207,10 +207,8 @@ class FrameLog:
             self.event(f"{where}: no history: {prediction.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
             self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
-        if prediction.skipped:
-            self.event(f"{where}: no camera has an image; the model was not run", "WARN")
-        if prediction.not_finite:
-            self.event(f"{where}: NaN or infinity in {prediction.not_finite}; no boxes, the state was reset", "ERROR")
+        if prediction.failure:
+            self.event(f"{where}: {prediction.failure}", "ERROR" if prediction.not_finite else "WARN")
 
     def _log_internals(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         self._log_pillars(frame, prediction, cameras)

@@ -16,7 +16,6 @@ from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.robustness.conditions import Condition, choose_conditions
 from bevcli.robustness.options import StressOptions
@@ -192,7 +191,7 @@ class _Test:
         model = self.model
         if self.runner is None:
             self.runner = model.runner(track=False, temporal=self.options.temporal)
-        steps = self.runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
+        steps = self.runner.run(sequence, range(len(sequence.stamps)), self.runner.preprocessor())
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
                 yield boxes_ego(frame, frame.ground_truth, prediction, self.metrics.classes)

@@ -12,7 +12,6 @@ from bevcli.inference.background import write_behind
 from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
@@ -92,7 +91,7 @@ def run_into_folder(
             asked = {"ask_attention": options.recording.shows_internals, "probes": probes, "commands": commands}
             runner = model.runner(track=options.track, temporal=options.temporal, **asked)
             places = range(began_at, len(sequence.stamps))
-            yield from runner.run(sequence, places, Preprocessor(model.config, options.cameras), before)
+            yield from runner.run(sequence, places, runner.preprocessor(options.cameras), before)
 
         try:
             _write_steps(steps(state.runner), files, summary, saver, after_frame, should_stop)

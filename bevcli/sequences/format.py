@@ -1,4 +1,4 @@
-"""Format: an input format, found through the entry points `bevcli.sequences`."""
+"""Format: an input format, registered under `bevcli.sequences`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Format:
 
 
 def formats() -> tuple[Format, ...]:
-    """All formats, in the order of the names of their entry points. Those that cannot be imported are left out."""
+    """All formats, in the order of their registered names. Those that cannot be imported are left out."""
     return _loaded()[0]
 
 

@@ -1,4 +1,4 @@
-"""OutputFormat: a format that drives are written in, found through the entry points `bevcli.drive_writers`."""
+"""OutputFormat: a format that drives are written in, registered under `bevcli.drive_writers`."""
 
 from __future__ import annotations
 

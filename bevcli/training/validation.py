@@ -17,7 +17,6 @@ from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.synth.drives import Drives
 
@@ -101,7 +100,7 @@ def validate(
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
-        places, preprocessor = range(len(sequence.stamps)), Preprocessor(runner.config)
+        places, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
         for frame, prediction, _ in runner.run(sequence, places, preprocessor):
             if frame.ground_truth is not None:
                 if tracking is not None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from accuracy import WrongTimes, errors_of_drive
 from command_line import MINI_TOML, command
 from memory_drive import MemorySequence, make_camera
@@ -18,8 +17,7 @@ from bevcli.calibration import calibrate as calibrating
 from bevcli.calibration.estimates import Verdict, either_text
 from bevcli.calibration.matches import match_points
 from bevcli.calibration.result import CorrectedDrive
-from bevcli.cli import bridge
-from bevcli.cli.calibrate import calibrate
+from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
@@ -167,10 +165,8 @@ def test_images_of_noise_are_refused():
 
 
 def typed(*arguments: str):
-    """The command as its user types it, also where its entry point is not installed."""
-    app = typer.Typer()
-    app.command()(bridge.command(calibrate))
-    return CliRunner().invoke(app, arguments)
+    """The command as its user types it."""
+    return CliRunner().invoke(app, ["calibrate", *arguments])
 
 
 @pytest.mark.slow

@@ -32,6 +32,12 @@ def test_every_out_has_a_short_form():
     assert sum("-o" in flags for flags in options.values()) > 8
 
 
+def test_calibrate_means_the_cameras_and_int8_has_its_own_flag():
+    found = [(name, flag) for name, one in commands().items() for each in shown(one) for flag in each.opts]
+    assert {name for name, flag in found if flag.startswith("--calibrate")} == {"run", "stress"}
+    assert {name for name, flag in found if flag == "--int8-drive"} >= {"run", "batch", "validate", "quantize"}
+
+
 def test_no_command_takes_the_name_of_a_model_as_an_argument():
     for name, found in commands().items():
         arguments = [each.name for each in shown(found) if each.param_type_name == "argument"]
@@ -44,7 +50,9 @@ def test_no_command_takes_the_name_of_a_model_as_an_argument():
         (("validate", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
         (("train", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
         (("export-onnx", "demo", "--rig", "nowhere", "--cameras", 2), "the argument demo is now --model demo"),
-        (("quantize", "nowhere.onnx", "--calibrate", "nowhere", "--frames", 3), "--frames is now --count"),
+        (("quantize", "nowhere.onnx", "--int8-drive", "nowhere", "--frames", 3), "--frames is now --count"),
+        (("quantize", "nowhere.onnx", "--calibrate", "nowhere"), "--calibrate is now --int8-drive"),
+        (("run", "nowhere", "--calibrate-with", "nowhere"), "--calibrate-with is now --int8-drive"),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
@@ -63,7 +71,10 @@ def test_each_flag_belongs_to_one_parameter():
         assert len(flags) == len(set(flags)), found.name
 
 
-def test_train_asks_for_a_model(tmp_path):
-    done = command(tmp_path, "train", "--rendered", "0:2")
+@pytest.mark.parametrize(
+    ("arguments", "flag"), [(("train", "--rendered", "0:2"), "--model"), (("quantize", __file__), "--int8-drive")]
+)
+def test_a_command_asks_for_an_option_that_it_needs(arguments, flag, tmp_path):
+    done = command(tmp_path, *arguments)
     assert done.returncode == 2
-    assert "--model" in done.stderr
+    assert f"{flag}: is missing" in done.stderr

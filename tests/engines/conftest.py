@@ -11,7 +11,7 @@ from bevcli.config import as_table
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.quantize import quantize
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.model.export_form import raw_images
+from bevcli.model.export_form import pixels_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs
@@ -28,5 +28,6 @@ def small_file(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def int8_file(small_file) -> Path:
     file, config = small_file.with_name("small-int8.onnx"), model_for_engines().config
-    quantize(small_file, [raw_images(small_inputs(seed).images, config).numpy() for seed in range(4)], file)
+    images = [pixels_of(small_inputs(seed).images, config.image).movedim(2, -1).numpy() for seed in range(4)]
+    quantize(small_file, images, file)
     return file

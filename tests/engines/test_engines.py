@@ -10,12 +10,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from forks import FORKS
+from memory_drive import MemorySequence, make_camera
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -25,12 +27,14 @@ from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
-from bevcli.inference.preprocess import calibration_images
+from bevcli.inference.preprocess import Preprocessor, calibration_images
 from bevcli.inference.run import run
+from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
-from bevcli.model.export_form import raw_images
+from bevcli.model.export_form import pixels_of
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
 
@@ -73,6 +77,32 @@ def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
     assert model.prepared is model.network
 
 
+@pytest.mark.parametrize("in_a_run", [True, False])
+def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeypatch):
+    """To the bit in a run, up to rounding where the frame was prepared for the model; a missing one is the mean."""
+    exported = load_exported(small_file, "onnxruntime")
+    width, height = exported.config.image.size
+    camera = make_camera("FRONT", 0, width, height)
+    drive = MemorySequence(1, CameraRig((camera, replace(camera, name="BACK")), default_ego_from_bev()))
+    frame = drive.load(0)
+    pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    frame = replace(frame, images={"FRONT": replace(frame.images["FRONT"], pixels_bgr=pixels)})
+    runner, feeds = Runner(exported, torch.device("cpu")), []
+    run_file = exported.outputs_by_name
+    monkeypatch.setattr(exported, "outputs_by_name", lambda feed: feeds.append(feed) or run_file(feed))
+    runner.step(None, (runner.preprocessor() if in_a_run else Preprocessor(exported.config))(frame))
+    found, tolerance = feeds[0]["images"].numpy(), 0 if in_a_run else 1e-4
+    np.testing.assert_allclose(found[0, 0], pixels, atol=tolerance, rtol=0)
+    np.testing.assert_allclose(found[0, 1], np.full_like(pixels, 120), atol=tolerance, rtol=0)
+
+
+@pytest.mark.parametrize("decoder", ["decode_boxes", "decode_map", "decode_results"])
+def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, decoder, monkeypatch):
+    exported, decoded = load_exported(small_file, "onnxruntime"), object()
+    monkeypatch.setattr(exported.kind, decoder, lambda model, outputs: (model, outputs, decoded))
+    assert getattr(exported, decoder)("outputs") == (exported, "outputs", decoded)
+
+
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
 def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"
@@ -95,7 +125,8 @@ def test_efficientnet_lite_runs_in_an_engine_and_in_int8(tmp_path):
     model = model_for_engines(EfficientNetLiteConfig())
     exact, rounded = tmp_path / "lite.onnx", tmp_path / "lite-int8.onnx"
     export_onnx(model, exact, decode=True, untrained=True)
-    quantize(exact, [raw_images(small_inputs(seed).images, model.config).numpy() for seed in range(4)], rounded)
+    images = [pixels_of(small_inputs(seed).images, model.config.image).movedim(2, -1).numpy() for seed in range(4)]
+    quantize(exact, images, rounded)
     files = [load_exported(file, "onnxruntime") for file in (exact, rounded)]
     with torch.inference_mode():
         expected, found, close = model(small_inputs()).bev, *(step_of_file(file, small_inputs()).bev for file in files)
@@ -250,7 +281,7 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
 def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command("export-onnx", "--model", "demo")
-    command("quantize", "demo.onnx", "--calibrate", str(STREET), "--count", "4", "--check", str(STREET))
+    command("quantize", "demo.onnx", "--int8-drive", str(STREET), "--count", "4", "--check", str(STREET))
     expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
     for engine in entries("bevcli.engines"):
         command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)

@@ -15,6 +15,7 @@ from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.encoder import EncoderConfig
+from bevcli.model.export_form import pixels_of
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
@@ -84,7 +85,9 @@ def small_inputs(seed: int = 0, batch: int = 1) -> ModelInputs:
 
 def step_of_file(exported: ExportedModel, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
     """One step of an exported BEVFormer."""
-    outputs: ModelOutputs = exported(exported.outputs_by_name(recurrent_feed(inputs, history, exported.config)))
+    config = exported.config
+    feed = recurrent_feed(replace(inputs, images=pixels_of(inputs.images, config.image)), history, config)
+    outputs: ModelOutputs = exported(exported.outputs_by_name(feed))
     return outputs
 
 

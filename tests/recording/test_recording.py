@@ -14,6 +14,7 @@ import pytest
 from memory_drive import MemorySequence, WithoutImages
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
 
+from bevcli.cli.run import _frame_warnings
 from bevcli.errors import OutputError
 from bevcli.frame import CameraImage, NewStart, StartReason
 from bevcli.geometry.boxes import Boxes3D
@@ -176,6 +177,17 @@ def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
         'frame 2: no history: new scene, scene "b"',
         'frame 3: no history: gap of 9.0 s, scene "b"',
     ]
+
+
+@pytest.mark.parametrize("changes", [{"skipped": True}, {"not_finite": "neck"}], ids=["skipped", "not finite"])
+def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes):
+    drive = MemorySequence(1, scenes=[""])
+    frame = drive.load(0)
+    gap = NewStart(StartReason.GAP, 2.5)
+    failed = replace(predict(frame), boxes=Boxes3D.empty(), bev=None, started_anew=gap, **changes)
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
+        recording.log(frame, failed)
+    assert sorted(events(tmp_path / "r.rrd")) == sorted(_frame_warnings(frame, failed))
 
 
 def test_a_minimal_recording_has_no_internals(tmp_path):

@@ -22,18 +22,11 @@ from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import object_classes
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.labels import csv_table, cvat, kitti, kitti_raw, label_format, openlabel as openlabel_reader
+from bevcli.sequences.labels import label_format
 from bevcli.sequences.labels.sequence import WithLabels, _labelled_places
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
 
-FORMATS = {
-    "csv": csv_table.FORMAT,
-    "cvat": cvat.FORMAT,
-    "kitti": kitti.FORMAT,
-    "kitti-raw": kitti_raw.FORMAT,
-    "openlabel": openlabel_reader.FORMAT,
-}
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 
 
@@ -42,13 +35,6 @@ class Drive(MemorySequence):
 
     def load(self, place: int) -> Frame:
         return replace(super().load(place), ground_truth=None)
-
-
-@pytest.fixture(autouse=True)
-def formats(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The formats of bevcli, whether or not its entry points are installed anew."""
-    monkeypatch.setattr(label_format, "entries", lambda group: FORMATS)
-    monkeypatch.setattr(label_format, "load", lambda group, name: FORMATS[name])
 
 
 def boxes_of_drive(drive: Drive) -> BoxesFile:

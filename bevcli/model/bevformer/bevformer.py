@@ -230,7 +230,7 @@ def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelCon
     """The inputs by name. history: (1, Y·X, C), the BEV map of the previous frame; None without one."""
     grid = config.bev_grid
     previous = torch.zeros(1, grid.rows * grid.columns, config.channels) if history is None else history
-    return camera_feed(inputs, config) | {
+    return camera_feed(inputs) | {
         "can_bus": inputs.can_bus,
         "shift": inputs.shift,
         "rotation": inputs.rotation_deg,

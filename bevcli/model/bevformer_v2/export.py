@@ -110,7 +110,7 @@ class WindowForm(ExportForm):
             current.image_size,
         )
         earlier = [one or absent for one in frames_at(past, places, prepared)]
-        feed = camera_feed(current, self.config) | {
+        feed = camera_feed(current) | {
             "image_from_bev": torch.stack([*(one.image_from_bev for one in earlier), current.image_from_bev], dim=1),
             "has_image": torch.stack([*(one.has_image for one in earlier), current.has_image], dim=1),
         }

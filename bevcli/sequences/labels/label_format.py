@@ -1,4 +1,4 @@
-"""LabelFormat: a format of labels, found through the entry points `bevcli.label_formats`."""
+"""LabelFormat: a format of labels, registered under `bevcli.label_formats`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
