@@ -228,7 +228,7 @@ def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: B
         used = logits.amax(-1).sigmoid() * of_class.sigmoid() > config.min_thing  # the other things are in no cell
         used[: len(STUFF_CLASSES)] = True
         layers = map_layers(logits[used], of_class[used], config, grid)
-    return map_of_layers(layers.cpu().numpy(), (*STUFF_CLASSES, THING_CLASS), grid)
+    return map_of_layers([*layers.cpu().numpy()], (*STUFF_CLASSES, THING_CLASS), grid)
 
 
 def map_layers(mask_logits: Tensor, class_logits: Tensor, config: SegmentationConfig, grid: BevGrid) -> Tensor:

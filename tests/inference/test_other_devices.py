@@ -66,8 +66,8 @@ def frames(config: ModelConfig, *, same_projection: bool = False) -> list[Prepar
 
 
 def run(model: Network, device: torch.device, prepared: list[PreparedFrame], waits: list[str]) -> list[Prediction]:
-    """Each frame's prediction. The step of the last frame is made three times, so that the last one is a replay of a CUDA
-    graph. The device's waits are forgotten before it."""
+    """Each frame's prediction. The step of the last frame is made three times, so that the last one is a replay of a
+    CUDA graph. The device's waits are forgotten before it."""
     runner = Runner(model, device, StepOptions())
     ahead = model.config.later_frames
     state, predictions = None, []

@@ -68,7 +68,8 @@ def things_in_a_row(*rows: list[float], minimum: float, scale: int) -> list[bool
 
 
 def test_a_cell_has_a_vehicle_where_any_query_is_probable() -> None:
-    assert things_in_a_row([0.9, 0.5, 0.3, 0.1], [0.0, 0.4, 0.6, 0.1], minimum=0.2, scale=1) == [True, True, True, False]
+    rows = [0.9, 0.5, 0.1, 0.1], [0.0, 0.4, 0.6, 0.1]
+    assert things_in_a_row(*rows, minimum=0.2, scale=1) == [True, True, True, False]
 
 
 def test_a_finer_map_interpolates_between_the_cells() -> None:
