@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from memory_drive import MemorySequence
-from simulated_device import OnDevice, SimulatedDevice, simulated
+from simulated_device import OnDevice, SimulatedDevice, pinned, simulated
 
 from bevcli.benchmark.made_up import made_up_model
 from bevcli.config import known_models, load_config
@@ -128,6 +128,24 @@ def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
         run(prepare_for_inference(model, device.device, "bf16"), device.device, prepared, device.waits)
     assert device.waits == ["synchronize"]
+
+
+def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
+    config = small_version("demo")
+    model, prepared = made_up_model(config), frames(config, same_projection=True)
+    copied = []
+    with simulated("cuda:0", monkeypatch, sample_plainly) as device:
+        fast = prepare_for_inference(model, device.device)
+        prepared = [replace(frame, images=device.tensor(frame.images)) for frame in prepared]  # were uploaded ahead
+        for name in ("bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"):
+            function = pinned if name.endswith("pinned") else lambda x: pinned(torch.empty(x.shape, dtype=x.dtype))
+            monkeypatch.setattr(name, lambda x, name=name, function=function: copied.append(name) or function(x))
+        runner = Runner(fast, device.device)
+        state, _ = runner.step(None, prepared[0])
+        for frame in (*prepared, *prepared):
+            copied.clear()
+            state, _ = runner.step(state, frame)
+    assert copied == ["bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"]
 
 
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
