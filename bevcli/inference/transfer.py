@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.tensors import exchanged, tensors_in
-from bevcli.model.upload import upload
+from bevcli.model.upload import packed, unpacked, upload
 
 
 def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:
@@ -37,7 +37,7 @@ def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFr
 def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
     """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
 
-    All copies from a CUDA GPU share one wait. What `ModelOutputs.stay_on_device` names stays there. The input images
+    There is one copy from a CUDA GPU. What `ModelOutputs.stay_on_device` names stays there. The input images
     must be finite too: the ReLU of oneDNN, and of cuDNN, turns NaN into zero, so that it may not reach the outputs.
     Weights are checked when they are read and when they are prepared. Not seen are numbers inside of the backbone that
     grow beyond the range of their type and that ReLU then turns into zeros.
@@ -57,9 +57,10 @@ def _on_cpu(tensors: list[Tensor]) -> list[Tensor]:
     device = tensors[0].device
     if device.type != "cuda":
         return [tensor.cpu() for tensor in tensors]
-    copies = [pinned_place(x).copy_(x, non_blocking=True) for x in tensors]
+    memory = packed(tensors)
+    copy = pinned_place(memory).copy_(memory, non_blocking=True)
     torch.cuda.current_stream(device).synchronize()
-    return copies
+    return unpacked(copy, tensors)
 
 
 def pinned_place(tensor: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from bevcli.model.step import ModelOutputs
 
 FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
 SUPPORT = 0.5  # share of its score that a duplicate adds to that of another box, where neither is near 1
+LEAST_EXPONENT = -60.0  # what is less adds nothing, and takes a CPU up to fifty times as long
 
 
 class BestBoxes(NamedTuple):
@@ -49,12 +50,14 @@ class BestBoxes(NamedTuple):
 
     def of_same_class(self) -> Tensor:
         """(B, K, K) float32, 1 where two boxes have the same class, else 0."""
-        return (self.label[:, :, None] == self.label[:, None]).float()
+        label = self.label.float()  # a CPU compares these three times as fast
+        return (label[:, :, None] == label[:, None]).float()
 
     def squared_distances(self) -> Tensor:
         """(B, K, K) float32, m², between the boxes on the ground."""
         # A sum over a last axis of two takes several times as long.
         x, y = self.codes[..., :2].float().unbind(-1)
+        x, y = x.contiguous(), y.contiguous()
         return (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()
 
 
@@ -94,7 +97,7 @@ def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
     """
     size = boxes.codes[..., 2:4].float().mean(-1, keepdim=True).exp()  # of the logarithms of width and length
     weights = boxes.scores.clamp(min=1e-6)[:, None]
-    near = torch.exp(-boxes.squared_distances() / (reach * size).square())
+    near = (boxes.squared_distances() / -(reach * size).square()).clamp(min=LEAST_EXPONENT).exp()
     counts = near * boxes.of_same_class() * weights  # (B, K, K)
     total = counts.sum(-1)
     places = counts @ boxes.codes[..., :2].float() / total[..., None]
@@ -109,7 +112,8 @@ def faded(boxes: BestBoxes, share: float) -> BestBoxes:
     several better boxes, the one counts that lowers it most.
     """
     distances = boxes.squared_distances().sqrt()  # (B, better, worse)
-    lost = share * torch.exp(-distances / (FADING_WIDTHS * boxes.codes[..., 2].float().exp()[:, :, None]))
+    widths = boxes.codes[..., 2].float().exp()[:, :, None]
+    lost = share * (distances / (-FADING_WIDTHS * widths)).clamp(min=LEAST_EXPONENT).exp()
     place = torch.arange(boxes.scores.shape[1], device=lost.device)
     worse = place[:, None] < place  # `triu` takes as long as all the rest
     return boxes.with_scores(boxes.scores * (1 - boxes.of_same_class() * worse * lost).amin(1))

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from bevcli.model import upload
 from bevcli.model.tensors import exchanged, tensors_in
 
 KEPT_GRAPHS = 8  # of one function: for other numbers and sizes of images, with and without history
@@ -21,12 +22,16 @@ class CudaGraph:
     """One captured call of a function, with input and output tensors of its own that every replay uses again."""
 
     def __init__(self, function: Function, arguments: tuple[Any, ...], device: torch.device, pool: Any) -> None:
-        """Captures the call. pool: memory that all graphs of a function share, as never two of them run at once.
+        """Captures the call; tensors on the CPU are uploaded. pool: memory that all graphs of a function share, as
+        never two of them run at once.
 
         Raises RuntimeError where an operation cannot be captured, such as a wait for the GPU.
         """
         self._sources = [tensor for _, tensor in tensors_in(arguments)]
-        self._inputs = [tensor.clone() for tensor in self._sources]
+        small = [tensor for tensor in self._sources if tensor.device.type == "cpu"]
+        self._uploaded = upload.upload(upload.packed(small), device) if small else None
+        of_cpu = iter([] if self._uploaded is None else upload.unpacked(self._uploaded, small))
+        self._inputs = [next(of_cpu) if x.device.type == "cpu" else x.clone() for x in self._sources]
         own = exchanged(arguments, iter(self._inputs))
         with torch.cuda.device(device):
             stream = torch.cuda.Stream(device)
@@ -41,10 +46,15 @@ class CudaGraph:
 
     def replay(self, arguments: tuple[Any, ...]) -> Any:
         """The results for other arguments of the same shapes, in new memory."""
+        small = []
         for place, (_, tensor) in enumerate(tensors_in(arguments)):
-            if tensor is not self._sources[place]:  # hits of a rig stay the same for many frames
+            if tensor.device.type == "cpu":
+                small.append(tensor)
+            elif tensor is not self._sources[place]:  # hits of a rig stay the same for many frames
                 self._inputs[place].copy_(tensor, non_blocking=True)
                 self._sources[place] = tensor
+        if self._uploaded is not None:
+            self._uploaded.copy_(upload.pinned(upload.packed(small)), non_blocking=True)
         self._graph.replay()
         return exchanged(self._outputs, (tensor.clone() for _, tensor in tensors_in(self._outputs)))
 
@@ -86,7 +96,7 @@ class Captured:
 
     def _graph_for(self, arguments: tuple[Any, ...]) -> CudaGraph | None:
         """The graph for arguments of these shapes; None where they come for the first time or cannot be captured."""
-        key = exchanged(arguments, ((tuple(x.shape), x.dtype) for _, x in tensors_in(arguments)))
+        key = exchanged(arguments, ((tuple(x.shape), x.dtype, x.device) for _, x in tensors_in(arguments)))
         if key not in self.graphs:
             self.graphs[key] = None
             if len(self.graphs) > KEPT_GRAPHS:

@@ -22,12 +22,12 @@ from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.cuda_layers import FusedBottleneck, TokensInOnePass, attention_by_products
+from bevcli.model.kernels.cuda_layers import FusedBottleneck, MapOnDevice, TokensInOnePass, attention_by_products
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
-from bevcli.model.segmentation import MaskDecoderLayer
+from bevcli.model.segmentation import MaskDecoderLayer, SegmentationHead
 from bevcli.model.temporal_model import TemporalModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
@@ -105,7 +105,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     return network
 
 
-def _use_cuda_layers(network: nn.Module, device: torch.device) -> None:
+def _use_cuda_layers(network: TemporalModel, device: torch.device) -> None:
     """Exchanges layers, in place, for those of `cuda_layers` and of the Triton kernels."""
     for module in network.modules():
         if isinstance(module, Bottleneck) and torch.version.hip is None:  # cuDNN is NVIDIA's
@@ -123,6 +123,9 @@ def _use_cuda_layers(network: nn.Module, device: torch.device) -> None:
             add_to_class(module, TokensInOnePass)
         elif isinstance(module, MaskDecoderLayer):
             module.attend = attention_by_products
+        elif isinstance(module, SegmentationHead):
+            add_to_class(module, MapOnDevice)
+            vars(module).update(config=network.config.segmentation, grid=network.config.bev_grid)
 
 
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:

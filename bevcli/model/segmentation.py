@@ -73,15 +73,18 @@ class SegmentationOutputs:
         class_logits: (M, B, Q), that anything of the query's class exists.
         locations: (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the
             map.
+        map_layers: see the function `map_layers`, for a batch of one; None where `decode_map` computes them.
     """
 
     mask_logits: Tensor
     class_logits: Tensor
     locations: Tensor
+    map_layers: Tensor | None = None
 
     def last_layers(self) -> "SegmentationOutputs":
-        """The outputs of the last layers."""
-        return SegmentationOutputs(self.mask_logits[-1:], self.class_logits[-1:], self.locations[-1:])
+        """The outputs of the last layers; no masks where there are map layers, which are smaller."""
+        masks = self.mask_logits[-1:] if self.map_layers is None else self.mask_logits[:0]
+        return SegmentationOutputs(masks, self.class_logits[-1:], self.locations[-1:], self.map_layers)
 
 
 class SegmentationHead(nn.Module):
@@ -218,39 +221,28 @@ def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: B
     """The masks of the last layer, for a batch of one, merged to one map, `map_scale` times as fine as the grid.
 
     A cell may have several classes, such as a pedestrian crossing on a road.
+    """
+    layers = outputs.map_layers
+    if layers is None:
+        logits, of_class = (each[-1, 0].detach().float() for each in (outputs.mask_logits, outputs.class_logits))
+        used = logits.amax(-1).sigmoid() * of_class.sigmoid() > config.min_thing  # the other things are in no cell
+        used[: len(STUFF_CLASSES)] = True
+        layers = map_layers(logits[used], of_class[used], config, grid)
+    return map_of_layers([*layers.cpu().numpy()], (*STUFF_CLASSES, THING_CLASS), grid)
+
+
+def map_layers(mask_logits: Tensor, class_logits: Tensor, config: SegmentationConfig, grid: BevGrid) -> Tensor:
+    """(STUFF_CLASSES + 1, scale · rows, scale · columns) bool: the cells of each stuff class and those of vehicles.
 
     The probability of a query in a cell is its class probability times its mask's value (MaskFormer, Cheng et al.
     2021). Panoptic SegFormer instead takes whole masks above 0.5. Focal loss gives small vehicles mask values that
-    rarely reach 0.5, and on rendered drives that rule loses a sixth of the vehicles' IoU.
+    rarely reach 0.5, and on rendered drives that rule loses a sixth of the vehicles' IoU. Between the centres of the
+    grid's cells, probabilities are interpolated.
+
+    mask_logits: (Q, Y·X) of the stuff queries and any number of thing queries. class_logits: (Q,).
     """
-    logits, of_class = (each[-1, 0].detach().float() for each in (outputs.mask_logits, outputs.class_logits))
-    of_class = of_class.sigmoid()
-    count = len(STUFF_CLASSES)
-    used = logits.amax(-1).sigmoid() * of_class > config.min_thing  # the other things can win no cell
-    used[:count] = True
-    masks = logits[used].sigmoid().unflatten(-1, (grid.rows, grid.columns))
-    probabilities = masks * of_class[used, None, None]
-    stuff = _upsampled(probabilities[:count], config.map_scale) > config.min_stuff
-    things = assign_cells(probabilities[count:], config.min_thing, config.map_scale)
-    return map_of_layers([*stuff.cpu().numpy(), things >= 0], (*STUFF_CLASSES, THING_CLASS), grid)
-
-
-def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[np.int64]:
-    """The most probable query of each cell: (scale · rows, scale · columns), its index, -1 for none.
-
-    Args:
-        probabilities: (Q, rows, columns).
-        minimum: a cell where no query has a larger probability belongs to none.
-        scale: cells of the result along a side of a cell.
-    """
-    candidates = (probabilities.amax((1, 2)) > minimum).nonzero()[:, 0]  # the others can win no cell
-    none = probabilities.new_full((1, *probabilities.shape[1:]), minimum)
-    layers = torch.cat([none, probabilities[candidates]])
-    winner = _upsampled(layers, scale).max(0).indices  # `argmax` takes nine times as long on a CPU
-    queries: NDArray[np.int64] = torch.cat([candidates.new_full((1,), -1), candidates])[winner].cpu().numpy()
-    return queries
-
-
-def _upsampled(layers: Tensor, scale: int) -> Tensor:
-    """(K, rows, columns) -> (K, scale · rows, scale · columns), bilinear between the centres of the cells."""
-    return F.interpolate(layers[None], scale_factor=scale, mode="bilinear", align_corners=False)[0]
+    probabilities = mask_logits.sigmoid() * class_logits.sigmoid()[:, None]
+    coarse = probabilities.unflatten(-1, (grid.rows, grid.columns))
+    fine = F.interpolate(coarse[None], scale_factor=config.map_scale, mode="bilinear", align_corners=False)[0]
+    stuff, things = fine[: len(STUFF_CLASSES)], fine[len(STUFF_CLASSES) :]
+    return torch.cat([stuff > config.min_stuff, (things > config.min_thing).any(0, keepdim=True)])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from memory_drive import MemorySequence
-from simulated_device import OnDevice, SimulatedDevice, simulated
+from simulated_device import OnDevice, SimulatedDevice, pinned, simulated
 
 from bevcli.benchmark.made_up import made_up_model
 from bevcli.config import known_models, load_config
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.frame import Prediction
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
@@ -65,19 +65,19 @@ def frames(config: ModelConfig, *, same_projection: bool = False) -> list[Prepar
     return prepared
 
 
-def run(model: Network, device: torch.device, prepared: list[PreparedFrame], waits: list[str]) -> list[Boxes3D]:
-    """Each frame's boxes. The step of the last frame is made three times, so that the last one is a replay of a CUDA
-    graph. The device's waits are forgotten before it."""
+def run(model: Network, device: torch.device, prepared: list[PreparedFrame], waits: list[str]) -> list[Prediction]:
+    """Each frame's prediction. The step of the last frame is made three times, so that the last one is a replay of a
+    CUDA graph. The device's waits are forgotten before it."""
     runner = Runner(model, device, StepOptions())
     ahead = model.config.later_frames
-    state, boxes = None, []
+    state, predictions = None, []
     for place, frame in enumerate(prepared):
         before = state
         for _ in range(REPEATS if place == len(prepared) - 1 else 1):
             waits.clear()
             state, prediction = runner.step(before, frame, prepared[place + 1 : place + 1 + ahead])
-        boxes.append(prediction.boxes)
-    return boxes
+        predictions.append(prediction)
+    return predictions
 
 
 def sample_plainly(values, shapes, locations, weights, ends, out, queries, maps, cells, **constants):
@@ -114,8 +114,10 @@ def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, 
         assert part.failure is None
         assert any(part.graphs.values())
     for ours, theirs in zip(expected, found, strict=True):
-        np.testing.assert_allclose(theirs.centers, ours.centers, atol=1e-3)
-        np.testing.assert_allclose(theirs.scores, ours.scores, atol=1e-4)
+        np.testing.assert_allclose(theirs.boxes.centers, ours.boxes.centers, atol=1e-3)
+        np.testing.assert_allclose(theirs.boxes.scores, ours.boxes.scores, atol=1e-4)
+        if ours.segmentation is not None:
+            assert (theirs.segmentation.cells == ours.segmentation.cells).mean() > 0.999
     if device_name == "cuda:1" and not isinstance(config, UniADConfig):
         assert device.waits == ["synchronize"]
 
@@ -126,6 +128,24 @@ def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
         run(prepare_for_inference(model, device.device, "bf16"), device.device, prepared, device.waits)
     assert device.waits == ["synchronize"]
+
+
+def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
+    config = small_version("demo")
+    model, prepared = made_up_model(config), frames(config, same_projection=True)
+    copied = []
+    with simulated("cuda:0", monkeypatch, sample_plainly) as device:
+        fast = prepare_for_inference(model, device.device)
+        prepared = [replace(frame, images=device.tensor(frame.images)) for frame in prepared]  # were uploaded ahead
+        for name in ("bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"):
+            function = pinned if name.endswith("pinned") else lambda x: pinned(torch.empty(x.shape, dtype=x.dtype))
+            monkeypatch.setattr(name, lambda x, name=name, function=function: copied.append(name) or function(x))
+        runner = Runner(fast, device.device)
+        state, _ = runner.step(None, prepared[0])
+        for frame in (*prepared, *prepared):
+            copied.clear()
+            state, _ = runner.step(state, frame)
+    assert copied == ["bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"]
 
 
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
@@ -188,4 +208,4 @@ def test_uploading_images_ahead_changes_no_box():
     in_turn = run(model, device, [preprocess(drive.load(place)) for place in range(FRAMES)], [])
     ahead = Runner(model, device, StepOptions()).run(drive, range(FRAMES), preprocess)
     for expected, (_, prediction, _) in zip(in_turn, ahead, strict=True):
-        np.testing.assert_allclose(prediction.boxes.centers, expected.centers, atol=1e-4)
+        np.testing.assert_allclose(prediction.boxes.centers, expected.boxes.centers, atol=1e-4)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from simulated_device import SimulatedDevice, simulated
+from simulated_device import SimulatedDevice, pinned, simulated
 from torch import Tensor, nn
 
 from bevcli.model.cuda_graph import KEPT_GRAPHS, Captured
+from bevcli.model.upload import packed, unpacked, upload_together
 
 NAME = "cuda:0"
 
@@ -34,6 +35,9 @@ class Scaled(nn.Module):
         self.runs += 1
         found = self.part(inputs.numbers * inputs.factor)
         return (found if inputs.others is None else found + inputs.others[0]), "name"
+
+    def uploading(self, inputs: Inputs) -> Tensor:
+        return self.scaled(upload_together(inputs, self.part.weight.device))[0]
 
     def waiting(self, inputs: Inputs) -> Tensor:
         return inputs.numbers * inputs.factor.item()
@@ -64,6 +68,35 @@ def test_a_replay_computes_with_the_new_numbers(device):
     for found, expected in kept:  # no replay has overwritten earlier results
         torch.testing.assert_close(found.held, expected.held, rtol=0, atol=0)
     assert device.waits == []
+
+
+def test_arguments_on_the_cpu_are_uploaded_in_one_copy(device, monkeypatch):
+    model, copies = Scaled().to(device.device), []
+    captured = Captured(model.uploading, model, device.device, rounds=True)
+    device.waits.clear()
+    monkeypatch.setattr("bevcli.model.upload.pinned", lambda x: copies.append(len(x)) or pinned(x))
+    for step in range(5):
+        numbers, factor, offset = (
+            torch.tensor([step, 2.0, 3.0]),
+            torch.tensor([10.0 + step]),
+            torch.tensor([float(step), step, step]),
+        )
+        found = captured(Inputs(on(device, *numbers), factor, (offset, 1)))
+        inputs = Inputs(on(device, *numbers), on(device, *factor), (on(device, *offset), 1))
+        torch.testing.assert_close(found.held, model.scaled(inputs)[0].held, rtol=0, atol=0)
+    assert copies == [16] * 6  # one more in the capture
+    assert device.waits == []
+
+
+def test_packed_tensors_keep_their_numbers_shapes_and_types():
+    tensors = [
+        torch.tensor([[True], [False], [True]]), torch.tensor(3.5), torch.zeros(0, 4), torch.arange(3),
+        torch.arange(12.0).view(3, 4).t(), torch.tensor([1.5, 2.5, 3.5]).half(), torch.tensor([7], dtype=torch.uint8),
+    ]  # fmt: skip
+    memory = packed(tensors)
+    assert memory.dtype == torch.uint8
+    for found, expected in zip(unpacked(memory, tensors), tensors, strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
 def test_other_shapes_and_numbers_are_captured_for_themselves(device):

@@ -14,8 +14,8 @@ from bevcli.model.segmentation import (
     SegmentationConfig,
     SegmentationHead,
     SegmentationOutputs,
-    assign_cells,
     decode_map,
+    map_layers,
 )
 
 BOTH = ("detection", "segmentation")
@@ -58,26 +58,24 @@ def test_a_mask_is_the_weighted_sum_of_attention_maps() -> None:
     assert masks[0, 0].tolist() == pytest.approx([0, 6 / math.sqrt(4), 2 * 6 / math.sqrt(4)])
 
 
-def in_a_row(*rows: list[float]) -> torch.Tensor:
-    """Probabilities over a map of one row."""
-    return torch.tensor(rows)[:, None, :]
+def things_in_a_row(*rows: list[float], minimum: float, scale: int) -> list[bool]:
+    """Where there are vehicles in a map of one row, from the probabilities of thing queries."""
+    logits = torch.cat([torch.full((3, len(rows[0])), -9.0), torch.tensor(rows).logit()])
+    config = SegmentationConfig(min_thing=minimum, map_scale=scale)
+    layers = map_layers(logits, torch.full((len(logits),), torch.inf), config, BevGrid(1, len(rows[0])))
+    assert not layers[:3].any()
+    return layers[3, 0].tolist()
 
 
-def test_a_cell_belongs_to_its_most_probable_query() -> None:
-    assert assign_cells(in_a_row([0.9, 0.5, 0.3, 0.1], [0.0, 0.4, 0.6, 0.2]), minimum=0.2, scale=1).tolist() == [
-        [0, 0, 1, -1]
-    ]
-
-
-def test_improbable_queries_do_not_change_the_indices_of_others() -> None:
-    assert assign_cells(in_a_row([0.1, 0.1], [0.0, 0.7]), minimum=0.2, scale=1).tolist() == [[-1, 1]]
-    assert assign_cells(in_a_row([0.1, 0.1]), minimum=0.2, scale=2).tolist() == [[-1] * 4] * 2
+def test_a_cell_has_a_vehicle_where_any_query_is_probable() -> None:
+    rows = [0.9, 0.5, 0.1, 0.1], [0.0, 0.4, 0.6, 0.1]
+    assert things_in_a_row(*rows, minimum=0.2, scale=1) == [True, True, True, False]
 
 
 def test_a_finer_map_interpolates_between_the_cells() -> None:
-    row = in_a_row([1.0, 0.0])  # over four half cells: 1, 0.75, 0.25, 0
-    assert assign_cells(row, minimum=0.5, scale=2)[0].tolist() == [0, 0, -1, -1]
-    assert assign_cells(row, minimum=0.2, scale=2)[0].tolist() == [0, 0, 0, -1]
+    row = [1.0, 0.0]  # over four half cells: 1, 0.75, 0.25, 0
+    assert things_in_a_row(row, minimum=0.5, scale=2) == [True, True, False, False]
+    assert things_in_a_row(row, minimum=0.2, scale=2) == [True, True, True, False]
 
 
 def test_a_probability_is_class_times_mask() -> None:
@@ -85,6 +83,8 @@ def test_a_probability_is_class_times_mask() -> None:
     outputs = SegmentationOutputs(masks, classes, torch.zeros(1, 1, 1, 4))
     one = decode_map(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))
     assert one.cells.tolist() == [[1]]  # the road alone: neither another class nor a vehicle
+    layers = map_layers(masks[0, 0], classes[0, 0], SegmentationConfig(map_scale=1, min_stuff=0.4), BevGrid(1, 1))
+    assert layers.flatten().tolist() == [True, False, False, False]
 
 
 def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:

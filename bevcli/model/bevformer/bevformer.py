@@ -1,7 +1,7 @@
 """BEVFormer (Li et al. 2022): camera images and ego-motion in, a BEV map and objects out. Then its exported form."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -16,7 +16,7 @@ from bevcli.model.export_step import ExportedStep
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
-from bevcli.model.upload import upload
+from bevcli.model.upload import upload, upload_together
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class BevHistory:
 
 @dataclass(frozen=True)
 class EncoderInputs:
-    """All that the device part of a step reads, on the device.
+    """All that the device part of a step reads, on the device or, small tensors, on the CPU.
 
     Attributes:
         images: see `ModelInputs`, as for camera_index, can_bus and shift.
@@ -71,14 +71,14 @@ class BEVFormer(Network):
         return self.encode(self.host_part(inputs, history))
 
     def host_part(self, inputs: ModelInputs, history: Tensor | None) -> "EncoderInputs":
-        """What a step needs of calibration and poses, as tensors on the device. Arguments as for `forward`."""
-        size, device = inputs.image_size, self.device
+        """What a step needs of calibration and poses, as tensors. Arguments as for `forward`."""
+        size = inputs.image_size
         rays = rotation = None
         if self.calibration_embedding is not None:
             rays = self.calibration_embedding(inputs.image_from_bev, self.config.level_shapes_of(size), size)
         if history is not None:
             center = self.config.ego_motion.history_rotation_center
-            rotation = upload(map_rotation(inputs.rotation_deg, self.config.bev_grid, center), device)
+            rotation = map_rotation(inputs.rotation_deg, self.config.bev_grid, center)
         return EncoderInputs(
             images=inputs.images,
             camera_index=inputs.camera_index,
@@ -96,6 +96,7 @@ class BEVFormer(Network):
 
     def encode(self, inputs: "EncoderInputs") -> Tensor:
         """The BEV map (B, Y·X, C)."""
+        inputs = upload_together(inputs, self.device)
         image_features = self.image_features(inputs.images, inputs.camera_index)
         if inputs.rays is not None:
             image_features = image_features.scaled(*inputs.rays)
@@ -122,7 +123,8 @@ class BEVFormer(Network):
         self, prepared: PreparedFrame, memory: BevHistory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, BevHistory]:
         inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
-        outputs = self(inputs.to(self.device, keep_geometry=True), None if memory is None else memory.bev)
+        inputs = replace(inputs, images=upload(inputs.images, self.device))
+        outputs = self(inputs, None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
 
     def remember(self, clip: ClipInputs, place: int, memory: Tensor | None) -> Tensor:

@@ -1,13 +1,16 @@
 """Layers of a model prepared for inference on a CUDA GPU that take fewer passes over the memory than the plain ones."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.resnet import Bottleneck
+from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, SegmentationOutputs, map_layers
 
 
 class FusedBottleneck(Bottleneck):
@@ -68,3 +71,21 @@ def attention_by_products(queries: Tensor, keys: Tensor, values: Tensor) -> Tens
     """
     scores = (queries * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)
     return scores.softmax(-1) @ values
+
+
+class MapOnDevice(SegmentationHead):
+    """Added to the segmentation head: the GPU merges the masks, so that neither masks are copied nor the CPU does it.
+
+    Attributes:
+        config: of the head.
+        grid: of the BEV map.
+    """
+
+    config: SegmentationConfig
+    grid: BevGrid
+
+    def forward(self, bev: Tensor, position: Tensor) -> SegmentationOutputs:
+        """As `SegmentationHead.forward`, for a batch of one, with map layers."""
+        found = super().forward(bev, position)
+        masks, classes = found.mask_logits[-1, 0].float(), found.class_logits[-1, 0].float()
+        return replace(found, map_layers=map_layers(masks, classes, self.config, self.grid))

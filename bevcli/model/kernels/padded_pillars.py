@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bevcli.model.kernels.compiled import in_threads
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
-from bevcli.model.upload import upload
+from bevcli.model.upload import upload_together
 
 PLACES = 128  # numbers of padded hits are multiples of this
 
@@ -32,10 +32,7 @@ class PaddedPillars(Pillars):
         if any(count > size for count, size in zip(hits.hits_per_camera, sizes, strict=True)):
             roomy = (min(len(self.points), _roomy(count)) for count in hits.hits_per_camera)
             sizes = self.sizes[key] = tuple(map(max, roomy, sizes))
-        hits, device = hits.padded(sizes), self.points.device
-        tensors = (upload(x, device) for x in (hits.cell, hits.reference_points, hits.cameras_per_cell))
-        cell, reference_points, cameras_per_cell = tensors
-        return PillarHits(cell, reference_points, sizes, cameras_per_cell)
+        return upload_together(hits.padded(sizes), self.points.device)
 
 
 def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:

@@ -34,6 +34,7 @@ from bevcli.model.uniad.track_queries import (
     live_and_die,
     with_tracks,
 )
+from bevcli.model.upload import upload
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +206,8 @@ class UniAD(BEVFormer):
         frame, device = prepared.frame, self.device
         is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
         previous_pose = memory.pose if memory is not None and is_known else None
-        inputs = model_inputs([prepared], [previous_pose], self.config).to(device, keep_geometry=True)
+        inputs = model_inputs([prepared], [previous_pose], self.config)
+        inputs = replace(inputs, images=upload(inputs.images, device))
         history = tracks = motion = None
         if memory is not None:
             history = None if memory.bev is None else memory.bev.to(device)
