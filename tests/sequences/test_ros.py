@@ -1,8 +1,10 @@
 """Bags written with the packages of ROS and MCAP, read as sequences."""
 
 import base64
+import contextlib
 import json
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -208,6 +210,17 @@ def test_poses_that_are_none_are_left_out_with_their_number(
     np.testing.assert_allclose(
         found.world_from_ego_at["CAM_FRONT"].matrix, true.world_from_ego_at["CAM_FRONT"].matrix, atol=1e-9
     )
+
+
+def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
+    with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
+        (number,) = database.execute("SELECT id FROM topics WHERE name = '/odom'").fetchone()
+        (row,) = database.execute("SELECT id FROM messages WHERE topic_id = ? LIMIT 1 OFFSET 7", (number,)).fetchone()
+        database.execute("UPDATE messages SET data = x'0001' WHERE id = ?", (row,))
+    sequence = open_sequence(bag)
+    assert any(f"/odom: 1 of {len(motion.timestamps_ns)} poses are left out" in note for note in sequence.notes)
+    assert len(sequence.stamps) == 4
 
 
 def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
