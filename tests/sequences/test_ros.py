@@ -253,6 +253,20 @@ def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: 
     np.testing.assert_array_equal(sequence.rig["CAM_FRONT"].intrinsics, native.rig["CAM_FRONT"].intrinsics)
 
 
+@pytest.mark.parametrize(("k", "size", "message"), [(0.01, 64, "implausible focal length"), (50, 0, "image size")])
+def test_a_camera_that_no_calibration_may_hold_is_refused(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, k: float, size: int, message: str
+) -> None:
+    info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
+    info |= {"width": size, "k": [k, 0.0, 32, 0, 50.0, 18, 0, 0, 1]}
+    messages = [
+        (t, kind, time, info if t == "/CAM_FRONT/camera_info" else f)
+        for t, kind, time, f in messages_of(native, motion)
+    ]
+    with pytest.raises(InputError, match=rf"/CAM_FRONT/camera_info.*CAM_FRONT.*{message}"):
+        open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+
+
 @pytest.mark.parametrize("rectified", [False, True])
 def test_the_intrinsics_are_those_of_the_region_of_interest(
     tmp_path: Path, native: Sequence, motion: EgoMotion, rectified: bool
