@@ -316,7 +316,7 @@ def test_impossible_boxes_are_left_out_with_their_number(name, form, street, tmp
     )
     result = CliRunner().invoke(app, ["convert", str(tmp_path / "in"), str(tmp_path / "out"), "--format", form])
     assert result.exit_code == 0
-    assert "2 boxes of the ground truth are left out" in result.output
+    assert "2 boxes of the ground truth left out" in result.output
     assert len(open_sequence(tmp_path / "out").load(0).ground_truth) == len(sizes) - 2
 
 
