@@ -92,10 +92,8 @@ class TableSequence(Sequence):
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""
-        samples, spans = (
-            self.index.samples,
-            [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes],
-        )
+        samples = self.index.samples
+        spans = [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes]
         lidars = np.concatenate([samples.lidars[slice(*span)] for span in spans])
         if (lidars < 0).any():
             yield (

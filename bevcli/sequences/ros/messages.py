@@ -14,10 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, Distortion
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, Pose, rigid
 from bevcli.parsing.documents import parse_json
-from bevcli.sequences.files.calibration_file import LENS_NAMES, checked_camera
+from bevcli.sequences.files.calibration_file import parse_camera
+from bevcli.sequences.files.json_fields import require, transform_to_json
+from bevcli.sequences.files.kalibr_ros import lens_fields
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for
@@ -198,20 +200,15 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
     if rectified and projection[0, 0] > 0:
         rectified_from_camera = rotation if abs(np.linalg.det(rotation) - 1) < 1e-3 else np.eye(3)
         intrinsics, ego_from_camera = projection[:, :3], ego_from_camera @ rigid((0, 0, 0), rectified_from_camera.T)
-    lens = None if rectified else _distortion(message, where)
-    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, lens), where)
-
-
-def _distortion(message: Any, where: str) -> Distortion | None:
-    model, coefficients = str(message.distortion_model), [float(d) for d in _first(message, "d", "D")]
-    if not any(coefficients):
-        return None
-    known = LENS_NAMES.get(model.lower() or "plumb_bob")
-    if known is None:
-        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENS_NAMES)})")
-    if known == "brown_conrady" and len(coefficients) > 8 and not any(coefficients[8:]):
-        coefficients = coefficients[:8]
-    return Distortion(known, tuple(coefficients))  # type: ignore[arg-type]
+    coefficients = [] if rectified else [float(d) for d in _first(message, "d", "D")]
+    fields = {
+        "width": width,
+        "height": height,
+        "intrinsics": intrinsics.tolist(),
+        "distortion": lens_fields(message.distortion_model, coefficients, where),
+        "ego_from_camera": transform_to_json(ego_from_camera),
+    }
+    return require(parse_camera, name, fields, where=where, camera=name)
 
 
 def _pose(translation: Any, rotation: Any) -> Pose | None:
