@@ -682,6 +682,19 @@ def test_foxglove_schemas(tmp_path: Path, native: Sequence, motion: EgoMotion, f
         np.testing.assert_allclose(sequence.rig[name].ego_from_camera, native.rig[name].ego_from_camera, atol=1e-12)
 
 
+@pytest.mark.parametrize("schema", ["foxglove.FrameTransforms", "foxglove.CompressedImage"])
+def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path: Path, native, motion, schema: str) -> None:
+    messages = foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9})
+    kind, place = next((one[1], i) for i, one in enumerate(messages) if one[1] == schema and one[0] != "/tf_static")
+    topic, _, time, fields = messages[place]
+    fields = json.loads(json.dumps(fields, default=lambda data: base64.b64encode(data).decode()))
+    (fields["transforms"][0] if "transforms" in fields else fields)["timestamp"]["sec"] = 10**15
+    messages[place] = (topic, kind, time, fields)
+    found = open_sequence(write_json_mcap(tmp_path / "bag.mcap", messages))
+    assert len(found.stamps) == 4
+    assert found.load(0).images["CAM_BACK"].timestamp_ns == native.load(0).images["CAM_BACK"].timestamp_ns
+
+
 def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
     bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
     (bag / "metadata.yaml").unlink()  # a recording that was cut off has none

@@ -1,5 +1,6 @@
 """The vehicle's poses in a bag, from a topic with poses or from transforms, and the times of its images."""
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import reduce
 from itertools import pairwise
@@ -195,16 +196,11 @@ def capture_times(bag: Bag, topics: Iterable[str]) -> dict[str, tuple[NDArray[np
 
 def _stated_times(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> dict[str, dict[int, int]]:
     """The times that messages state, ns, by topic and number; 0 for none."""
-
-    def stated(topic: str, number: int) -> int:
-        try:
-            return timestamp_ns(bag.message(topic, number))
-        except (InputError, AttributeError, ValueError):
-            return 0
-
     found: dict[str, dict[int, int]] = {topic: {} for topic in numbers}
     for _, topic, number in _in_order(bag, numbers):
-        found[topic][number] = stated(topic, number)
+        found[topic][number] = 0
+        with contextlib.suppress(InputError, AttributeError, ValueError):
+            found[topic][number] = timestamp_ns(bag.message(topic, number))
     return found
 
 

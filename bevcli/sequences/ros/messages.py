@@ -16,7 +16,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, Pose, rigid
-from bevcli.parsing.documents import parse_json
+from bevcli.parsing.documents import LARGEST_INTEGER, parse_json
 from bevcli.sequences.files.calibration_file import parse_camera
 from bevcli.sequences.files.json_fields import require, transform_to_json
 from bevcli.sequences.files.kalibr_ros import lens_fields
@@ -134,13 +134,14 @@ class Transform:
 
 
 def timestamp_ns(message: Any) -> int:
-    """The time that a message states, ns; 0 if it states none."""
+    """The time that a message states, ns; 0 if it states none, or one that is too large."""
     header = getattr(message, "header", None)
     stamp = header.stamp if header is not None else getattr(message, "timestamp", None)
     if stamp is None:
         return 0
     seconds = _first(stamp, "sec", "seconds")
-    return int(seconds) * 1_000_000_000 + int(_first(stamp, "nanosec", "nsec", "nanos", "nanoseconds"))
+    time = int(seconds) * 1_000_000_000 + int(_first(stamp, "nanosec", "nsec", "nanos", "nanoseconds"))
+    return time if abs(time) <= LARGEST_INTEGER else 0
 
 
 def frame_of(message: Any) -> str:
