@@ -142,6 +142,20 @@ def test_opening_a_large_bag_reads_few_images(
     assert len(set(read)) < 20
 
 
+def test_of_chunks_without_compression_messages_are_read(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bevcli.sequences.ros.storage import McapFile
+
+    packed = open_sequence(write_mcap(tmp_path / "packed.mcap", messages_of(native, motion))).load(1)
+    monkeypatch.setattr(McapFile, "_chunk", None)
+    path = write_mcap(tmp_path / "plain.mcap", messages_of(native, motion), chunk_size=5_000, packed=False)
+    plain = open_sequence(path).load(1)
+    for name, image in packed.images.items():
+        np.testing.assert_array_equal(plain.images[name].pixels_bgr, image.pixels_bgr)
+        np.testing.assert_array_equal(plain.world_from_ego_at[name].matrix, packed.world_from_ego_at[name].matrix)
+
+
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.999])
 def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
     tmp_path: Path, native: Sequence, motion: EgoMotion, share: float
