@@ -39,8 +39,8 @@ def say(*texts: object, err: bool = False) -> None:
 
 
 def counted(count: int | str, things: str) -> str:
-    """A number of things, such as "6 cameras" or "1 camera". things: a plural that ends in s."""
-    return f"{count} {things.removesuffix('s') if str(count) == '1' else things}"
+    """A number of things, such as "6 cameras" or "1 camera". things: a plural, such as "cameras" or "boxes"."""
+    return f"{count} {things.removesuffix('es' if things.endswith('xes') else 's') if str(count) == '1' else things}"
 
 
 class _Output(io.FileIO):

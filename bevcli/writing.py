@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 import uuid
 import zlib
 from collections.abc import Iterable, Iterator
@@ -18,6 +19,24 @@ def output_errors(path: Path, what: str = "written") -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(f"{path}: cannot be {what} ({error.strerror or error})") from None
+
+
+def lock(descriptor: int) -> bool:
+    """Lock an open file or folder until it is closed. False where another process has locked it.
+
+    True without a lock where the system, or the file system, has none.
+    """
+    if sys.platform == "win32":
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 @contextmanager

@@ -165,10 +165,14 @@ def _image_messages(frame: Frame, delay_ns: int) -> Iterator[Message]:
         yield f"/{name}/image/compressed", "sensor_msgs/CompressedImage", image.timestamp_ns + delay_ns, fields
 
 
-def write_mcap(path: Path, messages: Iterator[Message] | list[Message], *, chunk_size: int = 200_000) -> Path:
+def write_mcap(
+    path: Path, messages: Iterator[Message] | list[Message], *, chunk_size: int = 200_000, packed: bool = True
+) -> Path:
     """An MCAP file with ROS 2 messages, in order of time."""
     with path.open("wb") as file:
-        writer = Ros2Writer(file, chunk_size=chunk_size, compression=CompressionType.ZSTD)
+        writer = Ros2Writer(
+            file, chunk_size=chunk_size, compression=CompressionType.ZSTD if packed else CompressionType.NONE
+        )
         schemas: dict[str, Any] = {}
         for topic, kind, time, fields in sorted(messages, key=lambda message: message[2]):
             if kind not in schemas:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from bevcli._version import __version__
 from bevcli.batch.job import RESULTS, SCORE_BINS, Record
 from bevcli.inference.load import Model
-from bevcli.printing import duration
+from bevcli.printing import counted, duration
 
 WORST = 10  # drives in the table of the worst ones
 MOST_ERRORS = 50  # rows in the table of errors
@@ -64,7 +64,7 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
     failed = [record for record in records if record.get("error")]
     untrained = '<p class="bad">UNTRAINED: random weights, the boxes are meaningless</p>' if model.untrained else ""
     body = [
-        f"<h1>Batch of {len(records)} drives</h1>",
+        f"<h1>Batch of {counted(len(records), 'drives')}</h1>",
         f'<p class="soft">model {escape(model.name)}, bevcli {__version__}</p>{untrained}',
         _cards(done, failed, metrics),
         _distributions(done),
@@ -72,7 +72,7 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
         _worst(done),
         _errors(failed),
     ]
-    return page(f"Batch of {len(records)} drives", "\n".join(body))
+    return page(f"Batch of {counted(len(records), 'drives')}", "\n".join(body))
 
 
 def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, Any] | None) -> str:

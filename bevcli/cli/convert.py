@@ -27,6 +27,7 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
+    from bevcli.geometry.boxes import IMPOSSIBLE
     from bevcli.registry import load
     from bevcli.sequences.images import no_image_error
     from bevcli.sequences.labels.sequence import WithLabels
@@ -58,9 +59,9 @@ def convert(
         if not images:
             raise no_image_error(sequence.name, reasons.items())
     if boxes:
-        say(f"note: {boxes} boxes of the ground truth are left out: a size of 0 or less, or not finite", err=True)
+        say(f"note: {counted(boxes, 'boxes')} of the ground truth {IMPOSSIBLE}", err=True)
     if left_out:
         name = load(GROUP, written.form).name
         say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)
-    missing = f", {gaps} images missing" if gaps else ""
+    missing = f", {counted(gaps, 'images')} missing" if gaps else ""
     say(f"{out}: {counted(count, 'frames')}, {counted(len(frame.rig.cameras), 'cameras')}{missing}")

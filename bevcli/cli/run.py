@@ -11,7 +11,7 @@ import typer
 from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.cli.bridge import FormatValues, InputDrive, as_flags
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import say
+from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import SequenceOptions
@@ -134,11 +134,12 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
 def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
     """Warnings on missing images, results that are not finite, and gaps in time; the recording logs its own events."""
     from bevcli.frame import StartReason
+    from bevcli.geometry.boxes import IMPOSSIBLE
 
     where = f"frame {frame.stamp.index}"
     found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if frame.impossible_boxes:
-        found.append(f"{where}: {frame.impossible_boxes} true boxes are left out: a size of 0 or less, or not finite")
+        found.append(f"{where}: {counted(frame.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
     if prediction.failure:
         found.append(f"{where}: {prediction.failure}")
     if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:

@@ -7,7 +7,7 @@ import typer
 from bevcli.cli.bridge import Part, model_option, print_note
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import say
+from bevcli.printing import counted, say
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ModelFileOptions, TrainOptions
 
@@ -85,7 +85,7 @@ def _run(trainer: "Trainer") -> None:
         progress.advance()
 
     counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
-    say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
+    say(f"{job.config.clips}; {counted(steps, 'steps')}; drives: {counts}; output: {job.out}", err=True)
     for note in (*job.notes, *job.changed_settings()):
         print_note(note)
     for start in job.warm_starts:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from bevcli.cli.bridge import argument
-from bevcli.printing import say
+from bevcli.printing import counted, say
 from bevcli.viewer.options import ViewOptions
 
 PANEL = "Look"
@@ -52,10 +52,10 @@ def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
         count, rate = frame_rate(read_from)
         with Progress(count, "frames") as progress:
             write_video(read_from, options.video, count, rate, progress.advance)
-        say(f"{options.video}: {count} frames, {rate:.3g} per second")
+        say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
     if options.export is not None:
         frames, boxes = export_boxes(read_from, options.export)
-        say(f"{options.export}: {boxes} boxes in {frames} frames")
+        say(f"{options.export}: {counted(boxes, 'boxes')} in {counted(frames, 'frames')}")
 
 
 def _open(recording: Path, options: ViewOptions) -> None:

@@ -15,8 +15,9 @@ from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.scores_report import FrameScores, driving_tables, driving_to_dict, finite
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
-from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
+from bevcli.printing import counted
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
@@ -42,7 +43,7 @@ class Scores(FrameScores):
         return super().to_dict() | finite(driving_to_dict(self.driving))
 
     def table(self) -> str:
-        frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
+        frames = f"{counted(self.detection.frame_count, 'frames')}, matched by {self.pairs.matched_by}"
         return "\n\n".join([frames, super().table(), *driving_tables(self.driving)])
 
     def write_plots(self, folder: Path | str) -> list[Path]:
@@ -111,7 +112,9 @@ def evaluate(
     drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
     limits = _range_notes(max_range, model_range, pairs)
     notes = (*pairs.notes, *map_notes, *_class_notes(predicted, true, classes), *limits, *_detection_notes(detection))
-    notes = (*notes, *track_notes, *drives.notes)
+    impossible = truth.impossible_boxes
+    left_out = (f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}",) if impossible else ()
+    notes = (*notes, *track_notes, *drives.notes, *left_out)
     return Scores(detection, segmentation, tracks, notes, pairs=pairs, driving=drives)
 
 

@@ -35,12 +35,14 @@ class ScoredInput:
         maps: None where there is no folder of maps.
         bicycle_racks: by sample token, in the world frame; only of a nuScenes root.
         lines: reads the true lines of the map, and raises InputError without them; None of predictions.
+        impossible_boxes: the number of boxes that were left out: a size of 0 or less, or not finite.
     """
 
     boxes: BoxesFile
     maps: MapFolder | None = None
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
     lines: Callable[[], LinesFile] | None = None
+    impossible_boxes: int = 0
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
@@ -140,7 +142,7 @@ def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
 def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
     tables = tables_of(root, options.version)
     index, _ = open_index(tables)
-    frames, racks, samples = list[FrameBoxes](), {}, index.samples
+    frames, racks, samples, impossible = list[FrameBoxes](), {}, index.samples, 0
     for scene in chosen_scenes(index, tables, options.split, only):
         for sample in range(*index.scenes.first_sample[scene : scene + 2]):
             boxes, token = index.ground_truth(sample), samples.tokens[sample].decode()
@@ -148,21 +150,23 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
                 raise InputError(f"{tables}: has no annotations (expected for scoring): choose another split than test")
             stamp = FrameStamp(len(frames), str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000)
             pose = Pose(np.array(samples.translations[sample]), np.array(samples.quaternions[sample]))
-            frames.append(FrameBoxes(stamp, pose, names.renamed(boxes), {"sample_token": token}))
+            impossible += len(boxes) - len(boxes.possible())
+            frames.append(FrameBoxes(stamp, pose, names.renamed(boxes.possible()), {"sample_token": token}))
             racks[token] = index.bicycle_racks(sample)
     drive = partial(open_sequence, root, scene=only, version=options.version, split=options.split)
     lines = partial(_lines_of, drive, f"the map expansion in {root / 'maps' / 'expansion'}")
-    return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks, lines=lines)
+    return ScoredInput(BoxesFile("world", tuple(frames)), None, racks, lines, impossible)
 
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     drive = open_sequence(path, options)
-    found = []
+    found, impossible = [], 0
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if frame.ground_truth is not None:
             token = {"sample_token": frame.sample_token} if frame.sample_token else {}
             found.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
+            impossible += frame.impossible_boxes
     if not found:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
     lines = partial(_lines_of, lambda: drive, "a drive that has them")
-    return ScoredInput(BoxesFile("world", tuple(found)), lines=lines)
+    return ScoredInput(BoxesFile("world", tuple(found)), lines=lines, impossible_boxes=impossible)

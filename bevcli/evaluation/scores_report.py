@@ -12,7 +12,7 @@ from bevcli.evaluation.map_lines import THRESHOLDS_M
 from bevcli.evaluation.planning import PlanScores
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
-from bevcli.printing import aligned
+from bevcli.printing import aligned, counted
 
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
@@ -245,7 +245,7 @@ def driving_tables(scores: DrivingScores) -> Iterator[str]:
         for name, of_class in lines.ap.items():
             numbers = (lines.mean_by_class[name], *of_class.values())
             rows.append((name, str(lines.truth_count[name]), *map(_number, numbers)))
-        yield f"{aligned(rows)}\n\nmap mAP {_number(lines.mean_ap)} ({lines.frame_count} frames)"
+        yield f"{aligned(rows)}\n\nmap mAP {_number(lines.mean_ap)} ({counted(lines.frame_count, 'frames')})"
     if (motion := scores.motion) is not None:
         rows = [("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate")]
         for name, sums in motion.items():

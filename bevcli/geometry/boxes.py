@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
+IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes3D.possible` leaves out
+
 
 @dataclass(frozen=True)
 class Boxes3D:
@@ -62,6 +64,11 @@ class Boxes3D:
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
         return self if self.scores is None else self[self.scores >= least]
+
+    def possible(self) -> "Boxes3D":
+        """The boxes with sizes above 0 and finite numbers; velocities may be unknown."""
+        kept = (self.sizes_lwh > 0).all(axis=1) & np.isfinite(self.to_numpy()[:, :7]).all(axis=1)
+        return self if kept.all() else self[kept]
 
     @staticmethod
     def empty() -> "Boxes3D":

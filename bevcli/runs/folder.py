@@ -14,7 +14,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
-from bevcli.writing import output_errors
+from bevcli.writing import lock, output_errors
 
 OWN = ".bevcli"
 SUMMARY = "summary.json"
@@ -119,8 +119,8 @@ def folder_lock(out: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with output_errors(out):
             (out / OWN).mkdir(parents=True, exist_ok=True)
-            lock = stack.enter_context(_locked(out / OWN / "lock", out))
-            stack.callback(_remove, lock.name)
+            held = stack.enter_context(_locked(out / OWN / "lock", out))
+            stack.callback(_remove, held.name)
             if sys.platform != "win32":
                 stack.callback(os.close, _locked_folder(out))
         yield
@@ -133,36 +133,22 @@ def _remove(path: str) -> None:
 
 def _locked_folder(out: Path) -> int:
     """The descriptor of the locked folder. Raises OutputError where another run has locked it."""
-    import fcntl
-
     folder = os.open(out, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    if not lock(folder):
         os.close(folder)
-        raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`") from None
-    except OSError:  # a file system without locks for folders
-        pass
+        raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
     return folder
 
 
 def _locked(path: Path, out: Path) -> IO[str]:
     """The open lock file, which holds the number and the command of this process. Raises OutputError."""
-    if sys.platform == "win32":
-        return path.open("w")
-    import fcntl
-
     while True:
         file = path.open("a+", errors="replace")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock(file.fileno()):
             file.seek(0)
             holder = file.read(500).strip() or "an unknown process"
             file.close()
-            raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`") from None
-        except OSError:  # a file system without locks
-            return file
+            raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break

@@ -11,7 +11,7 @@ from bevcli._version import __version__
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.image_repair import BLACK_SHARE, WHITE_SHARE, grey_levels, sampled
 from bevcli.inference.load import Model
-from bevcli.printing import duration
+from bevcli.printing import counted, duration
 from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
@@ -199,10 +199,11 @@ class RunSummary:
         if guessed:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; `cameras` changes them)"))
         if counts.dropped:
-            rows.append(("dropped", f"{len(counts.dropped)} images, {len(counts.skipped)} frames without any"))
+            images, frames = counted(len(counts.dropped), "images"), counted(len(counts.skipped), "frames")
+            rows.append(("dropped", f"{images}, {frames} without any"))
         if counts.not_finite:
             _, where = counts.not_finite[0]
-            rows.append(("failed", f"{len(counts.not_finite)} frames: NaN or infinity, first in {where}"))
+            rows.append(("failed", f"{counted(len(counts.not_finite), 'frames')}: NaN or infinity, first in {where}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
         rows += [("rig", note) for note in self._rig_notes()]

@@ -69,8 +69,7 @@ class WithClassNames(DerivedSequence):
         truth = frame.ground_truth
         if truth is None:
             return frame
-        possible = (truth.sizes_lwh > 0).all(axis=1) & np.isfinite(truth.to_numpy()[:, :7]).all(axis=1)
-        kept = truth if possible.all() else truth[possible]
+        kept = truth.possible()
         return replace(frame, ground_truth=self._names.renamed(kept), impossible_boxes=len(truth) - len(kept))
 
 

@@ -18,7 +18,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.machine import peak_memory
-from bevcli.printing import duration
+from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
@@ -54,7 +54,7 @@ def write_model_file(
     name = re.sub(r"[^\w. +-]", "-", path.stem).lstrip("-. +")[:100] or "model"
     facts = look_at(_open_drives(data), load_config(PRESETS[preset][0]).bev_frame)
     table = model_table(name, preset, facts)
-    lines = [f"Model {name} for {len(facts.drives)} drives, preset {preset}.", *_facts_lines(facts, table)]
+    lines = [f"Model {name} for {counted(len(facts.drives), 'drives')}, preset {preset}.", *_facts_lines(facts, table)]
     cost = _cost_of(table, device, data, longest_s)
     if device.type == "cuda":
         clips, card_bytes = cost.config.clips, torch.cuda.get_device_properties(device).total_memory
@@ -102,7 +102,7 @@ def _open_drives(data: DriveOptions) -> list[Sequence]:
 def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
     """The facts that the settings of the file follow from."""
     named = ", ".join(f"{name} {facts.class_counts[name]}" for name in table["classes"])
-    yield f"Boxes in {facts.frames} frames: {named}."
+    yield f"Boxes in {counted(facts.frames, 'frames')}: {named}."
     alike = ", ".join(f"{name} like {settings['like']}" for name, settings in table.get("class_settings", {}).items())
     if alike:
         yield f"Own classes, by the sizes of their boxes: {alike}; [class_settings] changes it."
@@ -172,7 +172,7 @@ class Cost:
         step = f"{self.update_s:.2g} s an update"
         if updates > 1:
             step += f", {duration(self.step_s)} a step of {updates}"
-        whole = f"{duration(steps * self.step_s)} for {steps} steps without scoring"
+        whole = f"{duration(steps * self.step_s)} for {counted(steps, 'steps')} without scoring"
         return f"{self.machine}: {step}, {whole}; memory {self.memory_bytes / 1e9:.1f} GB"
 
 

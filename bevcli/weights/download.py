@@ -7,7 +7,6 @@ headers included. Each answer is checked before its first byte is written.
 import os
 import re
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from itertools import count
@@ -19,7 +18,7 @@ import msgspec
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
-from bevcli.writing import output_errors
+from bevcli.writing import lock, output_errors
 
 STALL_S, STALL_BYTES = 20, 4096  # a transfer that is slower than so many bytes in a second, for so long, is cut
 CONNECT_S = 20
@@ -63,7 +62,8 @@ def download(url: str, path: Path, expected_bytes: int | None, report: Report) -
     """
     require_space(path.parent, (expected_bytes or 0) - (path.stat().st_size if path.exists() else 0))
     with output_errors(path), path.open("ab") as file:
-        _lock(file, path)
+        if not lock(file.fileno()):
+            raise WeightsError(f"{path}: another process is downloading it: wait for it, then try again")
         _Download(url, file, expected_bytes, report).run()
 
 
@@ -75,18 +75,6 @@ def require_space(folder: Path, wanted: int) -> None:
             f"{folder}: the disk has too little space: {wanted / 1e6:.0f} MB are needed, {max(free, 0) / 1e6:.0f} MB "
             "are free: free some, or pass `weights_dir=DIR` on another disk"
         )
-
-
-def _lock(file: BinaryIO, path: Path) -> None:
-    """Raises WeightsError while another process downloads the same file."""
-    if sys.platform == "win32":
-        return
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise WeightsError(f"{path}: another process is downloading it: wait for it, then try again") from None
 
 
 class _Download:

@@ -102,7 +102,7 @@ def test_tracks_give_velocities_over_ground(tmp_path: Path) -> None:
     [
         ((0, 1), None, "1100", "2 frames with labels: PKW (2); 2 frames without rows are empty"),
         ((0, 2), None, "1x1x", "2 frames with labels: PKW (2); 2 frames are not labelled"),  # at half the rate
-        ((1,), None, "x1xx", "1 frames with labels: PKW (1); 3 frames are not labelled"),
+        ((1,), None, "x1xx", "1 frame with labels: PKW (1); 3 frames are not labelled"),
         ((0, 2), "empty", "1010", "2 frames without rows are empty (see `unlisted_frames`)"),
         ((0, 1), "unlabelled", "11xx", "2 frames are not labelled: they have no ground truth"),
         ((), None, "xxxx", "0 frames with labels: none; 4 frames are not labelled"),
@@ -132,7 +132,6 @@ def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
         ("", r"column class is missing .*found none"),
         ("frame,class,x\n", "column y is missing"),
         (HEAD.replace("frame,", ""), "column frame or timestamp_ns is missing"),
-        (f"{HEAD}\n0,PKW,1,2,0,4,2,0,0", r'line 2, column height: expected a number above 0, found "0"'),
         (f"{HEAD}\n0,PKW,1,2,0,4,2,1,x", r'line 2, column yaw: expected a number, found "x"'),
         (f"{HEAD}\n0,PKW,nan,2,0,4,2,1,1", r'line 2, column x: expected a finite number, found "nan"'),
         (f"{HEAD}\n0.5,PKW,1,2,0,4,2,1,1", "line 2, column frame: expected an integer"),
@@ -172,7 +171,6 @@ def test_openlabel_angles_turn_about_the_vertical(tmp_path: Path) -> None:
         ('{"openlabel": {', "is not OpenLABEL"),
         ("[]", "is no file of labels .*an OpenLABEL file"),
         (openlabel_text({"val": [1, 2]}), "object 7: expected a cuboid of 10 or 9 numbers"),
-        (openlabel_text({"val": [0] * 10}), "sizes above 0"),
         (openlabel_text({"val": [1] * 9, "coordinate_system": "lidar"}), "in one of world, odom, ego, .* found lidar"),
         (openlabel_text({"val": [1] * 9}, "yesterday"), 'timestamp "yesterday" is not a time'),
     ],
@@ -217,7 +215,6 @@ def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
         ('{"categories": {', 'is not a CVAT export "Datumaro 3D"'),
         (cvat_text().replace('"attr": {"frame": 1}', '"attr": {}'), 'item 000001: "attr" has no "frame"'),
         (cvat_text(label_id=2), r"item 000000: label_id is 2 \(expected 0 to 1"),
-        (cvat_text(scale=[1, 1, 0]), "expected three numbers each .* sizes above 0"),
         (cvat_text(rotation=[1]), "expected three numbers each"),
     ],
 )
@@ -257,7 +254,6 @@ def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
     [
         ("x 1 Car", "line 1: expected the index of a frame and a track"),
         ("0 1 Car 0 0", "line 1: expected 15 or 16 words from the type on"),
-        ("0 1 Car 0 0 0 0 0 9 9 0 2 4 0 1 20 0", "sizes above 0"),
         ("0 1 Car 0 0 0 0 0 9 9 1 2 4 nan 1 20 0", "finite numbers"),
     ],
 )
@@ -334,7 +330,6 @@ def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list,
         ("</tracklets>", "", "broken XML: mismatched tag"),
         ("<h>2.0</h>", "", "tracklet 0: w, h, l: expected a number for each"),
         ("<h>2.0</h>", "<h>nan</h>", "tracklet 0: w, h, l: expected a number for each"),
-        ("<h>2.0</h>", "<h>0</h>", "tracklet 0: expected three numbers each of .* sizes above 0"),
         ("<tx>12</tx>", "<tx>x</tx>", "tracklet 0: tx, ty, tz: expected"),
         ("<first_frame>1", "<first_frame>7000", "the frame 7000 is not in the drive"),
         ("PKW", "", "tracklet 0: objectType is missing"),
@@ -367,3 +362,22 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
     found, given = read_boxes(tmp_path / "out/ground_truth.json"), read_boxes(tmp_path / "truth.json")
     for one, other in zip(found.frames, given.frames, strict=True):
         same_boxes(one.boxes, other.boxes)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "kept"),
+    [
+        ("labels.csv", f"{HEAD}\n0,PKW,1,2,0,4,2,0,0\n0,PKW,1,2,0,4,2,1,0", 1),
+        ("openlabel.json", openlabel_text({"val": [0] * 10}), 0),
+        ("default.json", cvat_text(scale=[1, 1, 0]), 0),
+        ("0000.txt", "0 1 Car 0 0 0 0 0 9 9 0 2 4 0 1 20 0\n0 2 Car 0 0 0 0 0 9 9 1 2 4 0 1 20 0", 1),
+        ("labels.xml", CVAT_TRACKLETS.replace("<h>2.0</h>", "<h>0</h>"), 0),
+    ],
+)
+def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, kept: int, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    labelled = WithLabels(Drive(), tmp_path / name)
+    assert any("left out: a size of 0 or less" in note for note in labelled.notes)
+    boxes = [labelled.load(place).ground_truth for place in range(4)]
+    assert all((each.sizes_lwh > 0).all() for each in boxes if each is not None)
+    assert len(labelled.load(0).ground_truth or ()) == kept

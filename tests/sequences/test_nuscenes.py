@@ -4,13 +4,17 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
+from bevcli.evaluation.evaluate import evaluate
+from bevcli.evaluation.inputs import open_ground_truth
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
+from bevcli.sequences.files.boxes_file import BoxesFile, write_boxes
 from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
@@ -194,7 +198,7 @@ def test_several_versions_require_a_choice(root):
             lambda rows: [r for r in rows if "CAM" not in r["filename"]],
             "sample_data.json: no row belongs",
         ),
-        ("sample_data", lambda rows: [{**r, "width": 0} for r in rows], "sample_data.json: camera .* found 0x900"),
+        ("sample_data", lambda rows: [{**r, "width": 0} for r in rows], "sample_data.json .*camera .*found 0"),
         ("sample", lambda rows: [{**r, "timestamp": 1.5e9} for r in rows], "found 1500000000.0: give microseconds"),
         ("sensor", lambda rows: rows[1:], "sensor.json: token"),
         ("category", lambda rows: rows[1:], "instance.json: category .* is missing in category.json"),
@@ -231,6 +235,12 @@ def test_boxes_of_an_impossible_size_are_left_out(size, root):
     frames = [open_sequence(root).load(place) for place in range(2)]
     assert [len(frame.ground_truth) for frame in frames] == [3, 4]
     assert [frame.impossible_boxes for frame in frames] == [1, 0]
+    truth = open_ground_truth(root)
+    assert (truth.impossible_boxes, [len(frame.boxes) for frame in truth.boxes.frames[:2]]) == (1, [3, 4])
+    predictions = root / "predictions.json"
+    scored = [replace(one, boxes=replace(one.boxes, scores=np.ones(len(one.boxes)))) for one in truth.boxes.frames]
+    write_boxes(BoxesFile("world", tuple(scored)), predictions)
+    assert "1 box of the ground truth left out: a size of 0 or less, or not finite" in evaluate(predictions, root).notes
 
 
 def test_scenes_without_frames_are_skipped(root):

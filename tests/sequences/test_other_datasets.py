@@ -261,7 +261,7 @@ def _assert_refused(folder: Path, file: str) -> None:
         ("k1", ["bent"] * 6, '"k1": expected numbers, found string'),
         ("k1", [None] * 6, '"k1": expected numbers'),
         ("fx_px", [float("nan")] * 6, "expected finite numbers"),
-        ("fx_px", [-1.0] * 6, "expected an image size and focal lengths above 0"),
+        ("fx_px", [-1.0] * 6, "expected fx > 0 and fy > 0"),
         ("width_px", [0.5] * 6, '"width_px": expected integers'),
         ("sensor_name", ["ring_front_center"] * 6, "two of one camera"),
         ("cx_px", None, 'no column "cx_px"'),
@@ -279,7 +279,7 @@ def test_a_wrong_column_is_named(column, values, expected, street, tmp_path):
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
-        ("calibration/c.json", '"fx": 6', '"fx": -6', "focal lengths above 0"),
+        ("calibration/c.json", '"fx": 6', '"fx": -6', "fx > 0 and fy > 0"),
         ("calibration/c.json", '"skew": 0.0', '"xi": 0.5', '"xi", which is not supported'),
         ("calibration/c.json", '"names": ["LIDAR", ', '"names": [', "as many names as intrinsics"),
         ("scene_s.json", '"qw": ', '"qw": "a", "q": ', "expected finite numbers qw"),
@@ -316,7 +316,7 @@ def test_impossible_boxes_are_left_out_with_their_number(name, form, street, tmp
     )
     result = CliRunner().invoke(app, ["convert", str(tmp_path / "in"), str(tmp_path / "out"), "--format", form])
     assert result.exit_code == 0
-    assert "2 boxes of the ground truth are left out" in result.output
+    assert "2 boxes of the ground truth left out" in result.output
     assert len(open_sequence(tmp_path / "out").load(0).ground_truth) == len(sizes) - 2
 
 

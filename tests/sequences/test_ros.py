@@ -1,8 +1,10 @@
 """Bags written with the packages of ROS and MCAP, read as sequences."""
 
 import base64
+import contextlib
 import json
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -140,6 +142,20 @@ def test_opening_a_large_bag_reads_few_images(
     assert len(set(read)) < 20
 
 
+def test_of_chunks_without_compression_messages_are_read(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bevcli.sequences.ros.storage import McapFile
+
+    packed = open_sequence(write_mcap(tmp_path / "packed.mcap", messages_of(native, motion))).load(1)
+    monkeypatch.setattr(McapFile, "_chunk", None)
+    path = write_mcap(tmp_path / "plain.mcap", messages_of(native, motion), chunk_size=5_000, packed=False)
+    plain = open_sequence(path).load(1)
+    for name, image in packed.images.items():
+        np.testing.assert_array_equal(plain.images[name].pixels_bgr, image.pixels_bgr)
+        np.testing.assert_array_equal(plain.world_from_ego_at[name].matrix, packed.world_from_ego_at[name].matrix)
+
+
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.999])
 def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
     tmp_path: Path, native: Sequence, motion: EgoMotion, share: float
@@ -210,6 +226,17 @@ def test_poses_that_are_none_are_left_out_with_their_number(
     )
 
 
+def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
+    with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
+        (number,) = database.execute("SELECT id FROM topics WHERE name = '/odom'").fetchone()
+        (row,) = database.execute("SELECT id FROM messages WHERE topic_id = ? LIMIT 1 OFFSET 7", (number,)).fetchone()
+        database.execute("UPDATE messages SET data = x'0001' WHERE id = ?", (row,))
+    sequence = open_sequence(bag)
+    assert any(f"/odom: 1 of {len(motion.timestamps_ns)} poses are left out" in note for note in sequence.notes)
+    assert len(sequence.stamps) == 4
+
+
 def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
     messages = messages_of(native, motion)
     bad = [transform(1, "base_link", f"{name}_optical", NO_POSES["zero"]) for name in native.rig.names]
@@ -238,6 +265,20 @@ def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: 
         messages.append(("/CAM_FRONT/camera_info", "sensor_msgs/CameraInfo", time, unset))
     sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
     np.testing.assert_array_equal(sequence.rig["CAM_FRONT"].intrinsics, native.rig["CAM_FRONT"].intrinsics)
+
+
+@pytest.mark.parametrize(("k", "size", "message"), [(0.01, 64, "implausible focal length"), (50, 0, "image size")])
+def test_a_camera_that_no_calibration_may_hold_is_refused(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, k: float, size: int, message: str
+) -> None:
+    info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
+    info |= {"width": size, "k": [k, 0.0, 32, 0, 50.0, 18, 0, 0, 1]}
+    messages = [
+        (t, kind, time, info if t == "/CAM_FRONT/camera_info" else f)
+        for t, kind, time, f in messages_of(native, motion)
+    ]
+    with pytest.raises(InputError, match=rf"/CAM_FRONT/camera_info.*CAM_FRONT.*{message}"):
+        open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
 
 
 @pytest.mark.parametrize("rectified", [False, True])
@@ -653,6 +694,19 @@ def test_foxglove_schemas(tmp_path: Path, native: Sequence, motion: EgoMotion, f
         np.testing.assert_array_equal(found.images[name].pixels_bgr, image.pixels_bgr)
         np.testing.assert_allclose(found.world_from_ego_at[name].matrix, true.world_from_ego_at[name].matrix, atol=1e-9)
         np.testing.assert_allclose(sequence.rig[name].ego_from_camera, native.rig[name].ego_from_camera, atol=1e-12)
+
+
+@pytest.mark.parametrize("schema", ["foxglove.FrameTransforms", "foxglove.CompressedImage"])
+def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path: Path, native, motion, schema: str) -> None:
+    messages = foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9})
+    kind, place = next((one[1], i) for i, one in enumerate(messages) if one[1] == schema and one[0] != "/tf_static")
+    topic, _, time, fields = messages[place]
+    fields = json.loads(json.dumps(fields, default=lambda data: base64.b64encode(data).decode()))
+    (fields["transforms"][0] if "transforms" in fields else fields)["timestamp"]["sec"] = 10**15
+    messages[place] = (topic, kind, time, fields)
+    found = open_sequence(write_json_mcap(tmp_path / "bag.mcap", messages))
+    assert len(found.stamps) == 4
+    assert found.load(0).images["CAM_BACK"].timestamp_ns == native.load(0).images["CAM_BACK"].timestamp_ns
 
 
 def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:

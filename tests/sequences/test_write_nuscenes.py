@@ -135,7 +135,7 @@ def test_scenes_and_missing_images_are_kept(drive, tmp_path):
     lines = (drive / "frames.csv").read_text().replace("images/CAM_BACK/1.png", "").splitlines()
     scenes = ["scene", "first", "first", "second", "second"]
     (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
-    assert "1 images missing" in convert(drive, tmp_path / "out").output
+    assert "1 image missing" in convert(drive, tmp_path / "out").output
     out = open_sequence(tmp_path / "out")
     assert [stamp.scene for stamp in out.stamps] == scenes[1:]
     assert out.load(1).images.keys() == {"CAM_FRONT"}

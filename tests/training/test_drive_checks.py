@@ -253,7 +253,7 @@ def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_pat
     lines = done.stderr.splitlines()
     assert lines[0] == (
         "a step is 2 updates of the weights, one for each frame of a batch: 1 batch of 1 clip of 2 frames; "
-        "1 steps; drives: 1 to train on, 1 to evaluate on; output: out"
+        "1 step; drives: 1 to train on, 1 to evaluate on; output: out"
     )
     assert lines[1].startswith("note: the drive to train on: no box has the class truck or ")
     assert lines[3].startswith("1/2 updates, ")

@@ -9,6 +9,7 @@ from typing import Any
 
 from bevcli.evaluation.box_format import BoxFormat
 from bevcli.parsing.csv_tables import cell_of
+from bevcli.printing import counted
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import GrowingFile
@@ -67,4 +68,4 @@ def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]
         }
 
 
-FORMAT = BoxFormat("boxes.csv", lambda boxes, target, *_: f"{write_csv(boxes, target)} boxes")
+FORMAT = BoxFormat("boxes.csv", lambda boxes, target, *_: counted(write_csv(boxes, target), "boxes"))

@@ -13,6 +13,7 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, wrap_angle
+from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.writing import write_whole
@@ -24,7 +25,7 @@ NEAR_M = 0.1  # box edges are clipped at this depth
 def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     camera, ego_from_bev = _camera(options, source)
     labels = write_kitti(boxes, camera, ego_from_bev, target)
-    return f"{len(boxes.frames)} frames, {labels} labels of {camera.name}"
+    return f"{counted(len(boxes.frames), 'frames')}, {counted(labels, 'labels')} of {camera.name}"
 
 
 FORMAT = BoxFormat("kitti", _write)

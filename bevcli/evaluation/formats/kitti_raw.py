@@ -15,6 +15,7 @@ from bevcli.evaluation.options import ExportOptions
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, wrap_angle
+from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.writing import write_whole
@@ -38,7 +39,7 @@ def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path)
         in_ego = [boxes.in_ego(frame) for frame in frames]
         root = tracklets(in_ego, tracks, boxes.classes or NUSCENES_CLASSES)
         write_whole(target / scene / "tracklet_labels.xml", HEAD + ElementTree.tostring(root), parents=True)
-    return f"{len(boxes.frames)} frames, {count} tracks"
+    return f"{counted(len(boxes.frames), 'frames')}, {counted(count, 'tracks')}"
 
 
 FORMAT = BoxFormat("kitti_raw", _write)

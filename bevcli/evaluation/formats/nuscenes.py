@@ -15,6 +15,7 @@ from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
+from bevcli.printing import counted
 from bevcli.sequences.files.box_json import boxes_from_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
@@ -170,7 +171,7 @@ def _yaw(rotation: Any, where: str) -> float:
     return yaw_of_rotation(rotation_from_quaternion(rotation))
 
 
-DETECTION = BoxFormat("results_nusc.json", lambda boxes, target, *_: f"{write_submission(boxes, target)} samples")
+DETECTION = BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples"))
 TRACKING = BoxFormat(
-    "tracking_nusc.json", lambda boxes, target, *_: f"{write_submission(boxes, target, tracking=True)} samples"
+    "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
 )

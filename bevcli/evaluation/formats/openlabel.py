@@ -14,6 +14,7 @@ from bevcli.evaluation.box_format import BoxFormat
 from bevcli.evaluation.formats.tracks import tracks_of
 from bevcli.evaluation.options import ExportOptions
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.writing import write_whole
 
@@ -24,7 +25,7 @@ COLUMNS = {"score": "scores", "track_score": "track_scores", "visibility": "visi
 def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     content = openlabel(boxes)
     write_whole(target, json.dumps(content, allow_nan=False).encode())
-    return f"{len(boxes.frames)} frames, {len(content['openlabel']['objects'])} objects"
+    return f"{counted(len(boxes.frames), 'frames')}, {len(content['openlabel']['objects'])} objects"
 
 
 FORMAT = BoxFormat("openlabel.json", _write)

@@ -20,7 +20,7 @@ from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
 from bevcli.sequences.argoverse2.format import Argoverse2Options
-from bevcli.sequences.files.calibration_file import LARGEST_SIZE
+from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
 from bevcli.sequences.native.folder import rig_notes
@@ -216,15 +216,10 @@ def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
 def _camera(
     name: str, size: list[int], lens: Array, ego_from_camera: Array, path: Path, own: Argoverse2Options
 ) -> Camera:
-    width, height = size
-    fx, fy, cx, cy, k1, k2, k3 = lens
-    if not (0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
-        raise InputError(
-            f"{path}: {name}: expected an image size and focal lengths above 0, found {width}x{height}, {fx:g}, {fy:g}"
-        )
+    (width, height), (fx, fy, cx, cy, k1, k2, k3) = size, lens
     intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     distortion = brown_conrady((k1, k2, 0, 0, k3, 0, 0, 0)) if own.distorted else None
-    return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
+    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, distortion), path)
 
 
 def _image_times(folder: Path) -> Times:

@@ -15,7 +15,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_eg
 from bevcli.geometry.ego_motion import PoseTable
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
-from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
+from bevcli.sequences.files.calibration_file import checked_camera
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
@@ -132,11 +132,6 @@ class Calibration:
         """A camera with the size of its image (width, height). Raises InputError."""
         lens = self.lenses[name]
         fx, fy, cx, cy = lens.numbers(PINHOLE)
-        if not (is_file_name(name) and 0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
-            raise InputError(
-                f"{lens.where}: camera {name:.60}: expected an image size and focal lengths above 0, "
-                f"found {size[0]}x{size[1]}, {fx:g}, {fy:g}"
-            )
         for other in OTHER_LENSES:
             if lens.numbers((other,), 0.0).any():
                 raise InputError(
@@ -146,7 +141,7 @@ class Calibration:
         (skew,) = lens.numbers(("skew",), 0.0)
         intrinsics = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1]])
         distortion = brown_conrady(lens.numbers(BROWN_CONRADY, 0.0))
-        return Camera(name, *size, intrinsics, self.ego_from[name].matrix, distortion)
+        return checked_camera(Camera(name, *size, intrinsics, self.ego_from[name].matrix, distortion), lens.where)
 
 
 def read_calibration(path: Path) -> Calibration:

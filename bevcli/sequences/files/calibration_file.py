@@ -16,7 +16,14 @@ from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
-from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
+from bevcli.sequences.files.json_fields import (
+    LONGEST_VALUE,
+    Report,
+    parse_numbers,
+    parse_transform,
+    require,
+    transform_to_json,
+)
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
@@ -186,6 +193,11 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
         return None
     is_plausible = _are_plausible(intrinsics, width, height, report)
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion) if is_plausible else None
+
+
+def checked_camera(camera: Camera, where: Path | str) -> Camera:
+    """A camera that calibration.json may hold. where: start of an error message. Raises InputError for any other."""
+    return require(parse_camera, camera.name, _camera_to_json(camera), where=where, camera=camera.name)
 
 
 def is_file_name(name: str) -> bool:

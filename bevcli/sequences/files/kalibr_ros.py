@@ -82,7 +82,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
         "width": int(width),
         "height": int(height),
         "intrinsics": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-        "distortion": _lens(entry.get("distortion_model", "none"), entry.get("distortion_coeffs") or [], where),
+        "distortion": lens_fields(entry.get("distortion_model", "none"), entry.get("distortion_coeffs") or [], where),
     }
     if "T_cn_cnm1" in entry:
         fields[CHAIN] = require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where)
@@ -99,7 +99,7 @@ def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
         "width": document.get("image_width", document.get("width")),
         "height": document.get("image_height", document.get("height")),
         "intrinsics": [numbers[0:3], numbers[3:6], numbers[6:9]],
-        "distortion": _lens(document.get("distortion_model") or "plumb_bob", coefficients or [], where),
+        "distortion": lens_fields(document.get("distortion_model") or "plumb_bob", coefficients or [], where),
     }
 
 
@@ -112,15 +112,18 @@ def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> lis
     return require(parse_numbers, owner, name, (count,), where=where).tolist()
 
 
-def _lens(model: object, coefficients: object, where: str) -> Fields:
+def lens_fields(model: object, coefficients: object, where: str) -> Fields:
+    """The lens as in calibration.json, of a model's name in ROS, Kalibr or OpenCV. Raises InputError for another."""
     if not isinstance(coefficients, list):
         raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
-    known = {**LENS_NAMES, "none": "none"}
-    if not isinstance(model, str) or model not in known:
-        raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {', '.join(known)})")
     if not any(coefficients):
         return {"model": "none"}
-    return {"model": known[model], "coefficients": coefficients}
+    known = LENS_NAMES.get(str(model).lower() or "plumb_bob")
+    if known is None:
+        expected = ", ".join(LENS_NAMES)
+        raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {expected})")
+    used = 8 if known == "brown_conrady" and not any(coefficients[8:]) else None  # OpenCV states up to 14, of 0
+    return {"model": known, "coefficients": coefficients[:used]}
 
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:

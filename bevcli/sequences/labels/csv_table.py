@@ -17,8 +17,7 @@ from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, Moment
 
 LARGEST_BYTES = 512 * MIB
-SIZES = ("length", "width", "height")
-NUMBERS = ("x", "y", "z", *SIZES, "yaw")
+NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw")
 OPTIONAL_NUMBERS = ("vx", "vy", "visibility", "num_points")
 OPTIONAL = ("frame", "timestamp_ns", "frame_of_reference", "attribute", "instance", *OPTIONAL_NUMBERS)
 UNUSED = ("scene", "score", "track_score", "duplicate")  # of an export, without effect on ground truth
@@ -104,10 +103,7 @@ def _moments(path: Path, rows: list[CsvRow]) -> dict[Moment, list[int]]:
 
 def _boxes(rows: list[CsvRow], columns: list[str]) -> Boxes3D:
     numbers = np.array([[row.number(name) for name in NUMBERS] for row in rows]).reshape(-1, len(NUMBERS))
-    for row, sizes in zip(rows, numbers[:, 3:6], strict=True):
-        if min(sizes) <= 0:
-            column = SIZES[sizes.argmin()]
-            raise row.error(column, f'expected a number above 0, found "{row.cells[column]:.40}"')
+    for row in rows:
         if not row.cells["class"]:
             raise row.error("class", "is empty (expected the name of a class)")
     points = _optional(rows, "num_points")

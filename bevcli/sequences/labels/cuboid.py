@@ -30,8 +30,8 @@ def cuboid_of(
     about x, y and z, radians: Rx Ry Rz. size: (3,) length, width and height, metres.
     """
     numbers = position, rotation, size
-    if [len(each) for each in numbers] != [3, 3, 3] or not (np.isfinite(numbers).all() and min(size) > 0):
-        raise InputError(f"{where}: expected three numbers each of position, rotation and size, sizes above 0")
+    if [len(each) for each in numbers] != [3, 3, 3] or not np.isfinite(numbers).all():
+        raise InputError(f"{where}: expected three numbers each of position, rotation and size")
     (sx, sy, sz), (cx, cy, cz) = np.sin(rotation), np.cos(rotation)
     yaw = np.arctan2(cx * sz + sx * sy * cz, cy * cz)
     box = Boxes3D(

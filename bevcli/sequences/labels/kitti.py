@@ -76,8 +76,8 @@ def _box(where: str, words: list[str], track: str, camera: Camera) -> Boxes3D:
         raise InputError(
             f"{where}: expected {WORDS[0]} or {WORDS[1]} words from the type on, with {', '.join(NAMES)} as numbers"
         ) from None
-    if len(words) not in WORDS or not np.isfinite([x, y, z, rotation_y]).all() or not min(height, width, length) > 0:
-        raise InputError(f"{where}: expected {WORDS[0]} or {WORDS[1]} words, finite numbers, and sizes above 0")
+    if len(words) not in WORDS or not np.isfinite([height, width, length, x, y, z, rotation_y]).all():
+        raise InputError(f"{where}: expected {WORDS[0]} or {WORDS[1]} words, and finite numbers")
     rotation = camera.ego_from_camera[:3, :3]
     heading = rotation @ [np.cos(rotation_y), 0, -np.sin(rotation_y)]
     center = rotation @ [x, y, z] + camera.ego_from_camera[:3, 3] + [0, 0, height / 2]

@@ -1,16 +1,17 @@
 """LabelFormat: a format of labels, registered under `bevcli.label_formats`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
 import msgspec
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.parsing.files import MIB, read_bytes
+from bevcli.printing import counted
 from bevcli.registry import entries, load
 from bevcli.sequences.options import LabelOptions
 
@@ -92,4 +93,8 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     found = next((one for one in known if one.recognises(path)), None)
     if found is None:
         raise InputError(f"{path}: is no file of labels (expected {' or '.join(one.name for one in known)})")
-    return found.read(path, rig, options)
+    labels = found.read(path, rig, options)
+    frames = tuple(replace(each, boxes=each.boxes.possible()) for each in labels.frames)
+    left_out = sum(len(each.boxes) for each in labels.frames) - sum(len(each.boxes) for each in frames)
+    note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
+    return replace(labels, frames=frames, notes=(*labels.notes, *note))

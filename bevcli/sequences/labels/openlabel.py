@@ -96,8 +96,8 @@ def _frame(path: Path, content: _Content, number: str, frame: _Frame) -> tuple[M
 def _cuboid(where: str, key: str, kind: str, cuboid: _Cuboid) -> Cuboid:
     """One cuboid. Its rotation is a quaternion x, y, z, w, or three angles about x, y and z."""
     values = np.array(cuboid.val, dtype=float)
-    if values.shape not in ((10,), (9,)) or not np.isfinite(values).all() or not (values[-3:] > 0).all():
-        raise InputError(f"{where}: object {key:.40}: expected a cuboid of 10 or 9 numbers with sizes above 0")
+    if values.shape not in ((10,), (9,)) or not np.isfinite(values).all():
+        raise InputError(f"{where}: object {key:.40}: expected a cuboid of 10 or 9 numbers")
     x, y, z, w = values[3:7] if len(values) == 10 else _quaternion(*values[3:6])
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     tilt_deg = float(np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))))

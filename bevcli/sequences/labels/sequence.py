@@ -11,6 +11,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.printing import counted
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.labels.label_format import LabelledFrame, Labels, read_labels
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
@@ -54,11 +55,11 @@ class WithLabels(DerivedSequence):
         return self._labelled(self.sequence.load(place), place)
 
     def _labelled(self, frame: Frame, place: int) -> Frame:
-        return replace(frame, ground_truth=self._boxes.get(place))
+        return replace(frame, ground_truth=self._boxes.get(place), impossible_boxes=0)
 
     def _summary(self) -> str:
         counts = ", ".join(f"{name} ({count})" for name, count in sorted(self.class_counts.items()))
-        parts = [f"{self._listed} frames with labels: {counts or 'none'}"]
+        parts = [f"{counted(self._listed, 'frames')} with labels: {counts or 'none'}"]
         empty, unlabelled = len(self._boxes) - self._listed, len(self.stamps) - len(self._boxes)
         if empty:
             parts.append(f"{empty} frames without rows are empty (see `unlisted_frames`)")

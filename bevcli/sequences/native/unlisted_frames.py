@@ -17,6 +17,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import is_there, read_text
+from bevcli.printing import counted
 from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameEntry, ImageSource
 from bevcli.sequences.video import count_and_rate
 
@@ -132,7 +133,7 @@ def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> 
         entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
     how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
     where = "" if are_times or common.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
-    return tuple(entries), f"frames.csv is missing: found {len(numbers)} frames, {how}{where}"
+    return tuple(entries), f"frames.csv is missing: found {counted(len(numbers), 'frames')}, {how}{where}"
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
@@ -183,7 +184,7 @@ def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> tuple[tuple[Fra
         entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{leading.path}#{place}"))
     has_timing = is_there(folder / FILE_NAME)
     stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
-    note = f"frames.csv is missing: found {len(entries)} frames from {name}, {leading.rate_hz:g} per second"
+    note = f"frames.csv is missing: found {counted(len(entries), 'frames')} from {name}, {leading.rate_hz:g} per second"
     return tuple(entries), f"{note}, {stated}"
 
 

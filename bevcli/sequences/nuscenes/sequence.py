@@ -14,7 +14,7 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
+from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.nuscenes.cache import open_index
@@ -92,10 +92,8 @@ class TableSequence(Sequence):
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""
-        samples, spans = (
-            self.index.samples,
-            [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes],
-        )
+        samples = self.index.samples
+        spans = [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes]
         lidars = np.concatenate([samples.lidars[slice(*span)] for span in spans])
         if (lidars < 0).any():
             yield (
@@ -253,11 +251,7 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
 
 def _camera(index: NuScenesIndex, sensor: int, image: int, tables: Path) -> Camera:
     width, height = (int(value) for value in index.images.sizes[image])
-    name = str(index.sensors.channels[sensor])
-    if not is_file_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
-        raise InputError(
-            f'{tables / "sample_data.json"}: camera "{name:.60}": expected a name without a slash and an image size, '
-            f"found {width}x{height}"
-        )
     intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
-    return Camera(name, width, height, intrinsics, _pose_of(index.sensors, sensor).matrix, lens)
+    where = f"{tables}: sample_data.json and calibrated_sensor.json"
+    ego_from_camera, name = _pose_of(index.sensors, sensor).matrix, str(index.sensors.channels[sensor])
+    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, lens), where)

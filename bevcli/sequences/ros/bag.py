@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence as Indices
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,19 +92,18 @@ class Bag:
 
         Raises InputError as `read` for the first message, if no message has a value.
         """
+        values: list[_Value] = []
         invalid: InputError | None = None
-        empty: _Value | None = None
         for index in range(min(len(self.times(topic)), MOST_INVALID)):
             try:
-                empty = self.read(topic, index, parse, kind)
+                values.append(self.read(topic, index, parse, kind))
             except InputError as error:
                 invalid = invalid or error
-            else:
-                if empty:
-                    return empty
-        if empty is None and invalid is not None:
+            if values and values[-1]:
+                break
+        if not values and invalid is not None:
             raise invalid
-        return cast(_Value, empty)
+        return values[-1]
 
     def _bytes(self, topic: str, index: int) -> bytes:
         for file in self._files:

@@ -1,31 +1,26 @@
-"""The vehicle's poses in a bag, read around a time on demand: from a topic with poses, or from transforms."""
+"""The vehicle's poses in a bag, from a topic with poses or from transforms, and the times of its images."""
 
-from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache, reduce
+import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rigid
+from bevcli.geometry.transforms import Array, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
 from bevcli.sequences.ros.bag import Bag, spread
 from bevcli.sequences.ros.messages import Transform, timestamp_ns, transforms_of
 
 SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
-READ_WHOLE = 2048 * MIB  # of larger bags, not the times of all messages are read
-Sample = tuple[int, Pose]  # time ns, pose at that time
-ReadMessage = Callable[[int], dict[str, list[Sample]]]  # message -> samples by link
-MARGIN = 4  # samples on each side of a time: derivatives of second order, and one more
-MESSAGES_AT_ONCE = 8
-MOST_MESSAGES = 8192  # around one time; more without a pose is a gap
+MOST_MESSAGES = 8192  # of a topic, while a frame has had no valid transform
+READ_WHOLE = 2048 * MIB  # of larger bags, not the times of all images are read
 KINEMATICS_STEP_NS = 50_000_000  # poses closer than this in time are thinned before they are differentiated
-SAMPLES = 5
+SAMPLES = 5  # images of a topic
 LARGEST_SPREAD_NS = 50_000_000  # of the delay between capture and recording, among the samples
 FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
 FIXES_TRIED = 50
@@ -96,104 +91,19 @@ def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform]
 
 def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
     """A note on the poses that are left out; none where all are valid."""
-    invalid, reason = are_valid.count(False), "NaN, or a rotation that is not a quaternion of norm 1"
+    invalid, reason = are_valid.count(False), "NaN, a rotation that is not a quaternion of norm 1, or a broken message"
     return [f"{source}: {invalid} of {len(are_valid)} poses are left out: {reason}"] if invalid else []
 
 
-class BagEgoMotion:
-    """The vehicle's poses in a bag, with the methods of `EgoMotion`.
-
-    Only messages around the asked times are read. Kinematics are derived from the poses.
-    """
-
-    def __init__(
-        self, times: np.ndarray, read: ReadMessage, links: Sequence[str], source: str, ego: Array | None = None
-    ) -> None:
-        """times: (N,) of the messages, ns. read: the samples of a message by link. links: from the world to the ego
-        vehicle; their poses are multiplied. source: for error messages. ego: (4, 4) child_from_ego, None: the same.
-        """
-        self.notes: list[str] = []
-        self._times, self._links, self._source, self._ego = times, tuple(links), source, ego
-        self._read = lru_cache(maxsize=1 << 14)(read)
-        self._window = lru_cache(maxsize=64)(self._read_window)
-        self.first_ns = self._end(range(len(times)), max)
-        self.last_ns = self._end(range(len(times) - 1, -1, -1), min)
-
-    def pose_at(self, timestamp_ns: int) -> Pose:
-        """world_from_ego at a time, interpolated. Raises InputError if there is no pose around it."""
-        return self._window(timestamp_ns).pose_at(timestamp_ns)
-
-    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """Acceleration, angular rate and velocity at a time. Raises InputError as `pose_at`."""
-        return self._window(timestamp_ns).kinematics_at(timestamp_ns)
-
-    def _end(self, indices: range, outermost: Callable[[list[int]], int]) -> int:
-        """Time of the first sample of every link from one end of the bag on."""
-        found: dict[str, int] = {}
-        for index in indices[:MOST_MESSAGES]:
-            for link, samples in self._read(index).items():
-                found.setdefault(link, samples[0][0] if indices.step > 0 else samples[-1][0])
-            if len(found) == len(self._links):
-                return outermost(list(found.values()))
-        raise InputError(f"{self._source}: has no poses of {' and '.join(self._links)}")
-
-    def _read_window(self, timestamp_ns: int) -> EgoMotion:
-        """The poses around a time."""
-        message = int(np.searchsorted(self._times, timestamp_ns))
-        grow = MESSAGES_AT_ONCE
-        low, high = message - grow, message + grow
-        while True:
-            indices = range(max(low, 0), min(high, len(self._times)))
-            samples = self._samples(indices)
-            times = [time for time, _ in max(samples.values(), key=len)]
-            has_all = all(samples.values())
-            before = has_all and _reaches(times[::-1], timestamp_ns, -1)
-            after = has_all and _reaches(times, timestamp_ns, 1)
-            is_complete = (before or indices.start == 0) and (after or indices.stop == len(self._times))
-            if is_complete or len(indices) > MOST_MESSAGES:
-                break
-            low, high = low - (0 if before else grow), high + (0 if after else grow)
-            grow *= 2
-        if not has_all:
-            raise InputError(f"{self._source}: has no pose around {timestamp_ns} ns")
-        return self._motion(samples, times)
-
-    def _samples(self, indices: range) -> dict[str, list[Sample]]:
-        """Samples by link, in order of time, one a time."""
-        found: dict[str, dict[int, Pose]] = {link: {} for link in self._links}
-        for index in indices:
-            for link, samples in self._read(index).items():
-                found[link].update(samples)
-        return {link: sorted(by_time.items(), key=lambda sample: sample[0]) for link, by_time in found.items()}
-
-    def _motion(self, samples: dict[str, list[Sample]], times: list[int]) -> EgoMotion:
-        if len(self._links) == 1 and self._ego is None:
-            poses = [pose for _, pose in samples[self._links[0]]]  # with the sign of the quaternion as stated
-        else:
-            last = [] if self._ego is None else [self._ego]
-            chains = ([*(_at(samples[link], time).matrix for link in self._links), *last] for time in times)
-            poses = [Pose.from_matrix(reduce(np.matmul, chain, np.eye(4))) for chain in chains]
-        stamps = np.array(times, dtype=np.int64)
-        translations = np.stack([pose.translation for pose in poses])
-        quaternions = np.stack([pose.quaternion for pose in poses])
-        return EgoMotion(stamps, translations, quaternions, *_kinematics(stamps, translations, quaternions))
-
-
-def _reaches(times: list[int], timestamp_ns: int, sign: int) -> bool:
-    """True if enough samples lie on one side of a time for derivatives there. times: the outermost last."""
-    beyond = [time for time in times if sign * (time - timestamp_ns) >= 0]
-    return len(beyond) > MARGIN and sign * (beyond[-1] - timestamp_ns) >= MARGIN * KINEMATICS_STEP_NS
-
-
-def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> BagEgoMotion:
-    """Poses of a topic with Odometry or poses. child_from_ego: (4, 4) from the frame of the poses, None: the same."""
+def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> tuple[EgoMotion, list[str]]:
+    """Poses of a topic with Odometry or poses, and notes. child_from_ego: (4, 4), None: the poses are the vehicle's."""
     return _motion_from(bag, [topic], [topic], lambda one: topic, child_from_ego)
 
 
 def motion_from_transforms(
     bag: Bag, topics: Sequence[str], frames: Sequence[str], child_from_ego: Array | None
-) -> BagEgoMotion:
-    """Poses along a chain of transforms. topics: with transforms that change.
+) -> tuple[EgoMotion, list[str]]:
+    """Poses along a chain of transforms, and notes. topics: with transforms that change.
 
     frames: the frame of the world first, each the parent of the next. child_from_ego: (4, 4) from the last of them to
     the ego vehicle, None if they are the same.
@@ -209,94 +119,98 @@ def _motion_from(
     links: Sequence[str],
     link_of: Callable[[Transform], str | None],
     child_from_ego: Array | None,
-) -> BagEgoMotion:
-    """Poses along links. link_of: the link that a transform states, None for none of them."""
+) -> tuple[EgoMotion, list[str]]:
+    """Poses along links, which are multiplied, and notes. link_of: the link of a transform, None for none of them."""
+    samples: dict[str, dict[int, Pose]] = {link: {} for link in links}
     are_valid: list[bool] = []
-
-    def seen(message: Any) -> None:
-        are_valid.extend(one.parent_from_child is not None for one in transforms_of(message) if link_of(one))
-
-    parts = capture_times(bag, topics, seen)
-    places = [(topic, number) for topic, (_, numbers) in parts.items() for number in numbers.tolist()]
-    times = np.concatenate([times for times, _ in parts.values()])
-    order = np.argsort(times, kind="stable")
-    times = times[order]
-
-    def read(index: int) -> dict[str, list[Sample]]:
-        found: dict[str, list[Sample]] = {}
-        for one in read_transforms(bag, *places[order[index]]):
-            link = link_of(one)
-            if link is not None and one.parent_from_child is not None:
-                found.setdefault(link, []).append((one.timestamp_ns or int(times[index]), one.parent_from_child))
-        return found
-
+    for time, topic, number in _in_order(bag, {topic: range(len(bag.times(topic))) for topic in topics}):
+        try:
+            stated = [(link, one) for one in read_transforms(bag, topic, number) if (link := link_of(one))]
+        except InputError:
+            are_valid.append(False)
+            continue
+        for link, one in stated:
+            are_valid.append(one.parent_from_child is not None)
+            if one.parent_from_child is not None:
+                samples[link][one.timestamp_ns or time] = one.parent_from_child
     source = " and ".join(topics)
-    motion = BagEgoMotion(times, read, links, f"{bag.path}: {source}", child_from_ego)
-    motion.notes += invalid_note(source, are_valid)
-    return motion
-
-
-def _at(samples: list[Sample], time: int) -> Pose:
-    """The pose of one link at a time; outside of its samples, the nearest."""
-    times = [stamp for stamp, _ in samples]
-    later = bisect_left(times, time)
-    if later in (0, len(times)) or times[later] == time:
-        return samples[min(later, len(times) - 1)][1]
-    earlier = later - 1
-    fraction = (time - times[earlier]) / (times[later] - times[earlier])
-    return interpolate(samples[earlier][1], samples[later][1], fraction)
-
-
-def _kinematics(times: np.ndarray, translations: Array, quaternions: Array) -> tuple[Array, Array, Array]:
-    """Derived from poses at least KINEMATICS_STEP_NS apart, because differences of close poses are noise."""
-    kept = [0]
-    for place in range(1, len(times)):
-        if times[place] - times[kept[-1]] >= KINEMATICS_STEP_NS:
-            kept.append(place)
-    derived = derive_kinematics(times[kept], translations[kept], quaternions[kept])
-    seconds = (times - times[0]) / 1e9
-    return tuple(  # type: ignore[return-value]
-        np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1) for part in derived
+    parts = [_motion(sorted(own.items())) for own in samples.values() if own]
+    first, last = max((part.first_ns for part in parts), default=0), min((part.last_ns for part in parts), default=0)
+    if len(parts) < len(links) or first > last:
+        raise InputError(f"{bag.path}: {source}: has no poses of {' and '.join(links)}")
+    notes = invalid_note(source, are_valid)
+    if len(parts) == 1 and child_from_ego is None:
+        return parts[0], notes  # with the sign of the quaternion as stated
+    times = np.unique(np.concatenate([part.timestamps_ns for part in parts]))
+    ego = [] if child_from_ego is None else [child_from_ego]
+    chains = (
+        (time, [*(part.pose_at(time).matrix for part in parts), *ego])
+        for time in times[(times >= first) & (times <= last)].tolist()
     )
+    return _motion([(time, Pose.from_matrix(reduce(np.matmul, chain))) for time, chain in chains]), notes
 
 
-def capture_times(
-    bag: Bag, topics: Iterable[str], seen: Callable[[Any], None] = lambda message: None
-) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """By topic, (N,) times at which its messages were captured, ns, in order; and (N,) their numbers.
+def _motion(samples: Sequence[tuple[int, Pose]]) -> EgoMotion:
+    """samples: times in ns and poses.
+
+    Kinematics come from poses at least KINEMATICS_STEP_NS apart, because differences of close poses are noise.
+    """
+    times = np.array([time for time, _ in samples], dtype=np.int64)
+    translations = np.stack([pose.translation for _, pose in samples])
+    quaternions = np.stack([pose.quaternion for _, pose in samples])
+    kept = [0]
+    for place, time in enumerate(times.tolist()):
+        if time - times[kept[-1]] >= KINEMATICS_STEP_NS:
+            kept.append(place)
+    seconds = (times - times[0]) / 1e9
+    kinematics = (
+        np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1)
+        for part in derive_kinematics(times[kept], translations[kept], quaternions[kept])
+    )
+    return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=False)
+
+
+def capture_times(bag: Bag, topics: Iterable[str]) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """By topic of images, (N,) times at which they were captured, ns, in order; and (N,) the numbers of the messages.
 
     The index of a bag has the times of recording only, in another order where messages were late. So all messages are
     read. Of a bag above READ_WHOLE, the delay is taken from a few messages; if it differs much among them, such as in
-    a bag that was replayed at another speed, all messages are read, too. seen: is called with the messages read.
+    a bag that was replayed at another speed, all messages are read, too.
     """
-
-    def stated(topic: str, number: int) -> int:
-        try:
-            message = bag.message(topic, number)
-            seen(message)
-            return timestamp_ns(message) or next((one.timestamp_ns for one in transforms_of(message)), 0)
-        except (InputError, AttributeError, ValueError):
-            return 0
-
     logged = {topic: bag.times(topic) for topic in topics}
-    is_small = bag.size <= READ_WHOLE
-    numbers = {topic: range(len(own)) if is_small else spread(len(own), SAMPLES) for topic, own in logged.items()}
-    # In the order of recording, so that each chunk is decompressed once.
-    places = sorted((int(own[number]), topic, number) for topic, own in logged.items() for number in numbers[topic])
-    times = {(topic, number): stated(topic, number) for _, topic, number in places}
+    numbers = {topic: range(len(own)) for topic, own in logged.items()}
+    samples = numbers if bag.size <= READ_WHOLE else {topic: spread(len(own), SAMPLES) for topic, own in logged.items()}
+    stated = _stated_times(bag, samples)
     found = {}
     for topic, own in logged.items():
-        delays = [time - int(own[number]) for (other, number), time in times.items() if other == topic and time]
-        captured = own + int(np.median(delays or [0]))
-        if is_small or (delays and max(delays) - min(delays) > LARGEST_SPREAD_NS):
-            exact = (times[topic, number] if is_small else stated(topic, number) for number in range(len(own)))
-            captured = np.array([time or rough for time, rough in zip(exact, captured.tolist(), strict=True)], np.int64)
+        delays = [time - int(own[number]) for number, time in stated[topic].items() if time] or [0]
+        if max(delays) - min(delays) > LARGEST_SPREAD_NS and len(stated[topic]) < len(own):
+            stated |= _stated_times(bag, {topic: numbers[topic]})
+        captured = own + int(np.median(delays))
+        if len(stated[topic]) == len(own):
+            captured = np.array([stated[topic][number] or rough for number, rough in enumerate(captured)], np.int64)
         order = np.argsort(captured, kind="stable")
         found[topic] = (captured[order], order)
     return found
 
 
-def find_geo_origin(bag: Bag, motion: EgoMotion | BagEgoMotion | None) -> GeoOrigin | None:
+def _stated_times(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> dict[str, dict[int, int]]:
+    """The times that messages state, ns, by topic and number; 0 for none."""
+    found: dict[str, dict[int, int]] = {topic: {} for topic in numbers}
+    for _, topic, number in _in_order(bag, numbers):
+        found[topic][number] = 0
+        with contextlib.suppress(InputError, AttributeError, ValueError):
+            found[topic][number] = timestamp_ns(bag.message(topic, number))
+    return found
+
+
+def _in_order(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> list[tuple[int, str, int]]:
+    """Time of recording, topic and number of messages, in the order of recording: each chunk is decompressed once."""
+    logged = {topic: bag.times(topic).tolist() for topic in numbers}
+    return sorted((logged[topic][number], topic, number) for topic, own in numbers.items() for number in own)
+
+
+def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
     """The place of the world frame on Earth: the first valid NavSatFix, at the vehicle's place at its time.
 
     The world's x axis is taken as east and y as north, as ROS's REP 103 and 105 say of a map frame. The antenna counts

@@ -14,10 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, Distortion
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, Pose, rigid
-from bevcli.parsing.documents import parse_json
-from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS, LENS_NAMES
+from bevcli.parsing.documents import LARGEST_INTEGER, parse_json
+from bevcli.sequences.files.calibration_file import parse_camera
+from bevcli.sequences.files.json_fields import require, transform_to_json
+from bevcli.sequences.files.kalibr_ros import lens_fields
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for
@@ -132,13 +134,14 @@ class Transform:
 
 
 def timestamp_ns(message: Any) -> int:
-    """The time that a message states, ns; 0 if it states none."""
+    """The time that a message states, ns; 0 if it states none, or one that is too large."""
     header = getattr(message, "header", None)
     stamp = header.stamp if header is not None else getattr(message, "timestamp", None)
     if stamp is None:
         return 0
     seconds = _first(stamp, "sec", "seconds")
-    return int(seconds) * 1_000_000_000 + int(_first(stamp, "nanosec", "nsec", "nanos", "nanoseconds"))
+    time = int(seconds) * 1_000_000_000 + int(_first(stamp, "nanosec", "nsec", "nanos", "nanoseconds"))
+    return time if abs(time) <= LARGEST_INTEGER else 0
 
 
 def frame_of(message: Any) -> str:
@@ -181,7 +184,7 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
     ego_from_camera: (4, 4) of the optical frame, metres. rectified: lens distortion was removed from the images. where:
     start of an error message.
     K and P of a CameraInfo are those of the whole sensor: the image is its region of interest, then binned.
-    Raises InputError if the intrinsics are not set or have an unknown distortion model.
+    Raises InputError if the intrinsics are not set or not those of a camera, or have an unknown distortion model.
     """
     binning = [max(1, int(getattr(message, name, 1) or 1)) for name in ("binning_x", "binning_y")]
     region = getattr(message, "roi", None)
@@ -191,35 +194,22 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
     scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
     image_from_sensor = scale @ [[1, 0, -region.x_offset], [0, 1, -region.y_offset], [0, 0, 1]]
     intrinsics = image_from_sensor @ _matrix(_first(message, "k", "K"), 3, 3)
-    coefficients = [float(d) for d in _first(message, "d", "D")]
-    is_finite = np.isfinite([*intrinsics.ravel(), *coefficients]).all()
-    if not (is_finite and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0 and width > 0 and height > 0):
-        raise InputError(
-            f"{where}: the camera is not calibrated (K or the size is zero or not a number): pass `calibration=FILE`"
-        )
-    lens = _distortion(str(message.distortion_model), coefficients, where)
+    if not (np.isfinite(intrinsics).all() and min(intrinsics[0, 0], intrinsics[1, 1]) > 0):
+        raise InputError(f"{where}: the camera is not calibrated (K is zero or NaN): pass `calibration=FILE`")
     projection = image_from_sensor @ _matrix(_first(message, "p", "P"), 3, 4)
     rotation = _matrix(_first(message, "r", "R"), 3, 3)
     if rectified and projection[0, 0] > 0:
         rectified_from_camera = rotation if abs(np.linalg.det(rotation) - 1) < 1e-3 else np.eye(3)
-        ego_from_camera = ego_from_camera @ rigid((0, 0, 0), rectified_from_camera.T)
-        return Camera(name, width, height, projection[:, :3], ego_from_camera)
-    return Camera(name, width, height, intrinsics, ego_from_camera, None if rectified else lens)
-
-
-def _distortion(model: str, coefficients: list[float], where: str) -> Distortion | None:
-    if not any(coefficients):
-        return None
-    known = LENS_NAMES.get(model.lower() or "plumb_bob")
-    if known is None:
-        raise InputError(f"{where}: distortion model {model} is not supported (expected {', '.join(LENS_NAMES)})")
-    counts = COEFFICIENT_COUNTS[known]
-    if known == "brown_conrady" and len(coefficients) > 8 and not any(coefficients[8:]):
-        coefficients = coefficients[:8]
-    if len(coefficients) not in counts:
-        expected = " or ".join(map(str, counts))
-        raise InputError(f"{where}: {model} has {len(coefficients)} coefficients (expected {expected})")
-    return Distortion(known, tuple(coefficients))  # type: ignore[arg-type]
+        intrinsics, ego_from_camera = projection[:, :3], ego_from_camera @ rigid((0, 0, 0), rectified_from_camera.T)
+    coefficients = [] if rectified else [float(d) for d in _first(message, "d", "D")]
+    fields = {
+        "width": width,
+        "height": height,
+        "intrinsics": intrinsics.tolist(),
+        "distortion": lens_fields(message.distortion_model, coefficients, where),
+        "ego_from_camera": transform_to_json(ego_from_camera),
+    }
+    return require(parse_camera, name, fields, where=where, camera=name)
 
 
 def _pose(translation: Any, rotation: Any) -> Pose | None:

@@ -21,7 +21,6 @@ from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.ego_motion import (
-    BagEgoMotion,
     TransformTree,
     capture_times,
     find_geo_origin,
@@ -42,7 +41,7 @@ CALIBRATION_FILE, EGO_MOTION_FILE = "calibration.json", "ego_motion.csv"
 
 
 class RosSequence(Sequence):
-    """A bag as a `Sequence`. Opening it reads the index, the calibration and the static transforms.
+    """A bag as a `Sequence`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
 
@@ -78,7 +77,6 @@ class RosSequence(Sequence):
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
             *rig_notes(self.rig, "the calibration" if rig else "a bag"),
             *motion_notes,
-            *getattr(self._motion, "notes", ()),
             *gaps,
         )
         self._images = ImageReader(strict=common.strict)
@@ -177,9 +175,7 @@ class _VehicleReader:
             )
         return found
 
-    def motion(
-        self, use: EgoMotionUse, file: Path | None
-    ) -> tuple[EgoMotion | BagEgoMotion | None, str, tuple[str, ...]]:
+    def motion(self, use: EgoMotionUse, file: Path | None) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
         """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
 
         Raises InputError if poses are required and not found.
@@ -195,13 +191,14 @@ class _VehicleReader:
             is_other = child not in ("", ego_frame)
             child_from_ego = self._tree.between(child, ego_frame) if is_other else None
             note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
-            notes = (note,) if is_other and child_from_ego is None else ()
-            return motion_from_poses(self._bag, topic, child_from_ego), topic, notes
+            motion, notes = motion_from_poses(self._bag, topic, child_from_ego)
+            return motion, topic, (*([note] if is_other and child_from_ego is None else ()), *notes)
         path = self._moving_path(ego_frame)
         if len(path) > 1:
             changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
             child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
-            return motion_from_transforms(self._bag, changing, path[::-1], child_from_ego), changing[0], ()
+            motion, notes = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
+            return motion, changing[0], tuple(notes)
         if use == "required":
             raise InputError(
                 f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
@@ -254,7 +251,7 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
 
 
 def _covered(
-    entries: tuple[FrameEntry, ...], motion: EgoMotion | BagEgoMotion | None, path: Path
+    entries: tuple[FrameEntry, ...], motion: EgoMotion | None, path: Path
 ) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
     """The frames with poses around all of their images, and notes. Localisation often starts later than the cameras."""
     if motion is None:

@@ -25,6 +25,7 @@ from bevcli.sequences.ros.messages import Topic
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
+PLAIN_CHUNK_HEAD = 40  # bytes before the records of a chunk without compression: times, size, checksum, two lengths
 CACHE_BYTES = 256 * MIB  # of decompressed chunks
 LARGEST_CHUNK = 512 * MIB  # bytes after decompression
 NO_CHUNK = -1  # the message lies outside of chunks
@@ -61,6 +62,9 @@ class McapFile:
         else:
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+        # Where the records of chunks without compression start: of these, single messages are read.
+        plain = [one.chunk_start_offset for one in self._chunk_indexes if not one.compression]
+        self._starts = {NO_CHUNK: 0, **{start: start + RECORD_HEAD.size + PLAIN_CHUNK_HEAD for start in plain}}
         self.topics = {
             one.topic: Topic(one.topic, schema.name, one.message_encoding, schema.encoding, schema.data)
             for one in self._channels.values()
@@ -83,6 +87,7 @@ class McapFile:
     def _summary(self) -> Summary | None:
         """The summary, None if the file has none, or one that does not list all messages."""
         try:
+            self._file.seek(0)  # the reader takes the first bytes
             summary = SeekingReader(self._file).get_summary()
         except (McapError, ValueError, EOFError, OSError, struct.error, StopIteration, OverflowError, MemoryError):
             return None
@@ -116,8 +121,8 @@ class McapFile:
         return self._file.read(length)
 
     def _message(self, chunk: int, offset: int) -> bytes:
-        if chunk == NO_CHUNK:
-            return self._record(offset, Opcode.MESSAGE)[MESSAGE_HEAD.size :]
+        if chunk in self._starts:
+            return self._record(self._starts[chunk] + offset, Opcode.MESSAGE)[MESSAGE_HEAD.size :]
         content = self._chunk(chunk)
         opcode, length = RECORD_HEAD.unpack_from(content, offset)
         start = offset + RECORD_HEAD.size

@@ -21,7 +21,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.printing import aligned
+from bevcli.printing import aligned, counted
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.messages import KINDS, Kind, frame_of
 
@@ -162,8 +162,7 @@ class TopicFinder:
     def _facts(self, name: str) -> tuple[str, str]:
         times = self._bag.times(name)
         rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
-        count = "1 message" if len(times) == 1 else f"{len(times)} messages"
-        return self._bag.topics[name].short_type, count + rate
+        return self._bag.topics[name].short_type, counted(len(times), "messages") + rate
 
     def _check_exists(self, name: str) -> None:
         if name not in self._bag.topics:
