@@ -184,9 +184,12 @@ def _read(path: Path) -> list[Row]:
         return []
     text = read_text(path, LARGEST_CSV_BYTES)
     rows: list[Row] = []
-    for row in csv.DictReader(io.StringIO(text)):
-        with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
-            rows.append({name: float(value) for name, value in row.items()})
+    try:
+        for row in csv.DictReader(io.StringIO(text)):
+            with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
+                rows.append({name: float(value) for name, value in row.items()})
+    except csv.Error as error:
+        raise InputError(f"{path}: {error}: move it away, or start a new training") from None
     if rows and "step" not in rows[0]:
         raise InputError(f"{path}: has no column step: move it away, or start a new training")
     return rows

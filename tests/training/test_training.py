@@ -24,7 +24,7 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
 from bevcli.synth.options import DriveOptions, parse_seeds
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.files import load_checkpoint, save_checkpoint
+from bevcli.training.files import LearningCurve, load_checkpoint, save_checkpoint
 from bevcli.training.frame_losses import DenseLossConfig
 from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.training.options import TrainOptions
@@ -300,6 +300,12 @@ def test_half_a_row_of_a_full_disk_does_not_stop_a_training(two_steps: Trainer, 
     (tmp_path / "loss.csv").symlink_to("/dev/full")
     with pytest.raises(OutputError, match=r"loss\.csv: cannot be written \(No space left"):
         resumed._loss_curve.add(3, {"loss": 1.0})
+
+
+def test_a_giant_field_of_a_learning_curve_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "loss.csv").write_text("step,loss\n1," + "9" * 200_000 + "\n")
+    with pytest.raises(InputError, match=r"loss\.csv: .*start a new training"):
+        LearningCurve(tmp_path / "loss.csv", 1, "training")
 
 
 def test_one_folder_holds_one_training_at_a_time(tmp_path: Path) -> None:
