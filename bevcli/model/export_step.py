@@ -165,12 +165,13 @@ class DeformConvOperator(nn.Module):
 
     def __init__(self, original: ModulatedDeformableConvolution) -> None:
         super().__init__()
-        self.weight, self.offset_and_mask, self.stride = original.weight, original.offset_and_mask, original.stride
+        self.weight, self.bias, self.stride = original.weight, original.bias, original.stride
+        self.offset_and_mask = original.offset_and_mask
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, O, H', W'). Only for export: in PyTorch its result is zero."""
         offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
-        bias = x.new_zeros(len(self.weight))
+        bias = x.new_zeros(len(self.weight)) if self.bias is None else self.bias
         return torch.onnx.ops.symbolic(
             "DeformConv",
             [x, self.weight, offsets.flatten(1, 2), bias, mask],
