@@ -330,14 +330,19 @@ class Trainer:
             )
         return row
 
+    def averaged_model(self) -> Network:
+        """A copy of the model, with the running mean of its weights where `optimizer.average` asks for it."""
+        model = copy.deepcopy(self.job.model)
+        if self._average is not None:
+            model.load_state_dict(self._average)
+        return model
+
     def _validate(self) -> Validation:
         """Scores the model, writes its weights and the learning curves."""
         job = self.job
         options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
         # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
-        model = copy.deepcopy(job.model)
-        if self._average is not None:
-            model.load_state_dict(self._average)
+        model = self.averaged_model()
         runner = Runner(model, job.device, options)
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())

@@ -7,7 +7,8 @@ For a GPU that is there for minutes only:
         [--render-s 120] [--train-s 360] [--seeds 20000:20600] [--set KEY=VALUE]...
 
 All processor cores render drives with varied looks into OUT/drives until their time is over; then the model learns from
-those that are there, at a learning rate that falls with the time. A second call goes on with the drives of the first.
+those that are there, at a learning rate that falls with the time. A call that is stopped while it renders goes on with
+its drives the next time.
 Weights: OUT/weights.safetensors, and OUT/weights_90.safetensors and so on after that many seconds. No network is used.
 docs/training.md has what it gave.
 """
@@ -150,6 +151,9 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
         updates, saves = [0], save_times(end_s - asked.train_s)
         due = [next(saves)]
 
+        def save(name: str) -> None:
+            files.save_weights(asked.out / name, trainer.averaged_model(), torch.float16)
+
         def after_update(loss: float) -> None:
             updates[0] += 1
             if updates[0] in (1, 2, 3) or updates[0] % 100 == 0:
@@ -157,11 +161,11 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
 
         def after_step() -> None:
             if time.perf_counter() > due[0][1]:
-                save(trainer, asked.out / f"weights_{due[0][0]:.0f}.safetensors")
+                save(f"weights_{due[0][0]:.0f}.safetensors")
                 due[0] = next(saves)
 
         trainer.run(after_step, stop=lambda: left(end_s) < 0, after_update=after_update)
-        save(trainer, asked.out / "weights.safetensors")
+        save("weights.safetensors")
     frames = updates[0] * job.config.clips.batch
     say(f"{updates[0]} updates, {frames} frames, {frames / (time.perf_counter() - optimizer.begun_s[0]):.0f} a second")
 
@@ -177,16 +181,6 @@ def save_times(begun_s: float) -> Iterator[tuple[float, float]]:
     while True:
         yield after_s, begun_s + after_s
         after_s += SAVE_S
-
-
-def save(trainer: Trainer, path: Path) -> None:
-    """Write the averaged weights."""
-    model = trainer.job.model
-    own = {key: value.clone() for key, value in model.state_dict().items()}
-    if trainer._average is not None:
-        model.load_state_dict(trainer._average)
-    files.save_weights(path, model, torch.float16)
-    model.load_state_dict(own)
 
 
 if __name__ == "__main__":
