@@ -295,6 +295,7 @@ def provide_triton(monkeypatch: Any) -> None:
         "next_power_of_2": lambda number: 1 << (number - 1).bit_length(),
     }
     vars(triton).update(parts)
+    language.constexpr = object
     monkeypatch.setitem(sys.modules, "triton", triton)
     monkeypatch.setitem(sys.modules, "triton.language", language)
 
