@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from bevcli._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from bevcli.calibration.calibrate import calibrate as calibrate
     from bevcli.errors import BevcliError as BevcliError
     from bevcli.evaluation.evaluate import evaluate as evaluate
     from bevcli.frame import (
@@ -42,12 +41,13 @@ if TYPE_CHECKING:
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
-    from bevcli.synth.export import render as render
     from bevcli.viewer.recording_file import show as show
+    from bevcli.workshop.calibration.calibrate import calibrate as calibrate
+    from bevcli.workshop.synth.export import render as render
 
 # The public names by the modules that define them.
 _NAMES = {
-    "bevcli.calibration.calibrate": "calibrate",
+    "bevcli.workshop.calibration.calibrate": "calibrate",
     "bevcli.errors": "BevcliError",
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
@@ -64,7 +64,7 @@ _NAMES = {
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
-    "bevcli.synth.export": "render",
+    "bevcli.workshop.synth.export": "render",
     "bevcli.viewer.recording_file": "show",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -1,22 +1,29 @@
-"""Models, formats, engines and commands by name: bevcli's own (`registered.py`), and those of other packages.
+"""Models, formats, engines and commands by name: those of the core, of the workshop, and of other packages.
 
 An installed package adds one by an entry point of a group (docs/extend.md). Nothing is imported before it is used.
 """
 
 from functools import cache
-from importlib import resources
+from importlib import import_module, resources
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.registered import OWN, Group
+from bevcli.registered import Group
+
+FLOORS = ("bevcli.registered", "bevcli.workshop.registered")
+
+
+def own(group: Group) -> dict[str, str]:
+    """The entries of a group that bevcli has: name -> "module:attribute"."""
+    return {name: value for floor in FLOORS for name, value in import_module(floor).OWN.get(group, {}).items()}
 
 
 @cache
 def entries(group: Group) -> dict[str, EntryPoint]:
     """The entries of a group by name, in the order of their names. Raises BevcliError where two have the same name."""
-    found = {name: EntryPoint(name, value, group) for name, value in OWN[group].items()}
+    found = {name: EntryPoint(name, value, group) for name, value in own(group).items()}
     for entry in entry_points(group=group):
         if entry.value.startswith("bevcli."):  # of an earlier version, which an editable install may still list
             continue

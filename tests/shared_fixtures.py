@@ -23,11 +23,11 @@ from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.line_decoder import LineDecoderConfig
-from bevcli.model.vad.motion_head import MotionConfig
-from bevcli.model.vad.vad import VAD
 from bevcli.viewer import recording_file
+from bevcli.workshop.vad.config import VADConfig
+from bevcli.workshop.vad.line_decoder import LineDecoderConfig
+from bevcli.workshop.vad.motion_head import MotionConfig
+from bevcli.workshop.vad.vad import VAD
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -60,7 +60,7 @@ def warm_python() -> Iterator[WarmPython]:
 def assets_built_once() -> Iterator[None]:
     """The meshes of rendered drives, which are always the same. They are imported where tests of rendering are."""
     with pytest.MonkeyPatch.context() as patch:
-        if catalog := sys.modules.get("bevcli.synth.assets.catalog"):
+        if catalog := sys.modules.get("bevcli.workshop.synth.assets.catalog"):
             patch.setattr(catalog.Assets, "build", cache(catalog.Assets.build))
         yield
 

@@ -7,13 +7,13 @@ import numpy as np
 from memory_drive import MemorySequence, make_camera
 from recorded_drive import with_truth
 
-from bevcli.batch.job import Job
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.options import ModelOptions
 from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions
-from bevcli.sequences.native.writer import NativeWriter
+from bevcli.workshop.batch.job import Job
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 RIG = CameraRig(
     tuple(make_camera(name, yaw, 80, 45) for name, yaw in NUSCENES_YAWS_DEG.items()), default_ego_from_bev()

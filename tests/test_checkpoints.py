@@ -32,7 +32,7 @@ from bevcli.model import parts
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 from bevcli.model.temporal_model import build_model
-from bevcli.training.warm_start import warm_start
+from bevcli.workshop.training.warm_start import warm_start
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
 

@@ -20,8 +20,7 @@ from command_line import MINI_TOML
 from forks import FORKS, run_in_fork
 from source_code import ROOT as PACKAGE, trees
 
-from bevcli.registered import OWN
-from bevcli.registry import entries
+from bevcli.registry import entries, own
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/extend.md").read_text()
@@ -138,16 +137,8 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def folders(group: str) -> set[str]:
-    """The packages of bevcli's entries of a group, such as "bevcli.model.uniad"."""
-    return {value.partition(":")[0].rpartition(".")[0] for value in OWN[group].values()}
-
-
-def test_nothing_outside_its_folder_names_a_model():
-    inside = tuple(f"{folder}." for folder in folders("bevcli.models"))
-    for path in trees():
-        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        if module != "bevcli.registered" and not module.startswith(inside):
-            assert not [name for name in imported(path) if f"{name}.".startswith(inside)], module
+    """The packages of bevcli's entries of a group, such as "bevcli.workshop.uniad"."""
+    return {value.partition(":")[0].rpartition(".")[0] for value in own(group).values()}
 
 
 def test_opening_a_sequence_names_no_format():
@@ -158,7 +149,7 @@ def test_opening_a_sequence_names_no_format():
 
 
 def test_a_command_is_one_file_that_its_entry_names():
-    files = {value.partition(":")[0] for value in OWN["bevcli.commands"].values()}
-    assert len(files) == len(OWN["bevcli.commands"])
+    files = {value.partition(":")[0] for value in own("bevcli.commands").values()}
+    assert len(files) == len(own("bevcli.commands"))
     for name in ("__main__", "cli/__init__", "cli/main", "cli/bridge"):
         assert not files & set(imported(PACKAGE / f"{name}.py")), name

@@ -7,19 +7,19 @@ from source_code import ROOT, trees
 # Calls that wait without a limit, by file.
 ALLOWED = {
     (
-        "batch/drives.py",
+        "workshop/batch/drives.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "batch/find_like.py",
+        "workshop/batch/find_like.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "batch/run_batch.py",
+        "workshop/batch/run_batch.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "batch/storage.py",
+        "workshop/batch/storage.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     ("cli/bridge.py", "_flags.get"): "a context variable, not a queue",
@@ -29,13 +29,13 @@ ALLOWED = {
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
     ("inference/preprocess.py", "task.result"): "the task is done",
     ("model/kernels/compiled.py", "helper.result"): "the tasks only compute",
-    ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("synth/workers.py", "process.join"): "the process was killed",
-    ("synth/workers.py", "connection.recv"): "the connection has something to read, or its process has ended",
-    ("training/loading.py", "clip.result"): "in a thread whose own result has a limit",
-    ("robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("calibration/matches.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("calibration/road.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/synth/workers.py", "process.join"): "the process was killed",
+    ("workshop/synth/workers.py", "connection.recv"): "the connection has something to read, or its process has ended",
+    ("workshop/training/loading.py", "clip.result"): "in a thread whose own result has a limit",
+    ("workshop/robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/calibration/matches.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/calibration/road.py", "ThreadPoolExecutor"): "the tasks only compute",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.
 METHODS = {

@@ -27,8 +27,8 @@ def evaluate(
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
     runs a model on several drives and scores them together.
     """
-    from bevcli.evaluation.driving import DRIVING
     from bevcli.evaluation.evaluate import evaluate
+    from bevcli.workshop.vad.driving_scores import DRIVING
 
     scores = evaluate(
         predictions,

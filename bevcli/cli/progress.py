@@ -144,7 +144,7 @@ def engine_bar() -> Iterator[Callable[[int, int, str], None]]:
 
 def in_engine_with_bar(model: "Model", drive: "Sequence", parts: str = "") -> "Model":
     """The model in the engine that the options choose, see `in_engine`."""
-    from bevcli.inference.in_engine import in_engine
+    from bevcli.workshop.engines.in_engine import in_engine
 
     with engine_bar() as show:
         return in_engine(model, drive.rig, drive, parts=parts, report=show)

@@ -63,10 +63,10 @@ def _with_motion(
     check: "CalibrationCheck", path: Path, allow_outside: bool, given: dict[str, Any]
 ) -> "CalibrationCheck":
     """The check with the findings of a calibration from motion, where `path` is a drive with ego-motion."""
-    from bevcli.calibration.calibrate import motion_findings
     from bevcli.errors import InputError
     from bevcli.rig.rig_report import with_findings
     from bevcli.sequences.open import open_sequence
+    from bevcli.workshop.calibration.calibrate import motion_findings
 
     try:
         drive = open_sequence(path, ground_truth=False, allow_outside=allow_outside, **given)

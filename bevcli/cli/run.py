@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.cli.bridge import FormatValues, InputDrive, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.calibration.options import CalibrateFirstOptions
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
@@ -96,10 +96,10 @@ def run(
 
 def _calibrated(drive: "Sequence") -> "Sequence":
     """The drive with the rig that it shows; what is corrected is printed."""
-    from bevcli.calibration.calibrate import STEPS, calibrate
-    from bevcli.calibration.estimates import change_text
-    from bevcli.calibration.result import CorrectedDrive
     from bevcli.cli.progress import Progress
+    from bevcli.workshop.calibration.calibrate import STEPS, calibrate
+    from bevcli.workshop.calibration.estimates import change_text
+    from bevcli.workshop.calibration.result import CorrectedDrive
 
     with Progress(STEPS, "steps of the calibration") as progress:
         result = calibrate(drive, after_step=progress.advance)

@@ -9,10 +9,10 @@ import typer
 
 from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.help_text import PlainCommand
-from bevcli.engines.options import FileOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, say
+from bevcli.workshop.engines.options import FileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint

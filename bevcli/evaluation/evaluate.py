@@ -9,17 +9,17 @@ from typing import Any
 
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import DetectionScores, evaluate_detections
-from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.scores_report import FrameScores, driving_tables, driving_to_dict, finite
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
-from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
 from bevcli.printing import counted
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.workshop.tracking_scores.scoring import TrackingScores, evaluate_tracking
+from bevcli.workshop.vad.driving_scores import DrivingScores, Scored, evaluate_driving
 
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "

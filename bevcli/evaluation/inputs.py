@@ -16,7 +16,6 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.lines_file import TRUE_LINES, FrameLines, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes.cache import open_index
@@ -24,6 +23,7 @@ from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.vad.lines_file import TRUE_LINES, FrameLines, LinesFile, read_lines
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from typing import Any
 
 from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import DetectionScores, ScoreTable
-from bevcli.evaluation.driving import DrivingScores
-from bevcli.evaluation.map_lines import THRESHOLDS_M
-from bevcli.evaluation.planning import PlanScores
 from bevcli.evaluation.segmentation import SegmentationScores
-from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
 from bevcli.printing import aligned, counted
+from bevcli.workshop.tracking_scores.scoring import METRICS, TrackingScores
+from bevcli.workshop.vad.driving_scores import DrivingScores
+from bevcli.workshop.vad.line_scores import THRESHOLDS_M
+from bevcli.workshop.vad.planning_scores import PlanScores
 
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 

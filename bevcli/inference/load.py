@@ -15,10 +15,8 @@ from torch import Tensor
 
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
-from bevcli.engines.exported import SUFFIX, load_exported
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.inference.engine_choice import EngineChoice, engine_choice
 from bevcli.inference.options import AUTO, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
@@ -30,6 +28,8 @@ from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
 from bevcli.weights.cache import NamedWeights, all_weights, weights_folder
 from bevcli.weights.fetch import by_hand, fetch_weights
+from bevcli.workshop.engines.engine_choice import EngineChoice, engine_choice
+from bevcli.workshop.engines.exported import SUFFIX, load_exported
 
 DEFAULT_MODEL = "demo"
 DEFAULT_ENGINE = "onnxruntime"  # of an exported file

@@ -20,9 +20,9 @@ from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.export_form import pad_value_bgr
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
+from bevcli.workshop.engines.export_form import pad_value_bgr
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.commands import read_commands
-from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
+from bevcli.workshop.engines.in_engine import in_engine
 
 
 def run(

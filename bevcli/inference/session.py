@@ -14,9 +14,9 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.commands import one_command, read_commands
-from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
+from bevcli.workshop.engines.in_engine import in_engine
 
 ColorOrder = Literal["bgr", "rgb"]
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32

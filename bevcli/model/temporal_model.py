@@ -15,10 +15,10 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
-from bevcli.model.export_form import ExportForm
 from bevcli.model.segmentation import decode_map
 from bevcli.model.step import ModelOutputs, PreparedFrame, SceneAttention
 from bevcli.registry import load
+from bevcli.workshop.engines.export_form import ExportForm
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on
 

@@ -23,7 +23,7 @@ from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.ros.format import is_ros_bag
+from bevcli.workshop.formats.ros.format import is_ros_bag
 from bevcli.writing import write_whole
 
 _Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera

@@ -28,10 +28,10 @@ from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
-from bevcli.sequences.files.lines_file import LinesWriter
 from bevcli.sequences.files.map_folder import map_path, write_map
-from bevcli.sequences.files.plan_file import PlanWriter
 from bevcli.viewer.recording_file import restore_index
+from bevcli.workshop.vad.lines_file import LinesWriter
+from bevcli.workshop.vad.plan_file import PlanWriter
 from bevcli.writing import whole_file, write_whole
 
 BEV = "BEV features"

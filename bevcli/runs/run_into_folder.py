@@ -10,7 +10,6 @@ from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import write_behind
 from bevcli.inference.commands import read_commands
-from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
 from bevcli.model.temporal_model import model_class
@@ -22,6 +21,7 @@ from bevcli.runs.options import RunOptions
 from bevcli.runs.state import START_ANEW, RunState, StateSaver, run_facts, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
 from bevcli.sequences.images import no_image_error
+from bevcli.workshop.engines.in_engine import in_engine
 
 Steps = Iterator[tuple[Frame, Prediction, RunnerState[Any]]]  # of `Runner.run`
 

@@ -6,11 +6,11 @@ import pytest
 from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import write_drive
 
-from bevcli.batch.drives import find_drives, read_list
-from bevcli.batch.storage import open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.batch.drives import find_drives, read_list
+from bevcli.workshop.batch.storage import open_storage
 
 
 def test_patterns_lists_and_paths_give_each_drive_once(tmp_path):

@@ -10,8 +10,10 @@ from memory_drive import MemorySequence
 from recorded_drive import predict
 from small_fleet import make_job, results_of, write_drive
 
-from bevcli.batch.drives import find_drives
-from bevcli.batch.find_like import (
+from bevcli.errors import InputError
+from bevcli.runs.state import save_state
+from bevcli.workshop.batch.drives import find_drives
+from bevcli.workshop.batch.find_like import (
     EMBEDDINGS,
     FramePooling,
     find_like,
@@ -19,10 +21,8 @@ from bevcli.batch.find_like import (
     read_embeddings,
     similar_frames_page,
 )
-from bevcli.batch.run_batch import run_batch
-from bevcli.batch.storage import open_storage
-from bevcli.errors import InputError
-from bevcli.runs.state import save_state
+from bevcli.workshop.batch.run_batch import run_batch
+from bevcli.workshop.batch.storage import open_storage
 
 
 @pytest.fixture(scope="module")

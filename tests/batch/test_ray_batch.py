@@ -16,9 +16,9 @@ import pytest
 from command_line import MINI_TOML, command, start
 from small_fleet import results_of, write_drive, write_fleet
 
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.export import render
+from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.synth.export import render
 
 OPTIONS = ("--model", "mini.toml", "--untrained", "--rate", "all", "--score", "0", "--device", "cpu")
 # One thread, as of the single runs: sums in another order are rounded otherwise.

@@ -15,16 +15,16 @@ from command_line import MINI_TOML
 from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import make_job, results_of, write_drive, write_fleet
 
-from bevcli.batch import worker as worker_module
-from bevcli.batch.drives import find_drives
-from bevcli.batch.run_batch import run_batch
-from bevcli.batch.worker import Worker
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.ros.format import BagOptions
+from bevcli.workshop.batch import worker as worker_module
+from bevcli.workshop.batch.drives import find_drives
+from bevcli.workshop.batch.run_batch import run_batch
+from bevcli.workshop.batch.worker import Worker
+from bevcli.workshop.formats.ros.format import BagOptions
 
 COMPARED = ("predictions.json", "tracks.csv")
 

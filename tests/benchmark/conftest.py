@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bevcli.benchmark import made_up
+from bevcli.workshop.benchmark import made_up
 
 SMALL = {
     "size = [800, 450]": "size = [160, 90]",

@@ -30,9 +30,6 @@ from typing import Any, get_args
 import torch
 
 from bevcli._version import __version__
-from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.benchmark.measure import time_runs
-from bevcli.benchmark.versions import QueryResults, Version, difference, largest_differences, textbook_version
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import choose_device
@@ -45,10 +42,13 @@ from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say
-from bevcli.synth.options import DriveOptions
-from bevcli.training.job import prepare_training
-from bevcli.training.options import TrainOptions
-from bevcli.training.trainer import Trainer
+from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
+from bevcli.workshop.benchmark.measure import time_runs
+from bevcli.workshop.benchmark.versions import QueryResults, Version, difference, largest_differences, textbook_version
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.job import prepare_training
+from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.trainer import Trainer
 from bevcli.writing import write_whole
 
 ROOT = Path(__file__).parents[2]  # of the repository

@@ -11,17 +11,17 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from bevcli.benchmark import limits, made_up, measure, result
-from bevcli.benchmark.limits import MachineLimits
-from bevcli.benchmark.made_up import MadeUpDrive
-from bevcli.benchmark.result import BenchmarkResult, Comparison
-from bevcli.benchmark.versions import Version
 from bevcli.cli.main import app
 from bevcli.config import load_config
-from bevcli.engines.engine import installed_engines
 from bevcli.errors import BevcliError
-from bevcli.inference.engine_choice import fastest_engine
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.workshop.benchmark import limits, made_up, measure, result
+from bevcli.workshop.benchmark.limits import MachineLimits
+from bevcli.workshop.benchmark.made_up import MadeUpDrive
+from bevcli.workshop.benchmark.result import BenchmarkResult, Comparison
+from bevcli.workshop.benchmark.versions import Version
+from bevcli.workshop.engines.engine import installed_engines
+from bevcli.workshop.engines.engine_choice import fastest_engine
 
 
 @pytest.fixture(scope="module", autouse=True)

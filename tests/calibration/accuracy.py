@@ -13,19 +13,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevcli.calibration.calibrate import judge
-from bevcli.calibration.estimates import CameraEstimate, Verdict, delay_text
-from bevcli.calibration.matches import match_points
-from bevcli.calibration.measure import measure
-from bevcli.calibration.options import CalibrateOptions
-from bevcli.calibration.result import CalibrationResult
-from bevcli.calibration.views import Views, read_views
 from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
-from bevcli.robustness.sequences import CalibrationNoise, Draws
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.calibration.calibrate import judge
+from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, delay_text
+from bevcli.workshop.calibration.matches import match_points
+from bevcli.workshop.calibration.measure import measure
+from bevcli.workshop.calibration.options import CalibrateOptions
+from bevcli.workshop.calibration.result import CalibrationResult
+from bevcli.workshop.calibration.views import Views, read_views
+from bevcli.workshop.robustness.sequences import CalibrationNoise, Draws
 
 LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured
 

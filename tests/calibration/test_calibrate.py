@@ -13,14 +13,14 @@ from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, w
 from typer.testing import CliRunner
 
 import bevcli
-from bevcli.calibration import calibrate as calibrating
-from bevcli.calibration.estimates import Verdict, either_text
-from bevcli.calibration.matches import match_points
-from bevcli.calibration.result import CorrectedDrive
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
+from bevcli.workshop.calibration import calibrate as calibrating
+from bevcli.workshop.calibration.estimates import Verdict, either_text
+from bevcli.workshop.calibration.matches import match_points
+from bevcli.workshop.calibration.result import CorrectedDrive
 
 STREET = Path(__file__).parents[2] / "samples/street"
 TURNED, LOW = "CAM_FRONT", "CAM_BACK"

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bevcli.calibration.levels import level_corrections, sees_road
-from bevcli.calibration.options import CalibrateOptions
-from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
-from bevcli.calibration.road import beside_way
-from bevcli.calibration.solve import solve, spread
-from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
-from bevcli.calibration.views import DELAYS_S, View, Views
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+from bevcli.workshop.calibration.levels import level_corrections, sees_road
+from bevcli.workshop.calibration.options import CalibrateOptions
+from bevcli.workshop.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
+from bevcli.workshop.calibration.road import beside_way
+from bevcli.workshop.calibration.solve import solve, spread
+from bevcli.workshop.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
+from bevcli.workshop.calibration.views import DELAYS_S, View, Views
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 BLANK = np.zeros((2, 2), dtype=np.uint8)

@@ -4,9 +4,9 @@ import pytest
 from command_line import MINI_TOML, command
 from small_fleet import make_job, write_fleet
 
-from bevcli.batch import ray_workers
-from bevcli.batch.ray_workers import Workers, run_on_ray
 from bevcli.errors import BevcliError
+from bevcli.workshop.batch import ray_workers
+from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
 
 
 @pytest.fixture(scope="module")

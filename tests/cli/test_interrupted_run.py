@@ -17,9 +17,9 @@ from memory_drive import MemorySequence
 from small_fleet import RIG
 
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 FRAMES = 16
 pytestmark = pytest.mark.usefixtures("unchecked_recordings")

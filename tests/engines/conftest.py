@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from bevcli.config import as_table
-from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.quantize import quantize
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.model.export_form import pixels_of
+from bevcli.workshop.engines.export_form import pixels_of
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.quantize import quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs

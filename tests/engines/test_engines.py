@@ -23,9 +23,6 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.cli.stop_signals import EndSignals
 from bevcli.config import load_config
-from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import load_exported
-from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
@@ -34,9 +31,12 @@ from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
-from bevcli.model.export_form import pixels_of
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.engines.export_form import pixels_of
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.engines.quantize import quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs, step_of_file
@@ -307,7 +307,7 @@ def watch(event, arguments):
         print("CONNECTION", event, arguments, file=sys.stderr)
 sys.addaudithook(watch)
 from pathlib import Path
-from bevcli.engines.exported import load_exported
+from bevcli.workshop.engines.exported import load_exported
 load_exported(Path({str(small_file)!r}), "openvino")
 """
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)

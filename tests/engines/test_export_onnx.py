@@ -13,10 +13,7 @@ import pytest
 import torch
 from memory_drive import MemorySequence, make_rig
 
-from bevcli.benchmark.exported import check_exported
 from bevcli.config import load_config
-from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import load_exported, read_metadata
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
@@ -24,11 +21,14 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import decode
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history
-from bevcli.model.export_step import replace_parts
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries, load
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.benchmark.exported import check_exported
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.export_step import replace_parts
+from bevcli.workshop.engines.exported import load_exported, read_metadata
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original

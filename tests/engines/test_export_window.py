@@ -13,11 +13,8 @@ import torch
 from memory_drive import WithoutImages
 from typer.testing import CliRunner
 
-from bevcli.benchmark.exported import FrameDifference, check_exported
 from bevcli.cli.main import app
 from bevcli.config import load_config
-from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.preprocess import calibration_images
@@ -27,6 +24,9 @@ from bevcli.model.temporal_model import build_model
 from bevcli.registry import entries
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.benchmark.exported import FrameDifference, check_exported
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.quantize import quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original

@@ -16,17 +16,17 @@ import torch
 
 from bevcli.cli.main import app
 from bevcli.config import load_config
-from bevcli.engines.engine import installed_engines
-from bevcli.engines.exported import load_exported
-from bevcli.engines.file_cache import EngineFile, engines_folder
 from bevcli.errors import BevcliError, InputError
-from bevcli.inference import in_engine as module
-from bevcli.inference.engine_choice import EngineChoice, fastest_engine, remember_speeds
-from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.inference.session import Session
 from bevcli.sequences.selection import select_range
+from bevcli.workshop.engines import in_engine as module
+from bevcli.workshop.engines.engine import installed_engines
+from bevcli.workshop.engines.engine_choice import EngineChoice, fastest_engine, remember_speeds
+from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.engines.file_cache import EngineFile, engines_folder
+from bevcli.workshop.engines.in_engine import in_engine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from memory_drive import MemorySequence, make_rig

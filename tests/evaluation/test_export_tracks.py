@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z, rotation_from_quaternion
 from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes
+from bevcli.workshop.formats.boxes.openlabel import openlabel
 
 # Per frame: instance, x in the ego frame, class. The car is missed in the third frame; the last box has no track.
 SEEN = (

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevcli.batch.reproduce import known_mistakes
 from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.scores_report import FrameScores
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.workshop.batch.reproduce import known_mistakes
 
 # Length, width and height in metres of a usual object of each class.
 SIZES = {

@@ -6,9 +6,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from bevcli.evaluation.tracking.scoring import evaluate_tracking
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.workshop.tracking_scores.scoring import evaluate_tracking
 
 FRAMES, PERIOD_NS = 60, 500_000_000
 

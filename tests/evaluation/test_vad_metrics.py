@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevcli.evaluation.map_lines import _Curve, evaluate_lines, similarity
-from bevcli.evaluation.motion import MIN_SCORE, evaluate_motion, match
-from bevcli.evaluation.planning import PlannedFrame, PlanScores, collisions, evaluate_plans, hits, occupancy
 from bevcli.frame import MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.workshop.vad.line_scores import _Curve, evaluate_lines, similarity
+from bevcli.workshop.vad.motion_scores import MIN_SCORE, evaluate_motion, match
+from bevcli.workshop.vad.planning_scores import PlannedFrame, PlanScores, collisions, evaluate_plans, hits, occupancy
 
 VEHICLES = range(14, 24)
 HUMANS = range(2, 9)

@@ -9,12 +9,12 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.explain import figure_files as figures
-from bevcli.explain.attention_figures import FIGURES
-from bevcli.explain.figure_files import figures_of, write_figures
-from bevcli.explain.overview import FIGURES as OF_BEVFORMER
-from bevcli.explain.trace import Trace, trace
-from bevcli.model.vad.vad import VAD
+from bevcli.workshop.explain import figure_files as figures
+from bevcli.workshop.explain.attention_figures import FIGURES
+from bevcli.workshop.explain.figure_files import figures_of, write_figures
+from bevcli.workshop.explain.overview import FIGURES as OF_BEVFORMER
+from bevcli.workshop.explain.trace import Trace, trace
+from bevcli.workshop.vad.vad import VAD
 
 CPU = torch.device("cpu")
 

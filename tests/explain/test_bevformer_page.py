@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from bevcli.config import load_config
-from bevcli.explain.overview import FIGURES
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
+from bevcli.workshop.explain.overview import FIGURES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/bevformer.md"

@@ -11,15 +11,15 @@ from command_line import command
 from memory_drive import MemorySequence, make_rig
 
 from bevcli.errors import InputError, OutputError
-from bevcli.explain import figure_files as figures
-from bevcli.explain.drawing import project_bev
-from bevcli.explain.figure_files import check_figures, figures_of, write_figures
-from bevcli.explain.head_figures import reference_points
-from bevcli.explain.overview import FIGURES
-from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.model.pillar_projection import project_pillars
+from bevcli.workshop.explain import figure_files as figures
+from bevcli.workshop.explain.drawing import project_bev
+from bevcli.workshop.explain.figure_files import check_figures, figures_of, write_figures
+from bevcli.workshop.explain.head_figures import reference_points
+from bevcli.workshop.explain.overview import FIGURES
+from bevcli.workshop.explain.trace import cell_at, trace
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 CPU = torch.device("cpu")

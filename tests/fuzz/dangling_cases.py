@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from bevcli.sequences.nuscenes.writer import TABLES
 from bevcli.sequences.open import open_sequence
-from bevcli.training.files import load_checkpoint
+from bevcli.workshop.formats.nuscenes_writer import TABLES
+from bevcli.workshop.training.files import load_checkpoint
 
 VALUES = (-6, 0, 2**70, float("nan"), float("inf"), "2", None, [], {})
 

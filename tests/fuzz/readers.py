@@ -64,7 +64,7 @@ def _model(folder: Path) -> None:
     from bevcli.checkpoints import expected_state
     from bevcli.config import TRACKING, TRAINING, load_config, load_table
     from bevcli.inference.tracking import TrackerConfig
-    from bevcli.training.job import TrainingConfig
+    from bevcli.workshop.training.job import TrainingConfig
 
     load_table(folder / "model.toml", TRACKING, TrackerConfig)
     load_table(folder / "model.toml", TRAINING, TrainingConfig)
@@ -116,7 +116,7 @@ def _older_run(folder: Path) -> None:
 def _checkpoint(folder: Path) -> None:
     import torch
 
-    from bevcli.training.files import LearningCurve, load_checkpoint
+    from bevcli.workshop.training.files import LearningCurve, load_checkpoint
 
     model = torch.nn.Linear(2, 1)
     load_checkpoint(folder / "checkpoint.pt", model, torch.optim.AdamW(model.parameters()))

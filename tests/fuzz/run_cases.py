@@ -26,9 +26,9 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 FRAMES, STOP_AFTER = 4, 2
 CAMERAS = ("CAM_FRONT", "CAM_BACK")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bevcli.inference.image_repair import auto_levels, defogged
-from bevcli.synth import corruptions
+from bevcli.workshop.synth import corruptions
 
 LEVELS = (2, 4, 5)
 

@@ -12,7 +12,6 @@ import torch
 from memory_drive import MemorySequence
 from simulated_device import OnDevice, SimulatedDevice, pinned, simulated
 
-from bevcli.benchmark.made_up import made_up_model
 from bevcli.config import known_models, load_config
 from bevcli.frame import Prediction
 from bevcli.inference.preprocess import Preprocessor
@@ -23,7 +22,8 @@ from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import PreparedFrame
-from bevcli.model.uniad.uniad import UniADConfig
+from bevcli.workshop.benchmark.made_up import made_up_model
+from bevcli.workshop.uniad.uniad import UniADConfig
 
 CPU = torch.device("cpu")
 FRAMES = 3

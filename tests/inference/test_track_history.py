@@ -18,13 +18,13 @@ from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.uniad.map_head import MapHeadConfig
-from bevcli.model.uniad.track_queries import TrackQueryConfig
-from bevcli.model.uniad.uniad import UniAD, UniADConfig
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.training import validation
+from bevcli.workshop.training import validation
+from bevcli.workshop.uniad.map_head import MapHeadConfig
+from bevcli.workshop.uniad.track_queries import TrackQueryConfig
+from bevcli.workshop.uniad.uniad import UniAD, UniADConfig
 
 MAP_HEAD = MapHeadConfig(
     thing_queries=12, max_things=6, encoder_layers=1, location_layers=2, thing_mask_layers=1, stuff_mask_layers=1,

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevcli.evaluation.tracking.scoring import evaluate_tracking
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.tracking import TrackerConfig, step
 from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.workshop.tracking_scores.scoring import evaluate_tracking
 
 STREET = Path(__file__).parents[2] / "samples" / "street" / "ground_truth.json"
 STANDING = (0.0, 0.0)

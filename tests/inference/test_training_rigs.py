@@ -20,7 +20,7 @@ from bevcli.inference.runner import Runner
 from bevcli.inference.training_rigs import facts_notes, rig_notes, weights_facts
 from bevcli.model.config import BevFrameConfig
 from bevcli.model.temporal_model import build_model
-from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 
 def tilted(degrees: float, height_m: float = 1.84) -> Array:

@@ -21,7 +21,7 @@ from bevcli.model.calibration_embedding import CalibrationEmbedding, ray_feature
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.prepare import LastCall, add_to_class
-from bevcli.training.warm_start import warm_start
+from bevcli.workshop.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.benchmark.versions import PaddedSampling
 from bevcli.model.deformable_attention import GridSampling, Hits, level_sizes, sampling_locations
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
 from bevcli.model.kernels.softmax import softmax_of_groups
+from bevcli.workshop.benchmark.versions import PaddedSampling
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
 PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()

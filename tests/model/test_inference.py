@@ -10,13 +10,13 @@ import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
-from bevcli.benchmark.versions import textbook_version
 from bevcli.model import prepare
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.prepare import TokensInBlocks, add_to_class, prepare_for_inference
 from bevcli.model.step import ModelOutputs
+from bevcli.workshop.benchmark.versions import textbook_version
 
 CPU = torch.device("cpu")
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.uniad.map_encoder import FlatListAttention, sine_position
-from bevcli.model.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.model.uniad.map_merging import merge_map, thing_scores
+from bevcli.workshop.uniad.map_encoder import FlatListAttention, sine_position
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
+from bevcli.workshop.uniad.map_merging import merge_map, thing_scores
 
 SMALL = MapHeadConfig(
     thing_queries=7,

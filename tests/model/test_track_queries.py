@@ -11,9 +11,9 @@ import torch
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.model.decoder import ObjectQueries
-from bevcli.model.uniad.memory_bank import Memories, MemoryBank
-from bevcli.model.uniad.query_interaction import QueryInteraction
-from bevcli.model.uniad.track_queries import (
+from bevcli.workshop.uniad.memory_bank import Memories, MemoryBank
+from bevcli.workshop.uniad.query_interaction import QueryInteraction
+from bevcli.workshop.uniad.track_queries import (
     EGO,
     NO_TRACK,
     FrameMotion,

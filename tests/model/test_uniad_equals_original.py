@@ -20,9 +20,9 @@ from uniad_rule import rule_bev
 
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.uniad.map_merging import merge_map
-from bevcli.model.uniad.track_queries import FrameMotion, TrackQueries
-from bevcli.model.uniad.uniad import UniAD, UniADOutputs, decode_tracks
+from bevcli.workshop.uniad.map_merging import merge_map
+from bevcli.workshop.uniad.track_queries import FrameMotion, TrackQueries
+from bevcli.workshop.uniad.uniad import UniAD, UniADOutputs, decode_tracks
 
 KEPT = np.load(original.DATA / "golden_uniad_tracks.npz")
 

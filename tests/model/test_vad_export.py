@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from memory_drive import MemorySequence
 
-from bevcli.benchmark.exported import FrameDifference, check_exported, difference_lines
-from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import load_exported
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
-from bevcli.model.vad.vad import VAD
+from bevcli.workshop.benchmark.exported import FrameDifference, check_exported, difference_lines
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.vad.vad import VAD
 
 pytest.importorskip("onnxruntime")
 

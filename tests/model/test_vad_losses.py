@@ -12,10 +12,10 @@ from bevcli.frame import MapLines
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.step import FrameTruth
-from bevcli.model.vad.config import LossWeights
-from bevcli.model.vad.line_decoder import LineDecoderConfig, LineOutputs
-from bevcli.model.vad.line_loss import LineTargets, line_losses, line_targets
-from bevcli.model.vad.losses import (
+from bevcli.workshop.vad.config import LossWeights
+from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
+from bevcli.workshop.vad.line_loss import LineTargets, line_losses, line_targets
+from bevcli.workshop.vad.losses import (
     boundary_loss,
     collision_loss,
     crosses,
@@ -23,7 +23,7 @@ from bevcli.model.vad.losses import (
     motion_losses,
     path_losses,
 )
-from bevcli.model.vad.motion_head import MotionOutputs
+from bevcli.workshop.vad.motion_head import MotionOutputs
 
 GRID = BevGrid(4, 4, (-10, 10), (-20, 20), (-2, 2))
 EXTENT_M = torch.tensor([20.0, 40.0])

@@ -14,7 +14,7 @@ from bevcli.geometry.transforms import Array, rigid, rotation_about_z, rotation_
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.official_keys import from_official
 from bevcli.model.resnet import ResNetConfig
-from bevcli.model.uniad.uniad import UniAD, UniADConfig
+from bevcli.workshop.uniad.uniad import UniAD, UniADConfig
 
 TRACKER_CLASS_BIAS = 3.8  # of golden_uniad_track_only
 

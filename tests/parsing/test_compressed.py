@@ -13,9 +13,9 @@ import zstandard
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import decompressed
-from bevcli.sequences.ros.format import is_ros_bag
-from bevcli.sequences.ros.messages import Topic, decoder
-from bevcli.sequences.ros.storage import SqliteFile
+from bevcli.workshop.formats.ros.format import is_ros_bag
+from bevcli.workshop.formats.ros.messages import Topic, decoder
+from bevcli.workshop.formats.ros.storage import SqliteFile
 
 COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
 

@@ -12,8 +12,8 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.csv_tables import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 SIGNS = ("=", "+", "-", "@", "\t", "\r")
 

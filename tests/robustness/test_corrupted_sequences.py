@@ -12,7 +12,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.robustness.sequences import (
+from bevcli.workshop.robustness.sequences import (
     CalibrationNoise,
     CameraCrash,
     Draws,

@@ -14,9 +14,9 @@ from bevcli.frame import Frame
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
-from bevcli.robustness.conditions import choose_conditions
-from bevcli.robustness.stress import StressOptions, stress
-from bevcli.training.validation import drives_table, validate
+from bevcli.workshop.robustness.conditions import choose_conditions
+from bevcli.workshop.robustness.stress import StressOptions, stress
+from bevcli.workshop.training.validation import drives_table, validate
 
 FRAMES = 3
 NAMES = ("clean", "frame_lost", "snow", "calibration_noise", "ego_motion_lost", "frame_rate")

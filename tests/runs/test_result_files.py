@@ -20,16 +20,16 @@ from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.session import Session
 from bevcli.model.config import ModelConfig
-from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.line_decoder import LineDecoderConfig
-from bevcli.model.vad.motion_head import MotionConfig
-from bevcli.model.vad.vad import VAD
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.sequences.files.lines_file import LinesWriter, read_lines
-from bevcli.sequences.files.plan_file import read_plans
+from bevcli.workshop.vad.config import VADConfig
+from bevcli.workshop.vad.line_decoder import LineDecoderConfig
+from bevcli.workshop.vad.lines_file import LinesWriter, read_lines
+from bevcli.workshop.vad.motion_head import MotionConfig
+from bevcli.workshop.vad.plan_file import read_plans
+from bevcli.workshop.vad.vad import VAD
 
 FRAMES = 3
 MOTION = MotionConfig(modes=2, steps=3, step_s=0.5, attention_heads=4, feed_forward_width=32)

@@ -18,9 +18,9 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.model.bevformer_v2.window import FeatureWindow
-from bevcli.model.uniad.uniad import TrackMemory
 from bevcli.runs.state import RunState, load_state, save_state
 from bevcli.runs.summary import Counts
+from bevcli.workshop.uniad.uniad import TrackMemory
 
 
 def assert_same(one, other):

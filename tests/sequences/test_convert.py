@@ -14,10 +14,10 @@ from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import BevMap
 from bevcli.sequences.files.map_folder import write_map
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import WriteOptions
-from bevcli.sequences.output import open_writer
+from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import open_writer
 
 
 def convert(*arguments):

@@ -13,8 +13,8 @@ from bevcli.errors import InputError
 from bevcli.frame import DriveFacts
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.sequences.files.calibration_file import draft_calibration
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 MUNICH = DriveFacts(rendered=True, geo_origin=GeoOrigin(48.1374, 11.5755, 60.0))
 SAMPLES = Path(__file__).parents[2] / "samples"

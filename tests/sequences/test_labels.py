@@ -13,19 +13,19 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.formats import kitti_raw as tracklet_export
 from bevcli.evaluation.formats.csv_table import write_csv
-from bevcli.evaluation.formats.kitti import write_kitti
-from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.evaluation.options import ExportOptions
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import object_classes
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.labels import label_format
-from bevcli.sequences.labels.sequence import WithLabels, _labelled_places
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
+from bevcli.workshop.formats.boxes import kitti_raw as tracklet_export
+from bevcli.workshop.formats.boxes.kitti import write_kitti
+from bevcli.workshop.formats.boxes.openlabel import openlabel
+from bevcli.workshop.formats.labels import label_format
+from bevcli.workshop.formats.labels.sequence import WithLabels, _labelled_places
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 

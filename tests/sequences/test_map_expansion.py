@@ -21,9 +21,9 @@ from bevcli.frame import Ground, MapLines, Plan
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.json_fields import pose_to_json
-from bevcli.sequences.files.lines_file import LinesWriter
-from bevcli.sequences.files.plan_file import PlanWriter
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.vad.lines_file import LinesWriter
+from bevcli.workshop.vad.plan_file import PlanWriter
 
 TIMES = 0.5 * np.arange(1, 7)
 

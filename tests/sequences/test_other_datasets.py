@@ -388,7 +388,7 @@ def test_a_class_map_renames_a_class(street, tmp_path):
 @pytest.mark.parametrize("name", list(WRITTEN))
 def test_the_document_has_all_class_names(name):
     """Its table has the rows of the mapping, and others that have no class."""
-    module = resolve_name(WRITTEN[name].module.replace(".format", ".sequence"))
+    module = resolve_name(f"{WRITTEN[name].module.removesuffix('.format')}.sequence")
     mapping = module.CLASS_OF_NAME if name == "dgp" else module.CLASS_OF_CATEGORY
     section = DOCUMENT.split(f"<!-- {name} -->")[1].split("<!--")[0]
     rows = {one: target for names, target in ROW.findall(section) for one in names.split("`, `")}

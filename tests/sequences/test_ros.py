@@ -120,9 +120,9 @@ def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
 def test_opening_a_large_bag_reads_few_images(
     tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bevcli.sequences.ros.storage import McapFile
+    from bevcli.workshop.formats.ros.storage import McapFile
 
-    monkeypatch.setattr("bevcli.sequences.ros.ego_motion.READ_WHOLE", 0)
+    monkeypatch.setattr("bevcli.workshop.formats.ros.ego_motion.READ_WHOLE", 0)
     messages = messages_of(native, motion)
     images = [message for message in messages if "image" in message[0]]
     for repeat in range(1, 50):
@@ -145,7 +145,7 @@ def test_opening_a_large_bag_reads_few_images(
 def test_of_chunks_without_compression_messages_are_read(
     tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bevcli.sequences.ros.storage import McapFile
+    from bevcli.workshop.formats.ros.storage import McapFile
 
     packed = open_sequence(write_mcap(tmp_path / "packed.mcap", messages_of(native, motion))).load(1)
     monkeypatch.setattr(McapFile, "_chunk", None)
@@ -805,7 +805,7 @@ def test_without_the_extra_the_error_names_it(
     tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
-    monkeypatch.setattr("bevcli.sequences.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
+    monkeypatch.setattr("bevcli.workshop.formats.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
     with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):
         open_sequence(path)
 

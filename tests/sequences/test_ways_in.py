@@ -11,8 +11,8 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.native.folder import FolderSequence
-from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats.native_writer import NativeWriter
 
 
 def assert_same_rig(one: CameraRig, other: CameraRig) -> None:

@@ -10,7 +10,7 @@ from bevcli.frame import MapLines
 from bevcli.registry import load
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import WriteOptions
-from bevcli.sequences.output import GROUP, open_writer
+from bevcli.workshop.formats.output import GROUP, open_writer
 
 LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
 

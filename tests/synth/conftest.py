@@ -4,9 +4,9 @@ import pytest
 
 pytest.importorskip("numba")
 
-from bevcli.synth.assets.catalog import Assets
-from bevcli.synth.drive import RenderedDrive, RenderedFrame
-from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
+from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 
 @pytest.fixture(scope="session")

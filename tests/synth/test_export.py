@@ -12,14 +12,14 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import LINE_CLASSES
 from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.sequences.files.lines_file import TRUE_LINES, read_lines
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.assets.catalog import Assets
-from bevcli.synth.drive import RenderedDrive
-from bevcli.synth.export import export_drive, render as render_sequence
-from bevcli.synth.options import Weather, parse_resolution
-from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.world.weather import WEATHER_NAMES
+from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive
+from bevcli.workshop.synth.export import export_drive, render as render_sequence
+from bevcli.workshop.synth.options import Weather, parse_resolution
+from bevcli.workshop.synth.rig import nuscenes_like_rig
+from bevcli.workshop.synth.world.weather import WEATHER_NAMES
+from bevcli.workshop.vad.lines_file import TRUE_LINES, read_lines
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_a_lens_too_wide_for_its_model_is_an_error(tmp_path: Path):
     from dataclasses import replace
 
     from bevcli.geometry.cameras import Distortion
-    from bevcli.synth.rig import rig_for_rendering
+    from bevcli.workshop.synth.rig import rig_for_rendering
 
     rig = nuscenes_like_rig(160, 90)
     camera = rig.cameras[0]

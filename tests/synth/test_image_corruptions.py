@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from bevcli.robustness.sequences import Draws
-from bevcli.synth.corruptions import (
+from bevcli.workshop.robustness.sequences import Draws
+from bevcli.workshop.synth.corruptions import (
     FOG,
     LOW_LIGHT,
     blur_kernel,

@@ -8,10 +8,10 @@ import pytest
 from bevcli.frame import Sequence
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.assets.catalog import Assets
-from bevcli.synth.drive import RenderedDrive
-from bevcli.synth.export import export_drive
-from bevcli.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
+from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive
+from bevcli.workshop.synth.export import export_drive
+from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
 
 SIZE = (512, 288)
 RANDOM = RigDistribution(random_share=1.0)

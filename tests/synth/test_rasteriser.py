@@ -8,9 +8,9 @@ import pytest
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
-from bevcli.synth.assets.mesh import Mesh, TriangleSoup
-from bevcli.synth.render.rasteriser import rasterise
-from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.workshop.synth.assets.mesh import Mesh, TriangleSoup
+from bevcli.workshop.synth.render.rasteriser import rasterise
+from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 CAMERA = nuscenes_like_rig(160, 90)["CAM_FRONT_LEFT"]
 WORLD_FROM_CAMERA = rigid((3.0, -2.0, 0.1), rotation_about_z(0.4)) @ CAMERA.ego_from_camera

@@ -5,12 +5,12 @@ from pathlib import Path
 
 from source_code import trees
 
-import bevcli.synth
+import bevcli.workshop.synth
 
-ROOT = Path(bevcli.synth.__file__).parent
+ROOT = Path(bevcli.workshop.synth.__file__).parent
 LAYERS = (
     *("corruptions", "workers", "assets", "world", "render"),
-    *("options", "rig", "drive", "export", "drives", "splits"),
+    *("options", "rig", "drive", "export", "drives", "splits", "command", "demo_command"),
 )
 
 
@@ -21,8 +21,8 @@ def test_parts_import_only_from_lower_parts():
         if part == "__init__":
             continue
         for node in ast.walk(trees()[path]):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bevcli.synth."):
-                other = node.module.split(".")[2]
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bevcli.workshop.synth."):
+                other = node.module.split(".")[3]
                 assert LAYERS.index(other) <= LAYERS.index(part), f"{path.relative_to(ROOT)} imports {node.module}"
                 checked += 1
     assert checked > 50

@@ -10,8 +10,8 @@ from functools import partial
 import pytest
 
 from bevcli.errors import InputError, OutputError
-from bevcli.synth.export import render
-from bevcli.synth.workers import shared_out
+from bevcli.workshop.synth.export import render
+from bevcli.workshop.synth.workers import shared_out
 
 
 def refuse(index):

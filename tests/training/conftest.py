@@ -2,7 +2,7 @@
 
 import pytest
 
-from bevcli.training import files
+from bevcli.workshop.training import files
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from bevcli.training.detection_loss import DetectionTargets, padded
-from bevcli.training.perspective_loss import (
+from bevcli.workshop.training.detection_loss import DetectionTargets, padded
+from bevcli.workshop.training.perspective_loss import (
     FeatureLocations,
     ImageObjects,
     perspective_targets,

@@ -29,13 +29,13 @@ import torch
 from bevcli.config import TRAINING, load_config, load_table, read_model_file
 from bevcli.inference.load import choose_device
 from bevcli.printing import say
-from bevcli.synth.drives import RenderedDrives
-from bevcli.synth.options import DriveOptions, parse_seeds
-from bevcli.training import files
-from bevcli.training.job import OptimizerConfig, TrainingConfig, prepare_training
-from bevcli.training.model_file import _toml
-from bevcli.training.options import TrainOptions
-from bevcli.training.trainer import Trainer
+from bevcli.workshop.synth.drives import RenderedDrives
+from bevcli.workshop.synth.options import DriveOptions, parse_seeds
+from bevcli.workshop.training import files
+from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
+from bevcli.workshop.training.model_file import _toml
+from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.trainer import Trainer
 
 CHANGES = {
     "image": {"mean": [127.0] * 3, "std": [128.0] * 3},

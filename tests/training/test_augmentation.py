@@ -7,7 +7,7 @@ import pytest
 import torch
 from memory_drive import MemorySequence
 
-from bevcli.training.augmentation import (
+from bevcli.workshop.training.augmentation import (
     AugmentationConfig,
     BadConditions,
     CalibrationVariation,

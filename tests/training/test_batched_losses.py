@@ -10,9 +10,9 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.segmentation import SegmentationOutputs
-from bevcli.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss, padded
-from bevcli.training.frame_losses import DenseHead, DenseLossConfig, dense_loss
-from bevcli.training.segmentation_loss import (
+from bevcli.workshop.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss, padded
+from bevcli.workshop.training.frame_losses import DenseHead, DenseLossConfig, dense_loss
+from bevcli.workshop.training.segmentation_loss import (
     SegmentationLossConfig,
     SegmentationTargets,
     padded_masks,

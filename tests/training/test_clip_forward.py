@@ -17,13 +17,13 @@ from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.temporal_model import build_model
-from bevcli.synth.options import DriveOptions
-from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_training
-from bevcli.training.options import TrainOptions
-from bevcli.training.perspective_loss import PerspectiveLossConfig
-from bevcli.training.samples import Batch, Clip, ClipConfig, load_batch
-from bevcli.training.trainer import Trainer, forward_clip
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_training
+from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
+from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
+from bevcli.workshop.training.trainer import Trainer, forward_clip
 
 V1 = replace(CONFIG, heads=("detection",))
 WINDOW = BEVFormerV2Config(

@@ -9,7 +9,7 @@ import pytest
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.training.samples import Clip, ClipConfig, draw_clip, draw_frames
+from bevcli.workshop.training.samples import Clip, ClipConfig, draw_clip, draw_frames
 
 
 class Drives:

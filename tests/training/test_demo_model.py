@@ -15,9 +15,9 @@ from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.sequences.selection import select_range
-from bevcli.synth.drives import FolderDrives
-from bevcli.training.job import TrainingConfig
-from bevcli.training.validation import validate
+from bevcli.workshop.synth.drives import FolderDrives
+from bevcli.workshop.training.job import TrainingConfig
+from bevcli.workshop.training.validation import validate
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 

@@ -16,16 +16,16 @@ from bevcli.frame import Frame, FrameStamp, MapLines, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply
-from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.line_decoder import LineDecoderConfig
-from bevcli.model.vad.motion_head import MotionConfig
-from bevcli.model.vad.vad import VAD
-from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.frame_losses import FrameLosses, LossConfigs
-from bevcli.training.frame_truth import frame_truth
-from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
-from bevcli.training.samples import Clip, ClipConfig, load_batch
-from bevcli.training.trainer import Trainer, forward_clip
+from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.frame_losses import FrameLosses, LossConfigs
+from bevcli.workshop.training.frame_truth import frame_truth
+from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
+from bevcli.workshop.training.samples import Clip, ClipConfig, load_batch
+from bevcli.workshop.training.trainer import Trainer, forward_clip
+from bevcli.workshop.vad.config import VADConfig
+from bevcli.workshop.vad.line_decoder import LineDecoderConfig
+from bevcli.workshop.vad.motion_head import MotionConfig
+from bevcli.workshop.vad.vad import VAD
 
 VAD_CONFIG = VADConfig(
     **{field.name: getattr(CONFIG, field.name) for field in fields(CONFIG)} | {"heads": ("detection",)},

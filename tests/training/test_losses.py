@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
-from bevcli.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss
-from bevcli.training.segmentation_loss import dice_costs, dice_loss
+from bevcli.workshop.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss
+from bevcli.workshop.training.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.segmentation_loss import dice_costs, dice_loss
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])

@@ -16,11 +16,11 @@ from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, class_of_size
 from bevcli.model.config import BevFrameConfig
-from bevcli.synth.options import DriveOptions
-from bevcli.training.job import TrainingConfig
-from bevcli.training.model_file import Cost, _toml, fitting_batch, write_model_file
-from bevcli.training.presets import PRESETS, look_at, model_table
-from bevcli.training.samples import ClipConfig
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.job import TrainingConfig
+from bevcli.workshop.training.model_file import Cost, _toml, fitting_batch, write_model_file
+from bevcli.workshop.training.presets import PRESETS, look_at, model_table
+from bevcli.workshop.training.samples import ClipConfig
 
 CPU = torch.device("cpu")
 FRAME = BevFrameConfig()

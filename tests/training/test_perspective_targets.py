@@ -12,8 +12,8 @@ from one_image import ImageTargets, objects_of_image, targets_of_image
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.box_coding import encode
-from bevcli.training.detection_loss import DetectionTargets
-from bevcli.training.perspective_loss import (
+from bevcli.workshop.training.detection_loss import DetectionTargets
+from bevcli.workshop.training.perspective_loss import (
     OUTLINE_DEPTH_M,
     feature_locations,
 )

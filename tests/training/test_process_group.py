@@ -12,9 +12,15 @@ from painted_drives import CONFIG, PaintedDrives
 from torch import nn
 
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.training.job import ProcessGroup, TrainingConfig, TrainingJob, join_process_group, leave_process_group
-from bevcli.training.samples import ClipConfig
-from bevcli.training.trainer import Trainer
+from bevcli.workshop.training.job import (
+    ProcessGroup,
+    TrainingConfig,
+    TrainingJob,
+    join_process_group,
+    leave_process_group,
+)
+from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.trainer import Trainer
 
 SHORT = TrainingConfig(
     steps=2, held_out=0, evaluate_every=2, checkpoint_every=2, clips=ClipConfig(frames=2, batch=1, short_share=0.0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bevcli.model.segmentation import SegmentationOutputs
-from bevcli.training.segmentation_loss import (
+from bevcli.workshop.training.segmentation_loss import (
     SegmentationLossConfig,
     SegmentationTargets,
     segmentation_loss,

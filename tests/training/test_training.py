@@ -17,21 +17,21 @@ from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
 from bevcli.cli.stop_signals import StopSignals
-from bevcli.cli.train import _run
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
-from bevcli.synth.options import DriveOptions, parse_seeds
-from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.files import LearningCurve, load_checkpoint, save_checkpoint
-from bevcli.training.frame_losses import DenseLossConfig
-from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
-from bevcli.training.options import TrainOptions
-from bevcli.training.perspective_loss import PerspectiveLossConfig
-from bevcli.training.randomisation import RandomisationConfig
-from bevcli.training.samples import ClipConfig
-from bevcli.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
+from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
+from bevcli.workshop.synth.options import DriveOptions, parse_seeds
+from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.files import LearningCurve, load_checkpoint, save_checkpoint
+from bevcli.workshop.training.frame_losses import DenseLossConfig
+from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
+from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
+from bevcli.workshop.training.randomisation import RandomisationConfig
+from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.train_command import _run
+from bevcli.workshop.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)

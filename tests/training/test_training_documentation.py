@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import bevcli
-from bevcli.training.job import TrainingConfig
+from bevcli.workshop.training.job import TrainingConfig
 
 DOCS = Path(bevcli.__file__).parents[1] / "docs"
 

@@ -18,9 +18,9 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
 from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.training.files import save_weights
-from bevcli.training.warm_start import WarmStart, warm_start
 from bevcli.weights.fetch import weights_file
+from bevcli.workshop.training.files import save_weights
+from bevcli.workshop.training.warm_start import WarmStart, warm_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 

@@ -11,12 +11,12 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import map_rotation, rotate_history, turned_history
 from bevcli.model.encoder import EncoderLayer
-from bevcli.model.export_form import ExportForm, Port, camera_feed, camera_ports
-from bevcli.model.export_step import ExportedStep
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import upload, upload_together
+from bevcli.workshop.engines.export_form import ExportForm, Port, camera_feed, camera_ports
+from bevcli.workshop.engines.export_step import ExportedStep
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class BEVFormer(Network):
 
     memory_type: ClassVar[type] = BevHistory
     device_parts: ClassVar[tuple[str, ...]] = ("device_part",)
-    figures: ClassVar[tuple[str, ...]] = ("bevcli.explain.overview:FIGURES",)
+    figures: ClassVar[tuple[str, ...]] = ("bevcli.workshop.explain.overview:FIGURES",)
 
     def forward(self, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
         """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""

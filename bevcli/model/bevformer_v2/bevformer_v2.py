@@ -16,7 +16,6 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.bevformer_v2.bev_fusion import BevFusion, BevFusionConfig
-from bevcli.model.bevformer_v2.export import WindowForm
 from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, fill_window, frames_at, kept
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
@@ -26,6 +25,7 @@ from bevcli.model.network import STAGES, Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ClipInputs, ModelOutputs, PreparedFrame
 from bevcli.model.upload import upload
+from bevcli.workshop.engines.window_export import WindowForm
 
 NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
 

@@ -17,13 +17,13 @@ from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
-from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, leads_out, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
 from bevcli.sequences.video import rotation_notes
+from bevcli.workshop.vad.lines_file import TRUE_LINES, LinesFile, read_lines
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"

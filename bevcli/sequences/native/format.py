@@ -2,7 +2,7 @@
 
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import RigOptions
-from bevcli.sequences.output import OutputFormat
+from bevcli.workshop.formats.output import OutputFormat
 
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
@@ -16,4 +16,4 @@ FORMAT = Format(
     precedence=-10,
 )
 
-OUTPUT = OutputFormat("a sequence folder", "bevcli.sequences.native.writer:write_native", keeps_maps=True)
+OUTPUT = OutputFormat("a sequence folder", "bevcli.workshop.formats.native_writer:write_native", keeps_maps=True)

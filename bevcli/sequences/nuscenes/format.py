@@ -5,7 +5,7 @@ from pathlib import Path
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
-from bevcli.sequences.output import OutputFormat
+from bevcli.workshop.formats.output import OutputFormat
 
 
 @options("Input")
@@ -48,4 +48,4 @@ FORMAT = Format(
     precedence=20,
 )
 
-OUTPUT = OutputFormat("a nuScenes root", "bevcli.sequences.nuscenes.writer:NuScenesWriter")
+OUTPUT = OutputFormat("a nuScenes root", "bevcli.workshop.formats.nuscenes_writer:NuScenesWriter")

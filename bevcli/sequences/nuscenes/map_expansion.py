@@ -15,7 +15,7 @@ from bevcli.frame import LINE_CLASSES, MapLines
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json
 from bevcli.sequences.nuscenes.json_tables import read_rows
-from bevcli.sequences.true_lines import AREA, lines_in_area
+from bevcli.workshop.vad.true_lines import AREA, lines_in_area
 
 DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES
 LARGEST_BYTES = 256 << 20

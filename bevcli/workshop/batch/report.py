@@ -1,0 +1,222 @@
+"""report.html: one page about a batch that needs no other file, for light and dark browsers."""
+
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bevcli._version import __version__
+from bevcli.inference.load import Model
+from bevcli.printing import counted, duration
+from bevcli.workshop.batch.job import RESULTS, SCORE_BINS, Record
+
+WORST = 10  # drives in the table of the worst ones
+MOST_ERRORS = 50  # rows in the table of errors
+WIDTH, HEIGHT = 420, 180  # of a chart
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 24, 10, 36
+STYLE = """
+:root { color-scheme: light dark; --page: #fcfcfb; --text: #1d1d1b; --soft: #6b6a66; --line: #dddcd6;
+  --card: #ffffff; --bar: #2f6db5; --bad: #b3261e; }
+@media (prefers-color-scheme: dark) { :root { --page: #171716; --text: #e8e7e3; --soft: #a09f99; --line: #3a3936;
+  --card: #20201e; --bar: #6ea8e8; --bad: #f2877f; } }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 24px; max-width: 1080px;
+  background: var(--page); color: var(--text); }
+h1 { font-size: 24px; margin: 0 0 4px; } h2 { font-size: 17px; margin: 32px 0 8px; }
+p { margin: 4px 0; } .soft, .none { color: var(--soft); } .bad { color: var(--bad); }
+a { color: var(--bar); } code { font-size: 13px; }
+.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(116px, 1fr)); gap: 12px; margin-top: 16px; }
+.card { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px 14px; }
+.card b { display: block; font-size: 22px; font-weight: 600; }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 16px; }
+figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px; }
+figcaption { font-weight: 600; margin-bottom: 4px; }
+table.narrow { width: auto; } table.narrow td, table.narrow th { padding-right: 32px; }
+svg rect { fill: var(--bar); } svg line { stroke: var(--soft); } svg text { fill: var(--soft); font-size: 11px; }
+.scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-size: 14px; }
+th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
+td:first-child { white-space: nowrap; } img { max-width: 100%; border-radius: 4px; display: block; }
+"""
+# Key of the scores -> title and axis of its histogram.
+_SCORE_CHARTS = {
+    "mean_ap": ("mAP", "mAP of a drive, classes with ground truth"),
+    "trans_err": ("Translation errors", "translation error of a drive, metres"),
+    "orient_err": ("Orientation errors", "orientation error of a drive, radians"),
+    "vel_err": ("Velocity errors", "velocity error of a drive, m/s"),
+}
+
+
+def page(title: str, body: str) -> str:
+    """An HTML page with the style of the reports. body: HTML."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
+    )
+
+
+def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:
+    """The page about a batch, as HTML. metrics: of `joint_metrics`, None if no drive was scored."""
+    done = [record for record in records if not record.get("error")]
+    failed = [record for record in records if record.get("error")]
+    untrained = '<p class="bad">UNTRAINED: random weights, the boxes are meaningless</p>' if model.untrained else ""
+    body = [
+        f"<h1>Batch of {counted(len(records), 'drives')}</h1>",
+        f'<p class="soft">model {escape(model.name)}, bevcli {__version__}</p>{untrained}',
+        _cards(done, failed, metrics),
+        _distributions(done),
+        _classes(done, model.config.classes),
+        _worst(done),
+        _errors(failed),
+    ]
+    return page(f"Batch of {counted(len(records), 'drives')}", "\n".join(body))
+
+
+def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, Any] | None) -> str:
+    frames, seconds = sum(r["frames"] for r in done), sum(r["seconds"] for r in done)
+    cards = [("drives done", f"{len(done):,}"), ("drives failed", f"{len(failed):,}"), ("frames", f"{frames:,}")]
+    cards += [("boxes", f"{sum(r['boxes'] for r in done):,}"), ("worker time", duration(seconds))]
+    cards.append(("frames per second of a worker", f"{frames / seconds:.2f}" if seconds else "-"))
+    if metrics is not None:
+        present = metrics["classes_with_ground_truth"]
+        cards += [(f"mAP, {metrics['drives']:,} drives together", _number(present["mean_ap"]))]
+        cards += [(f"NDS, {metrics['drives']:,} drives together", _number(present["nd_score"]))]
+    shown = [f'<div class="card"><b>{value}</b><span class="soft">{escape(name)}</span></div>' for name, value in cards]
+    return f'<div class="cards">{"".join(shown)}</div>'
+
+
+def _distributions(done: Sequence[Record]) -> str:
+    if not done:
+        return ""
+    scores = np.sum([r["score_histogram"] for r in done], axis=0)
+    figures = [
+        ("Speed", histogram([r["frames_per_second"] for r in done], "frames per second of a drive")),
+        ("Scores", bars(scores.tolist(), np.linspace(0, 1, SCORE_BINS + 1), "score of a box")),
+    ]
+    scored = [r["scores"] for r in done if r.get("scores")]
+    if scored:
+        for key, (title, label) in _SCORE_CHARTS.items():
+            known = [scores[key] for scores in scored if scores.get(key) is not None]
+            figures.append((title, histogram(known, label)))
+    charts = "".join(f"<figure><figcaption>{escape(n)}</figcaption>{svg}</figure>" for n, svg in figures)
+    return f'<h2>Distributions over drives</h2><div class="charts">{charts}</div>'
+
+
+def _classes(done: Sequence[Record], classes: Sequence[str]) -> str:
+    counts: Counter[str] = Counter()
+    for record in done:
+        counts.update(record["boxes_by_class"])
+    names = [*classes, *sorted(counts.keys() - set(classes))]
+    rows = [(escape(name), f"{counts[name]:,}") for name in names]
+    return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, (1,), 'narrow')}"
+
+
+def worst_drives(done: Sequence[Record]) -> tuple[list[Record], str]:
+    """The worst drives, the worst first, and the criterion in words."""
+    scored = [r for r in done if r.get("scores") and r["scores"].get("mean_ap") is not None]
+    if scored:
+        return sorted(scored, key=lambda r: r["scores"]["mean_ap"])[:WORST], "lowest mAP over classes with ground truth"
+    worst = sorted(done, key=lambda r: (-r["dropped_images"] - r["not_finite_frames"], _mean_score(r)))
+    return worst[:WORST], "no ground truth: most missing images and NaN frames, then lowest mean score of the boxes"
+
+
+def _mean_score(record: Record) -> float:
+    counts = np.asarray(record["score_histogram"])
+    middles = (np.arange(len(counts)) + 0.5) / len(counts)
+    return float(counts @ middles / counts.sum()) if counts.sum() else 0.0
+
+
+def _worst(done: Sequence[Record]) -> str:
+    worst, meaning = worst_drives(done)
+    if not worst:
+        return ""
+    rows = []
+    for record in worst:
+        path = f"{RESULTS}/{record['result']}"
+        scores = record.get("scores") or {}
+        problems = record["dropped_images"] + record["not_finite_frames"]
+        link = f'<a href="{escape(path)}/recording.rrd">recording</a>'
+        numbers = [_number(scores.get("mean_ap")), _number(scores.get("nd_score")), _number(scores.get("trans_err"))]
+        row = [escape(record["drive"]), *numbers, f"{_mean_score(record):.2f}", str(problems), str(record["frames"])]
+        rows.append((*row, f"{link} <code>bevcli viz {escape(path)}</code>"))
+    head = ("drive", "mAP", "NDS", "ATE m", "mean score", "missing images, NaN", "frames", "")
+    table = _table(head, rows, range(1, 7))
+    return f'<h2>Worst drives</h2><p class="soft">{meaning}</p>{table}'
+
+
+def _errors(failed: Sequence[Record]) -> str:
+    if not failed:
+        return "<h2>Errors</h2><p>No drive has failed.</p>"
+    rows = [
+        tuple(escape(str(record[key])) for key in ("drive", "source", "attempts", "error"))
+        for record in failed[:MOST_ERRORS]
+    ]
+    more = len(failed) - MOST_ERRORS
+    note = f'<p class="soft">{more:,} more are in batch.csv</p>' if more > 0 else ""
+    table = _table(("drive", "input", "attempts", "error"), rows, (2,))
+    return f"<h2>Errors</h2><p>Failed drives: {len(failed):,}</p>{table}{note}"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], kind: str = "wide") -> str:
+    """A table. rows: cells as HTML. numbers: columns with numbers. kind: "narrow" is only as wide as its cells."""
+    lines = [("th", [escape(text) for text in head]), *(("td", row) for row in rows)]
+    classes = ["number" if place in numbers else "text" for place in range(len(head))]
+    body = "".join(
+        "<tr>" + "".join(f'<{tag} class="{c}">{text}</{tag}>' for c, text in zip(classes, row, strict=True)) + "</tr>"
+        for tag, row in lines
+    )
+    return f'<div class="scroll"><table class="{kind}">{body}</table></div>'
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def histogram(values: ArrayLike, label: str, bins: int = 24) -> str:
+    """A histogram of numbers. label: of the horizontal axis, with its unit."""
+    numbers = np.asarray(values, dtype=np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    if not len(numbers):
+        return '<p class="none">no values</p>'
+    low, high = float(numbers.min()), float(numbers.max())
+    if low == high:
+        low, high = (max(low - 0.5, 0) if low >= 0 else low - 0.5), high + 0.5
+    counts, edges = np.histogram(numbers, bins, (low, high))
+    return bars(counts.tolist(), edges, label)
+
+
+def bars(counts: Sequence[float], edges: ArrayLike, label: str) -> str:
+    """N bars with N + 1 edges on the horizontal axis."""
+    ends = np.asarray(edges, dtype=np.float64)
+    top = max(max(counts, default=0), 1)
+    span = float(ends[-1] - ends[0])
+    inner_width, inner_height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
+    base = HEIGHT - _BOTTOM
+
+    def x_of(value: float) -> float:
+        return _LEFT + (value - float(ends[0])) / span * inner_width
+
+    parts = []
+    for count, low, high in zip(counts, ends[:-1], ends[1:], strict=True):
+        height = count / top * inner_height
+        left, right = x_of(low), x_of(high)
+        title = f"<title>{_short(low)} to {_short(high)}: {_short(count)}</title>"
+        parts.append(
+            f'<rect x="{left + 0.5:.1f}" y="{base - height:.1f}" width="{max(right - left - 1, 1):.1f}" '
+            f'height="{height:.1f}">{title}</rect>'
+        )
+    for value in np.linspace(ends[0], ends[-1], 5):
+        parts.append(f'<text x="{x_of(float(value)):.1f}" y="{base + 14}" text-anchor="middle">{_short(value)}</text>')
+    parts.append(f'<text x="{_LEFT - 6}" y="{_TOP + 8}" text-anchor="end">{_short(top)}</text>')
+    parts.append(f'<text x="{_LEFT - 6}" y="{base}" text-anchor="end">0</text>')
+    parts.append(f'<line x1="{_LEFT}" y1="{base}" x2="{WIDTH - _RIGHT}" y2="{base}"/>')
+    middle = _LEFT + inner_width / 2
+    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(label)}</text>')
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">{"".join(parts)}</svg>'
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 or float(value).is_integer() else f"{value:.3g}"

@@ -1,0 +1,266 @@
+"""`run_batch`: skip drives that are done, hand the others to workers, and write the tables and the report."""
+
+import contextlib
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bevcli.errors import OutputError
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.evaluate import OWN_CLASSES
+from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.object_classes import are_nuscenes
+from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
+from bevcli.parsing.csv_tables import cell_of
+from bevcli.recording.class_meshes import read_class_meshes
+from bevcli.runs.folder import folder_lock
+from bevcli.runs.state import load_state
+from bevcli.workshop.batch.drives import Drive
+from bevcli.workshop.batch.job import ATTEMPTS, FAILED, READING_THREADS, RECORD, RESULTS, Job, Record, read_record
+from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
+from bevcli.workshop.batch.report import write_report
+from bevcli.workshop.batch.storage import LocalFolder, Storage, open_storage
+from bevcli.workshop.batch.worker import MATCHES, StoppedError, Worker
+from bevcli.workshop.vad.joint_scores import DriveMatches, score_jointly
+
+PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
+DESCRIPTION = "batch.json"  # says that a folder is a batch
+
+_COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
+
+
+@dataclass(frozen=True)
+class BatchSummary:
+    """Summary of a batch.
+
+    Attributes:
+        records: of all drives that are done or have failed, in the order of the drives.
+        drives: number of drives of the batch.
+        skipped: number of drives that were done or had failed before.
+        stopped: before its end.
+        files: paths or URLs of the files of the batch.
+    """
+
+    records: tuple[Record, ...]
+    drives: int
+    skipped: int
+    stopped: bool
+    files: tuple[str, ...]
+
+    @property
+    def failed(self) -> int:
+        """Number of drives that have failed."""
+        return sum(bool(record.get("error")) for record in self.records)
+
+    def table(self) -> str:
+        """The summary as a few aligned lines."""
+        done = [record for record in self.records if not record.get("error")]
+        classes: Counter[str] = Counter()
+        for record in done:
+            classes.update(record["boxes_by_class"])
+        boxes = ", ".join(f"{count} {name}" for name, count in classes.most_common(4))
+        before = f"; {self.skipped} were done or had failed before" if self.skipped else ""
+        rows = [
+            ("drives", f"{len(done)} of {self.drives} done, {self.failed} failed{before}"),
+            ("frames", str(sum(record["frames"] for record in done))),
+            ("boxes", f"{sum(classes.values())}" + (f" ({boxes})" if boxes else "")),
+            *(("written", path) for path in self.files),
+        ]
+        return "\n".join(f"{name:<8} {text}" for name, text in rows)
+
+
+def run_batch(
+    job: Job,
+    model: Model,
+    drives: Sequence[Drive],
+    workers: Workers | None = None,
+    *,
+    resume: bool = False,
+    retry_failed: bool = False,
+    skipped: Callable[[int], None] = lambda count: None,
+    after_drive: Callable[[Record], None] = lambda record: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> BatchSummary:
+    """Run a model over many drives, each as `run_into_folder` does.
+
+    The folder gets drives/NAME-HASH/ with the files of `bevcli run` for each drive, failed/NAME-HASH.json for each
+    drive that failed, batch.parquet, batch.csv, report.html and, if drives were scored, metrics.json. The hash is that
+    of a drive's input, the model, the weights and the options.
+
+    Args:
+        job: the model and the options.
+        model: of `job.load_model`; with `workers` on any device.
+        drives: of `find_drives`.
+        workers: on Ray; None runs one drive after another in this process.
+        resume: skip drives that are done or have failed, and go on with the others.
+        retry_failed: run drives again that have failed.
+        skipped: called once with the number of drives that are skipped.
+        after_drive: called with the record of each drive that is done or has failed.
+        should_stop: asked after each frame in this process; True ends the batch. KeyboardInterrupt ends it too.
+
+    Raises:
+        OutputError: the folder has a batch already, is in use by another one, or cannot be written.
+        InputError: no drive has the format of an option, or the mesh of a class cannot be read.
+        BevcliError: see `Worker` and `run_on_ray`.
+    """
+    job.check_options(drives)
+    read_class_meshes(model.config.object_classes)  # each drive's recording needs them
+    out, job_hash = open_storage(job.out), job.hash(model)
+    with folder_lock(out.path) if isinstance(out, LocalFolder) else contextlib.nullcontext():
+        _check_folder(out, resume)
+        out.write(DESCRIPTION, json.dumps({"format": "bevcli-batch/1", "model": model.name}).encode())
+        known = _known_records(out, drives, job_hash, retry_failed)
+        skipped(len(known))
+        for left in [name for name in out.names(ATTEMPTS) if name.endswith(".run")]:  # of workers that died
+            out.remove(f"{ATTEMPTS}/{left}")
+        pending = [drive for drive in drives if drive.result(job_hash) not in known]
+        if retry_failed:
+            for drive in pending:
+                out.remove(f"{ATTEMPTS}/{drive.result(job_hash)}.json")
+        records, stopped = dict(known), False
+        try:
+            with contextlib.closing(_run(job, job_hash, model, pending, workers, should_stop)) as running:
+                for record in running:
+                    records[record["result"]] = record
+                    after_drive(record)
+        except (KeyboardInterrupt, StoppedError):
+            stopped = True
+            for name in out.names(ATTEMPTS):  # an attempt that the user ended does not count
+                out.remove(f"{ATTEMPTS}/{name}")
+        ordered = [records[name] for name in (drive.result(job_hash) for drive in drives) if name in records]
+        files = _write_tables(out, ordered, model)
+    return BatchSummary(tuple(ordered), len(drives), len(known), stopped, files)
+
+
+def _run(
+    job: Job,
+    job_hash: str,
+    model: Model,
+    drives: Sequence[Drive],
+    workers: Workers | None,
+    should_stop: Callable[[], bool],
+) -> Generator[Record, None, None]:
+    if not drives:
+        return
+    if workers is not None:
+        yield from run_on_ray(job, job_hash, drives, workers)
+        return
+    worker = Worker(job, job_hash, model)
+    for drive in drives:
+        yield worker.run(drive, should_stop)
+        if should_stop():
+            raise StoppedError
+
+
+def _check_folder(out: Storage, resume: bool) -> None:
+    """Raises OutputError unless the folder is new, or has a batch to go on with."""
+    is_batch = out.read(DESCRIPTION) is not None
+    found = out.names("") - {".bevcli"}
+    if found and not is_batch:
+        raise OutputError(f"{out.where}: is not a batch and not empty: pass `out=DIR` for another folder")
+    if is_batch and not resume and (out.names(RESULTS) or out.names(FAILED)):
+        raise OutputError(f"{out.where}: has a batch already: pass `resume=True` to go on with it, or `out=DIR`")
+
+
+def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_failed: bool) -> dict[str, Record]:
+    """The records of drives that are done or have failed, by the name of their results."""
+    done, failed = out.names(RESULTS), out.names(FAILED)
+
+    def find(result: str) -> Record | None:
+        record = read_record(out.read(f"{RESULTS}/{result}/{RECORD}"), result) if result in done else None
+        if record is None and not retry_failed and f"{result}.json" in failed:
+            record = read_record(out.read(f"{FAILED}/{result}.json"), result)
+        return record
+
+    results = [drive.result(job_hash) for drive in drives]
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        found = zip(results, pool.map(find, results), strict=True)
+        return {result: record for result, record in found if record is not None}
+
+
+def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tuple[str, ...]:
+    metrics = joint_metrics(out, records, model.config)
+    classes = model.config.classes
+    files = {PARQUET: to_parquet(records, classes), CSV: to_csv(records, classes)}
+    if metrics is not None:
+        files[METRICS] = (json.dumps(metrics, indent=1) + "\n").encode()
+    files[REPORT] = write_report(records, metrics, model).encode()
+    for name, content in files.items():
+        out.write(name, content)
+    return tuple(f"{out.where}/{name}" for name in files)
+
+
+def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
+    """The columns of the tables and their types. classes: of the model, a column each."""
+    return {
+        **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
+        **dict.fromkeys(_COUNTS, pa.int64()),
+        **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
+        "output_bytes": pa.int64(),
+        **{f"boxes_{name}": pa.int64() for name in classes},
+        **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
+        "ground_truth_boxes": pa.int64(),
+        **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
+    }
+
+
+def row(record: Record, names: Iterable[str]) -> dict[str, Any]:
+    """The columns of a drive; None for what is not known, such as metrics without ground truth."""
+    boxes = record.get("boxes_by_class")
+    flat = {**(record.get("scores") or {}), **record}
+    counts = {} if boxes is None else {name: boxes.get(name.removeprefix("boxes_"), 0) for name in names}
+    return {name: counts.get(name) if name.startswith("boxes_") else flat.get(name) for name in names}
+
+
+def to_parquet(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.parquet: one row per drive, in the order of the records. classes: of the model."""
+    schema = columns(classes)
+    table = pa.Table.from_pylist([row(record, schema) for record in records], schema=pa.schema(list(schema.items())))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.csv: the same columns; an empty field for what is not known."""
+    names = columns(classes)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for record in records:
+        cells = row(record, names).items()
+        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in cells})
+    return text.getvalue().encode()
+
+
+def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
+    """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
+
+    Boxes of all drives are scored together: the result is not a mean of the drives' scores. Nothing was scored beyond
+    the model's BEV grid. Raises InputError where the matches of a drive cannot be read.
+    """
+    scored = [record for record in records if record.get("scores")]
+    if not scored:
+        return None
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+    range_m = model.bev_grid.nearest_side_m
+    config = DetectionConfig.of(model.object_classes).cut_at(range_m)
+    notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
+    if not are_nuscenes(model.object_classes):
+        notes.append(OWN_CLASSES)
+    return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
+
+
+def _read_matches(out: Storage, record: Record) -> DriveMatches:
+    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+        return load_state(path, DriveMatches)

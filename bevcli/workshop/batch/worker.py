@@ -1,0 +1,259 @@
+"""Worker: runs one drive after another, each exactly as `bevcli run` does, and lands its results."""
+
+import contextlib
+import json
+import os
+import shlex
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import torch
+
+from bevcli.errors import BevcliError
+from bevcli.evaluation.evaluate import Scores, evaluate
+from bevcli.frame import Frame, Prediction
+from bevcli.inference.load import Model
+from bevcli.parsing.files import is_there
+from bevcli.printing import valid_text
+from bevcli.rig.sequence_checks import CheckedDrive
+from bevcli.runs.folder import SUMMARY
+from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.runs.state import save_state
+from bevcli.runs.summary import RunSummary
+from bevcli.sequences.format import format_of
+from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.workshop.batch.drives import Drive, fetch_scene
+from bevcli.workshop.batch.find_like import FramePooling
+from bevcli.workshop.batch.job import ATTEMPTS, FAILED, RECORD, RESULTS, SCORE_BINS, Job, Record, read_record
+from bevcli.workshop.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
+from bevcli.workshop.vad.joint_scores import DriveMatches
+
+MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
+_SCRATCH = "bevcli-batch-"
+
+
+class StoppedError(Exception):
+    """The batch was stopped while a drive was running."""
+
+
+class Worker:
+    """Runs drives with a model that is loaded once. Raises BevcliError where the model or `out` cannot be used."""
+
+    def __init__(self, job: Job, job_hash: str, model: Model | None = None) -> None:
+        self._job, self._job_hash = job, job_hash
+        self._out = open_storage(job.out)
+        self._model = job.load_model() if model is None else model
+        _remove_scratch_of_dead_workers()
+
+    def run(self, drive: Drive, should_stop: Callable[[], bool] = lambda: False) -> Record:
+        """Run a drive until it is done or has failed too often, and returns its record, which is also stored.
+
+        An attempt is counted before it starts, so that a drive that kills its worker is not tried for ever.
+
+        Raises StoppedError if `should_stop` says so after a frame; OutputError if the batch's folder cannot be written.
+        """
+        result = drive.result(self._job_hash)
+        done = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
+        if done is not None:  # Ray runs a drive again if it lost the answer of a worker
+            return done
+        marker = f"{ATTEMPTS}/{result}.json"
+        attempt, error = _read_marker(self._out.read(marker))
+        while attempt <= self._job.retries:
+            attempt += 1
+            died = f"the worker died in attempt {attempt} of {self._job.retries + 1} (out of memory, or a crash)"
+            self._out.write(marker, msgspec.json.encode((attempt, died)))
+            try:
+                record = self._attempt(drive, result, attempt, should_stop)
+            except StoppedError:
+                self._out.remove(marker)
+                raise
+            except BevcliError as failure:
+                error = str(failure)
+            except Exception as failure:  # whatever one drive raises, the others go on
+                reason = " ".join(str(failure).split())[:300]
+                error = f"{type(failure).__name__}: {reason}" if reason else type(failure).__name__
+                self._check_device()
+            else:
+                self._out.remove(marker)
+                return record
+        record = {**_about(drive, result), "attempts": attempt, "error": valid_text(error)}
+        self._out.write(f"{FAILED}/{result}.json", json.dumps(record).encode())
+        self._out.remove(marker)
+        return record
+
+    def _attempt(self, drive: Drive, result: str, attempt: int, should_stop: Callable[[], bool]) -> Record:
+        if drive.problem:
+            raise BevcliError(drive.problem)
+        job, began = self._job, time.perf_counter()
+        with self._scratch(result) as (aside, inputs):
+            path = _fetched(drive, job, inputs)
+            fetched = time.perf_counter()
+            try:
+                sequence = CheckedDrive(job.open(path, drive.scene), shlex.quote(drive.source))
+                histogram = np.zeros(SCORE_BINS, dtype=np.int64)  # of the boxes that are shown
+                pooling = FramePooling(f"{self._model.name}, {self._model.weights_hash}") if job.embed else None
+
+                def after_frame(frame: Frame, prediction: Prediction) -> None:
+                    scores = prediction.boxes.scores
+                    if scores is not None:
+                        shown = scores[scores >= job.run.recording.score]
+                        np.add(histogram, np.histogram(shown, SCORE_BINS, (0, 1))[0], out=histogram)
+                    if pooling is not None:
+                        pooling.add(frame, prediction)
+
+                summary = run_into_folder(
+                    self._model, sequence, aside, job.run, after_frame=after_frame, should_stop=should_stop
+                )
+            except BevcliError as error:
+                raise BevcliError(_with_final_paths(str(error), (path, drive.source), (aside, result))) from None
+            if not summary.is_complete:
+                raise StoppedError
+            seconds = time.perf_counter() - fetched
+            if pooling is not None:
+                pooling.write(aside)
+            scores, why_not = self._score(drive, path, aside)
+            record = {
+                **_about(drive, result),
+                "attempts": attempt,
+                "error": "",
+                **_summary_columns(summary),
+                "seconds": round(seconds, 3),
+                "frames_per_second": round(summary.frames / seconds, 4),
+                "fetch_seconds": round(fetched - began, 3),
+                "output_bytes": sum(file.stat().st_size for file in aside.rglob("*") if file.is_file()),
+                "score_histogram": histogram.tolist(),
+                "scores": None if scores is None else _score_columns(scores),
+                "not_scored": why_not,
+                "input_errors": "; ".join(summary.input_errors),
+            }
+            _rewrite_paths(aside, f"{self._out.where}/{RESULTS}/{result}")
+            (aside / RECORD).write_text(json.dumps(record, indent=1) + "\n")
+            landed = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
+            if landed is not None:
+                return landed
+            self._out.remove(f"{FAILED}/{result}.json")
+            self._out.land(aside, f"{RESULTS}/{result}", RECORD)
+            return record
+
+    def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
+        """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
+        chosen = format_of(path)
+        if not self._job.evaluate or not (chosen.annotated or is_there(path / "ground_truth.json")):
+            return None, ""
+        version = self._job.own_of(NuScenesOptions).version if drive.scene else None
+        class_map = self._job.source.class_map
+        range_m = self._model.config.bev_grid.nearest_side_m
+        try:
+            scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)
+        except BevcliError as error:
+            return None, _with_final_paths(str(error), (path, drive.source), (aside, "its results"))
+        found = scores.detection
+        matches = DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
+        save_state(aside / MATCHES, matches)
+        return scores, ""
+
+    @contextlib.contextmanager
+    def _scratch(self, result: str) -> Iterator[tuple[Path, Path]]:
+        """Folders for the results of an attempt and for a copy of its input; both are removed at the end.
+
+        The results are written on the file system of the batch's folder, so that they can be moved at once.
+        """
+        inputs = Path(tempfile.gettempdir()) / f"{_SCRATCH}{os.getpid()}-{uuid.uuid4().hex[:8]}"
+        aside = inputs / "result"
+        if isinstance(self._out, LocalFolder):
+            attempts = self._out.path / ATTEMPTS
+            for left in attempts.glob(f"{result}.*.run"):  # of a worker that died
+                shutil.rmtree(left, ignore_errors=True)
+            aside = attempts / f"{result}.{uuid.uuid4().hex[:8]}.run"
+        try:
+            yield aside, inputs / "input"
+        finally:
+            shutil.rmtree(inputs, ignore_errors=True)
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def _check_device(self) -> None:
+        """End this process if its GPU no longer works: after some errors, CUDA fails until the process is replaced."""
+        if self._model.device.type == "cuda":
+            try:
+                torch.zeros(1, device=self._model.device).cpu()
+            except RuntimeError:
+                os._exit(1)
+
+
+def use_threads(count: int) -> None:
+    """Set the number of CPU threads of this process."""
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
+
+
+def _about(drive: Drive, result: str) -> Record:
+    return {"drive": drive.name, "source": valid_text(drive.source), "scene": drive.scene, "result": result}
+
+
+def _summary_columns(summary: RunSummary) -> Record:
+    facts = summary.to_dict()
+    counts = {name: facts[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")}
+    lists = ("dropped_images", "skipped_frames", "not_finite_frames")
+    return counts | {name: len(facts[name]) for name in lists}  # type: ignore[arg-type]
+
+
+def _score_columns(scores: Scores) -> Record:
+    table = scores.detection.overall.of_classes_with_ground_truth()
+    numbers = {"mean_ap": table.mean_ap, "nd_score": table.nd_score, **table.errors}
+    if scores.segmentation is not None:
+        numbers |= {f"iou_{name}": value for name, value in scores.segmentation.iou.items()}
+    defined = {name: None if np.isnan(value) else round(value, 6) for name, value in numbers.items()}
+    return {**defined, "ground_truth_boxes": scores.detection.overall.ground_truth_count}
+
+
+def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:
+    """A local path of a drive's input; of a URL, a copy with the same name."""
+    if not is_url(drive.source):
+        return Path(drive.source)
+    local = inputs / drive.source.rpartition("/")[2]
+    if drive.scene is None:
+        RemoteFolder(drive.source).fetch(local)
+    else:
+        fetch_scene(drive.source, job.own_of(NuScenesOptions), drive.scene, local)
+    return local
+
+
+def _with_final_paths(message: str, *pairs: tuple[Path, str]) -> str:
+    """An error message with the names that the user knows in place of temporary paths."""
+    for path, name in pairs:
+        message = message.replace(str(path), name)
+    return message
+
+
+def _rewrite_paths(aside: Path, where: str) -> None:
+    """Names the final paths in summary.json."""
+    path = aside / SUMMARY
+    facts = json.loads(path.read_text())
+    facts["files"] = [_with_final_paths(name, (aside, where)) for name in facts["files"]]
+    path.write_text(json.dumps(facts, indent=1) + "\n")
+
+
+def _read_marker(content: bytes | None) -> tuple[int, str]:
+    """Number and error of the last attempt; 0 without one."""
+    try:
+        return msgspec.json.decode(content or b'[0, ""]', type=tuple[int, str])
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return 0, ""
+
+
+def _remove_scratch_of_dead_workers() -> None:
+    for folder in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*-*"):
+        pid = folder.name.removeprefix(_SCRATCH).partition("-")[0]
+        try:
+            os.kill(int(pid), 0)
+        except ProcessLookupError:
+            shutil.rmtree(folder, ignore_errors=True)
+        except (ValueError, OSError):
+            continue

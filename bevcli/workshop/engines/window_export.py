@@ -1,0 +1,140 @@
+"""The exported form of a BEVFormerV2 whose window ends with the current frame."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, frames_at, kept
+from bevcli.model.config import ModelConfig
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.step import PreparedFrame, model_inputs
+from bevcli.workshop.engines.export_form import ExportForm, Port, camera_feed, camera_ports
+from bevcli.workshop.engines.export_step import ExportedStep
+
+
+class WindowStep(ExportedStep):
+    """One step of a BEVFormerV2 whose window ends with the current frame: `BEVFormerV2.forward`.
+
+    The image features of the earlier frames enter, and those of the current frame come out. All frames are encoded,
+    also those that do not exist, because a graph has no optional parts; a frame without any image then takes the map
+    of the next one, as in `fill_window`.
+    """
+
+    def forward(
+        self,
+        images: Tensor,
+        image_from_bev: Tensor,
+        camera_index: Tensor,
+        has_image: Tensor,
+        previous_features: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """One step; `WindowForm` documents every input and output."""
+        network = self.network
+        image_features = self.image_features(images, camera_index)
+        tokens = [*([] if previous_features is None else previous_features), image_features.tokens]
+        hits = [self.hits(image_from_bev[:, place], has_image[:, place]) for place in range(len(tokens))]
+        maps = [
+            network.encoder(
+                bev_query=network.bev_queries.embedding[None],
+                position=network.bev_queries.position(),
+                image_features=FeatureMaps(frame_tokens, image_features.level_shapes),
+                hits=frame_hits,
+            )
+            for frame_tokens, frame_hits in zip(tokens, hits, strict=True)
+        ]
+        for place in reversed(range(len(maps) - 1)):
+            maps[place] = torch.where(has_image[:, place].any(), maps[place], maps[place + 1])
+        bev = maps[0] if network.fusion is None else network.fusion(maps)
+        most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
+        outputs = self.outputs(bev, most_cameras)
+        return outputs if previous_features is None else (*outputs, image_features.tokens)
+
+
+class WindowForm(ExportForm):
+    """The form of one step of a BEVFormerV2.
+
+    Attributes:
+        frames: of the window, relative to the current one, which is the last.
+    """
+
+    step = WindowStep
+
+    def __init__(self, config: ModelConfig, cameras: int, frames: tuple[int, ...]) -> None:
+        super().__init__(config, cameras)
+        self.frames = frames
+
+    @property
+    def inputs(self) -> tuple[Port, ...]:
+        lead, bev_frame = (1, len(self.frames), self.cameras), "the current frame's bev frame"
+        images, projection, camera_index, has_image = camera_ports(self.config, lead, "1, F, N", bev_frame)
+        window = (
+            " For the cameras of each of the window's F frames, which are, relative to the current one: "
+            f"{_listed(self.frames)}."
+        )
+        absent = (
+            " All false for a frame that does not exist, such as before a scene's first frame or before a gap in "
+            "time of more than max_gap_s: the BEV map of the next frame takes the place of its own."
+        )
+        projection = replace(projection, meaning=projection.meaning + window)
+        ports = (images, projection, camera_index, replace(has_image, meaning=has_image.meaning + absent))
+        if len(self.frames) == 1:
+            return ports
+        meaning = (
+            "(F - 1, N, S, C): the output image_features of the window's earlier frames "
+            f"{_listed(self.frames[:-1])}, in this order; ignored for a frame that does not exist."
+        )
+        return (*ports, Port("previous_features", (len(self.frames) - 1, *self._features_shape), meaning))
+
+    def outputs(self, *, decode: bool) -> tuple[Port, ...]:
+        ports = super().outputs(decode=decode)
+        if len(self.frames) == 1:
+            return ports
+        meaning = "(N, S, C): of the current frame's images, for previous_features of the next frames."
+        return (*ports, Port("image_features", self._features_shape, meaning))
+
+    def facts(self) -> dict[str, Any]:
+        return {"window": self.frames}
+
+    def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
+        """See `ExportForm`. Of a frame that does not exist no camera has an image."""
+        past = self._past(prepared, memory)
+        current = model_inputs([prepared], [None], self.config)
+        places = [len(past) + offset for offset in self.frames[:-1]]
+        absent = WindowFrame(
+            FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),
+            torch.zeros_like(current.image_from_bev),
+            torch.zeros_like(current.has_image),
+            current.image_size,
+        )
+        earlier = [one or absent for one in frames_at(past, places, prepared)]
+        feed = camera_feed(current) | {
+            "image_from_bev": torch.stack([*(one.image_from_bev for one in earlier), current.image_from_bev], dim=1),
+            "has_image": torch.stack([*(one.has_image for one in earlier), current.has_image], dim=1),
+        }
+        if earlier:
+            feed["previous_features"] = torch.stack([one.image_features.tokens for one in earlier])
+        return feed
+
+    def memory(
+        self, prepared: PreparedFrame, memory: FeatureWindow | None, found: Mapping[str, Tensor]
+    ) -> FeatureWindow:
+        past = self._past(prepared, memory)
+        if "image_features" not in found:
+            return kept(past, len(past), -self.frames[0])
+        features = FeatureMaps(found["image_features"], self.config.level_shapes)
+        return kept([*past, FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
+
+    def _past(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> list[FrameFeatures]:
+        return [] if memory is None else memory.before(prepared.frame.stamp, -self.frames[0])
+
+    @property
+    def _features_shape(self) -> tuple[int, int, int]:
+        cells = sum(height * width for height, width in self.config.level_shapes)
+        return self.cameras, cells, self.config.channels
+
+
+def _listed(frames: tuple[int, ...]) -> str:
+    return ", ".join(map(str, frames))

@@ -1,0 +1,1 @@
+"""Formats of other programs: drives, labels and boxes, and `convert`."""

@@ -1,0 +1,1 @@
+"""Box formats of other programs, written by `bevcli export`."""

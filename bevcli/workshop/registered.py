@@ -1,0 +1,51 @@
+"""Names of the models, formats, engines and commands of the workshop, as `bevcli.registered` has those of the core."""
+
+from bevcli.registered import Group
+
+OWN: dict[Group, dict[str, str]] = {
+    "bevcli.models": {
+        "UniAD": "bevcli.workshop.uniad.uniad:UniAD",
+        "VAD": "bevcli.workshop.vad.vad:VAD",
+    },
+    "bevcli.sequences": {
+        "argoverse2": "bevcli.workshop.formats.argoverse2.format:FORMAT",
+        "dgp": "bevcli.workshop.formats.dgp.format:FORMAT",
+        "ros": "bevcli.workshop.formats.ros.format:FORMAT",
+        "t4": "bevcli.workshop.formats.t4.format:FORMAT",
+    },
+    "bevcli.drive_writers": {
+        "mcap": "bevcli.workshop.formats.foxglove.format:OUTPUT",
+    },
+    "bevcli.box_formats": {
+        "kitti": "bevcli.workshop.formats.boxes.kitti:FORMAT",
+        "kitti-raw": "bevcli.workshop.formats.boxes.kitti_raw:FORMAT",
+        "openlabel": "bevcli.workshop.formats.boxes.openlabel:FORMAT",
+    },
+    "bevcli.label_formats": {
+        "csv": "bevcli.workshop.formats.labels.csv_table:FORMAT",
+        "cvat": "bevcli.workshop.formats.labels.cvat:FORMAT",
+        "kitti": "bevcli.workshop.formats.labels.kitti:FORMAT",
+        "kitti-raw": "bevcli.workshop.formats.labels.kitti_raw:FORMAT",
+        "openlabel": "bevcli.workshop.formats.labels.openlabel:FORMAT",
+    },
+    "bevcli.engines": {
+        "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
+        "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",
+    },
+    "bevcli.commands": {
+        "batch": "bevcli.workshop.batch.command:batch",
+        "bench": "bevcli.workshop.benchmark.command:bench",
+        "calibrate": "bevcli.workshop.calibration.command:calibrate",
+        "convert": "bevcli.workshop.formats.convert_command:convert",
+        "demo": "bevcli.workshop.synth.demo_command:demo",
+        "explain": "bevcli.workshop.explain.command:explain",
+        "export-onnx": "bevcli.workshop.engines.export_command:export_onnx",
+        "find-like": "bevcli.workshop.batch.find_like_command:find_like",
+        "quantize": "bevcli.workshop.engines.quantize_command:quantize",
+        "render": "bevcli.workshop.synth.command:render",
+        "reproduce": "bevcli.workshop.batch.reproduce_command:reproduce",
+        "stress": "bevcli.workshop.robustness.command:stress",
+        "train": "bevcli.workshop.training.train_command:train",
+        "validate": "bevcli.workshop.training.validate_command:validate",
+    },
+}

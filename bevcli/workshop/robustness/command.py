@@ -1,0 +1,92 @@
+"""`bevcli stress`: how a model copes with corrupted images, calibration, times and ego-motion."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
+from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.robustness.options import StressOptions, StressOutputOptions
+from bevcli.workshop.synth.options import DriveOptions
+
+PANEL = "Score"
+
+
+def stress(
+    sequence: Annotated[
+        list[Path] | None,
+        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+    ] = None,
+    *,
+    model: Annotated[ModelOptions, Part(without=("untrained",))],
+    options: StressOptions,
+    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
+    drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
+    output: StressOutputOptions,
+    as_json: Json = False,
+) -> None:
+    """Score a model on the same drives under corruptions: RoboBEV's eight, five others, calibration and timing faults.
+
+    Each corruption has three severities (calibration noise: four levels) and is applied on the fly, before the model.
+    The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
+    of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
+    """
+    from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
+    from bevcli.cli.stop_signals import StopSignals
+    from bevcli.errors import InputError
+    from bevcli.inference.load import load_model
+    from bevcli.sequences.open import open_sequence
+    from bevcli.sequences.selection import select_range
+    from bevcli.workshop.robustness.conditions import choose_conditions
+    from bevcli.workshop.robustness.report import stress_table
+    from bevcli.workshop.robustness.results import read_results
+    from bevcli.workshop.robustness.stress import stress
+    from bevcli.workshop.synth.drives import open_drives
+
+    conditions = choose_conditions(output.severity, output.only)
+    other = None if options.against is None else read_results(options.against)
+    if bool(sequence) == (drive_options.rendered is not None):
+        raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
+    fetch_if_asked(model)
+    loaded = load_model(options=model)
+    if drive_options.rendered is None:
+        chosen = source.for_model(loaded.config)
+        drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
+    else:
+        seeds, cache = drive_options.rendered, drive_options.cache
+        rendered = open_drives((), seeds, cache, loaded.config, class_map=source.class_map)
+        drives = [rendered.open(index) for index in range(len(rendered))]
+        if source.frames is not None:
+            drives = [select_range(drive, source.frames) for drive in drives]
+    loaded = in_engine_with_bar(loaded, drives[0])
+    out = output.out or Path("runs") / f"stress-{loaded.name}"
+    total = len(conditions) * sum(len(drive.stamps) for drive in drives)
+    notes = [note for drive in drives for note in drive.notes]
+    with Progress(total, "frames", notes) as progress, StopSignals("frame") as signals:
+        results = stress(
+            loaded,
+            drives,
+            conditions,
+            out,
+            options,
+            force=output.force,
+            resume=output.resume,
+            after_frame=progress.advance,
+            resumed=progress.skip,
+            should_stop=signals.received,
+        )
+    if as_json:
+        say(json.dumps(results.to_dict(other), indent=1))
+    else:
+        say(f"drives  {len(drives)}\n\n{stress_table(results, other)}")
+    for name in () if other is None else results.differences(other):
+        print_note(f'"{name}" differs from {options.against}: the corruption errors compare unlike tests')
+    if not results.is_complete:
+        say("stopped; `--resume` goes on", err=True)
+        raise typer.Exit(signals.exit_code)
+    say(f"wrote {out}", err=True)

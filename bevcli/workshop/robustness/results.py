@@ -1,0 +1,125 @@
+"""The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+
+from bevcli.errors import InputError
+from bevcli.evaluation.detection import known_mean
+from bevcli.evaluation.scores_report import finite
+from bevcli.parsing.documents import read_json
+from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group
+
+FORMAT = "bevcli-stress/1"
+
+
+@dataclass(frozen=True)
+class ConditionScores:
+    """The scores under one condition, over the classes that have ground truth: an entry of "conditions" in stress.json.
+
+    Attributes:
+        corruption: its name, or "clean".
+        severity: "easy", "mid", "hard" or a level; "" for clean.
+        nd_score: NDS, 0 to 1.
+        mean_ap: mAP, 0 to 1.
+        tp_errors: true-positive errors by the devkit's names; NaN, or None of a file, where undefined.
+        mean_dist_aps: class -> AP.
+    """
+
+    corruption: str
+    severity: str
+    nd_score: float
+    mean_ap: float
+    tp_errors: Mapping[str, float | None]
+    mean_dist_aps: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class StressResults:
+    """The scores of a model under several conditions.
+
+    Attributes:
+        header: what was tested, such as model, weights, drives, seed; for JSON.
+        scores: by condition, clean first.
+        is_complete: whether all requested conditions were run.
+    """
+
+    header: Mapping[str, Any]
+    scores: tuple[ConditionScores, ...]
+    is_complete: bool = True
+
+    @property
+    def clean(self) -> ConditionScores | None:
+        """The scores without corruption; None if they are not there yet."""
+        return next((scores for scores in self.scores if scores.corruption == CLEAN.name), None)
+
+    def of(self, name: str) -> dict[str, ConditionScores]:
+        """Severity -> scores of a corruption, in the order of the severities."""
+        return {scores.severity: scores for scores in self.scores if scores.corruption == name}
+
+    def tested(self) -> tuple[Corruption, ...]:
+        """The corruptions that have scores, in their order."""
+        return tuple(corruption for corruption in CORRUPTIONS if self.of(corruption.name))
+
+    def resilience(self, name: str) -> float:
+        """Resilience rate of a corruption: its mean NDS over its severities, over the NDS of clean drives."""
+        found = self.of(name).values()
+        if self.clean is None or not found or not self.clean.nd_score:
+            return math.nan
+        return sum(scores.nd_score for scores in found) / len(found) / self.clean.nd_score
+
+    def corruption_error(self, name: str, against: Self) -> float:
+        """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""
+        own, other = self.of(name), against.of(name)
+        common = [severity for severity in own if severity in other]
+        below = sum(1 - other[severity].nd_score for severity in common)
+        return sum(1 - own[severity].nd_score for severity in common) / below if below else math.nan
+
+    def mean_resilience(self, group: Group = Group.ROBOBEV) -> float:
+        """The mean resilience rate of a group's corruptions that were tested, RoboBEV's mRR; NaN without any."""
+        return known_mean(self.resilience(part.name) for part in self.tested() if part.group is group)
+
+    def mean_corruption_error(self, against: Self) -> float:
+        """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
+        return known_mean(
+            self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV
+        )
+
+    def to_dict(self, against: Self | None = None) -> dict[str, Any]:
+        """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
+        names = [corruption.name for corruption in self.tested()]
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            **self.header,
+            "complete": self.is_complete,
+            "conditions": [vars(scores) for scores in self.scores],
+            "resilience": {name: self.resilience(name) for name in names},
+            "mRR": self.mean_resilience(),
+            "mean_resilience_unseen": self.mean_resilience(Group.UNSEEN),
+        }
+        if against is not None:
+            content["against"] = {name: against.header.get(name) for name in ("model", "weights")}
+            content["corruption_error"] = {name: self.corruption_error(name, against) for name in names}
+            content["mCE"] = self.mean_corruption_error(against)
+        return finite(content)
+
+    def differences(self, other: Self) -> tuple[str, ...]:
+        """Settings other than model and weights that differ between the tests: their scores cannot be compared."""
+        names = ("drives", "max_range_m", "seed", "lost_images")
+        return tuple(name for name in names if self.header.get(name) != other.header.get(name))
+
+
+def read_results(path: Path) -> StressResults:
+    """Reads a stress.json. Raises InputError where it is missing or wrong."""
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f'{path}: is no result of `bevcli stress` (expected "format": "{FORMAT}")')
+    try:
+        scores = msgspec.convert(content["conditions"], tuple[ConditionScores, ...])
+    except (KeyError, msgspec.ValidationError) as error:
+        raise InputError(f'{path}: "conditions" is wrong ({type(error).__name__}: {error})') from None
+    return StressResults(content, scores, content.get("complete") is True)

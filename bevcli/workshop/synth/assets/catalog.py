@@ -1,0 +1,130 @@
+"""The catalog of annotated objects: the variants of each class, and a drawn individual of a variant."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.workshop.synth.assets import people, roadworks, vehicles
+from bevcli.workshop.synth.assets.mesh import Mesh, joined, made
+from bevcli.workshop.synth.assets.paint import (
+    BUS_PAINTS,
+    CAR_PAINTS,
+    CLOTHES,
+    MACHINE_PAINTS,
+    TRUCK_PAINTS,
+    Color,
+    linear,
+)
+from bevcli.workshop.synth.assets.people import CYCLES, RIDDEN
+from bevcli.workshop.synth.assets.roadworks import MACHINES
+from bevcli.workshop.synth.assets.street_furniture import StreetFurniture
+
+OWN_PAINTS: dict[str, tuple[Color, ...]] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One look of a class.
+
+    Attributes:
+        class_name: one of the ten nuScenes classes.
+        name: the look, such as "sedan" or "city_rider"; unique within the class.
+        poses: meshes of one size, shown in turn while the object moves.
+        size_lwh: (3,) usual length, width and height, metres.
+        paints: colours to draw from for PAINT faces.
+        dyes: colours to draw from for DYE faces.
+    """
+
+    class_name: str
+    name: str
+    poses: tuple[Mesh, ...]
+    size_lwh: NDArray[np.float64]
+    paints: tuple[Color, ...]
+    dyes: tuple[Color, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An individual of a variant, with its own size and colours.
+
+    Attributes:
+        variant: the look.
+        size_lwh: (3,) length, width and height, metres; the mesh is stretched to it.
+        paint: (3,) linear RGB of PAINT faces.
+        dye: (3,) linear RGB of DYE faces.
+        instance: the ground truth instance name, unique in a drive.
+    """
+
+    variant: Variant
+    size_lwh: NDArray[np.float64]
+    paint: NDArray[np.float32]
+    dye: NDArray[np.float32]
+    instance: str
+
+
+def draw_body(
+    variant: Variant, rng: np.random.Generator, instance: str, spread: float = 0.05, scale: float = 1.0
+) -> Body:
+    """Draw an individual of a variant.
+
+    spread: each dimension is drawn from 1 - spread to 1 + spread times the usual one. scale: factor on all dimensions.
+    """
+    size = variant.size_lwh * rng.uniform(1 - spread, 1 + spread, 3) * scale
+    paint = variant.paints[int(rng.integers(len(variant.paints)))]
+    dye = variant.dyes[int(rng.integers(len(variant.dyes)))]
+    return Body(variant, size, linear(paint), linear(dye), instance)
+
+
+# The classes but pedestrians: the names of the looks, the function that makes their parts, paints, dyes.
+_CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Color, ...], tuple[Color, ...]]] = {
+    "car": (vehicles.CAR_SHAPES, vehicles.car, CAR_PAINTS, CAR_PAINTS),
+    "truck": (vehicles.TRUCK_NAMES, vehicles.truck, TRUCK_PAINTS, TRUCK_PAINTS),
+    "construction_vehicle": (MACHINES, lambda look: made(MACHINES[look]), MACHINE_PAINTS, TRUCK_PAINTS),
+    "bus": (vehicles.BUSES, vehicles.bus, BUS_PAINTS, BUS_PAINTS),
+    "trailer": (vehicles.TRAILER_NAMES, vehicles.trailer, TRUCK_PAINTS, TRUCK_PAINTS),
+    "barrier": (roadworks.BARRIER_NAMES, roadworks.barrier, CAR_PAINTS, CLOTHES),
+    "motorcycle": (CYCLES["motorcycle"] + RIDDEN["motorcycle"], people.motorcycle, CAR_PAINTS, CLOTHES),
+    "bicycle": (CYCLES["bicycle"] + RIDDEN["bicycle"], people.bicycle, CAR_PAINTS, CLOTHES),
+    "traffic_cone": (roadworks.CONE_NAMES, roadworks.traffic_cone, CAR_PAINTS, CLOTHES),
+}
+
+
+@dataclass(frozen=True)
+class Assets:
+    """The meshes that all drives share. Build them once and pass them to every drive.
+
+    Attributes:
+        by_class: all variants of the annotated objects, by class.
+        furniture: the repeated objects without annotations.
+    """
+
+    by_class: Mapping[str, tuple[Variant, ...]]
+    furniture: StreetFurniture
+
+    @staticmethod
+    def build() -> "Assets":
+        """Build every mesh. This takes about half a second."""
+        by_class: dict[str, tuple[Variant, ...]] = {}
+        for name, (looks, make, paints, dyes) in _CLASSES.items():
+            meshes = {look: joined(make(look)) for look in looks}
+            by_class[name] = tuple(
+                Variant(name, look, (mesh,), mesh.extents, OWN_PAINTS.get(look, paints), dyes)
+                for look, mesh in meshes.items()
+            )
+        # A walking person has two mirrored strides of the same size.
+        walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
+        return Assets({**by_class, "pedestrian": (*walking, *standing)}, StreetFurniture())
+
+    def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
+        """Draw a variant of a class. names: draw from these variants only."""
+        choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
+        return choices[int(rng.integers(len(choices)))]
+
+
+def _person(name: str, *strides: int) -> Variant:
+    """A person with a pose for each stride."""
+    poses = tuple(joined(people.person(name, stride)) for stride in strides)
+    size = poses[0].extents * (0.68 if name == "child" else 1.0)
+    return Variant("pedestrian", name if any(strides) else f"{name}_standing", poses, size, CLOTHES, CLOTHES)

@@ -1,0 +1,266 @@
+"""A rendered drive: its frames, ground truth and ego-motion, made in memory when they are asked for."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.frame import BevMap, FrameStamp, MapLines
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
+from bevcli.workshop.synth.assets.catalog import Assets, Body
+from bevcli.workshop.synth.assets.mesh import TriangleSoup
+from bevcli.workshop.synth.render.ground import GroundTexture, draw_map, paint_ground, true_lines
+from bevcli.workshop.synth.render.lens import lens_parts
+from bevcli.workshop.synth.render.rasteriser import ShadowMap
+from bevcli.workshop.synth.render.renderer import (
+    NO_PATTERN,
+    RenderedView,
+    WorldSnapshot,
+    render_through_lens,
+    render_view,
+)
+from bevcli.workshop.synth.rig import DrawnRig, nuscenes_like_rig
+from bevcli.workshop.synth.world.city import CityPlan
+from bevcli.workshop.synth.world.ground_plan import GroundPlan
+from bevcli.workshop.synth.world.looks import Looks
+from bevcli.workshop.synth.world.scenery import Scenery
+from bevcli.workshop.synth.world.simulation import Actor, Simulation
+from bevcli.workshop.synth.world.traffic import ActorState
+from bevcli.workshop.synth.world.weather import WEATHER_NAMES, make_weather
+
+ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
+ACTORS_M = 66.0  # actors are drawn within this distance
+SCENERY_M = 135.0  # scenery is drawn within this distance
+NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
+SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
+FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
+
+
+def texel_sizes(width: int) -> tuple[float, float]:
+    """The texel sizes of the ground texture and the shadow map, metres, that suit images of a width in pixels."""
+    if width <= 500:
+        return 0.125, 0.16
+    return (0.06, 0.08) if width <= 1000 else (0.04, 0.06)
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """One frame of a rendered drive.
+
+    Attributes:
+        stamp: index, scene and timestamp.
+        views: camera name to image.
+        world_from_ego: pose of the ego vehicle.
+        world_from_ego_at: camera name to pose of the ego vehicle at the camera's time.
+        camera_timestamps_ns: camera name to the time of its image.
+        boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
+        bev_map: ground truth map.
+        lines: true lines of the map, bev frame.
+    """
+
+    stamp: FrameStamp
+    views: Mapping[str, RenderedView]
+    world_from_ego: Pose
+    world_from_ego_at: Mapping[str, Pose]
+    camera_timestamps_ns: Mapping[str, int]
+    boxes: Boxes3D
+    bev_map: BevMap
+    lines: MapLines
+
+    @property
+    def images(self) -> dict[str, NDArray[np.uint8]]:
+        """Camera name to image (H, W, 3) uint8 BGR."""
+        return {name: view.pixels_bgr for name, view in self.views.items()}
+
+
+class RenderedDrive:
+    """A drive through the city of one seed.
+
+    `frame(k)` renders any frame, in any order; the same seed and options always give the same frames.
+
+    Args:
+        seed: the drive; 0 or greater.
+        frames: number of frames.
+        rate_hz: frames per second.
+        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s) and whether the looks are varied
+            (`Looks`); default: `nuscenes_like_rig` at 400x225.
+        weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
+        assets: the meshes, if they are built already.
+        supersampling: samples per pixel along each axis (anti-aliasing).
+        threads: number of cameras rendered in parallel.
+        map_half_extent_m: from the origin of the bev frame to each side of the ground truth maps, metres.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        frames: int = 20,
+        rate_hz: float = 2.0,
+        rig: CameraRig | DrawnRig | None = None,
+        weather: str | None = None,
+        assets: Assets | None = None,
+        supersampling: int = 1,
+        threads: int = 1,
+        map_half_extent_m: float = 32.0,
+    ) -> None:
+        self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
+        drawn = rig if isinstance(rig, DrawnRig) else DrawnRig(rig or nuscenes_like_rig(400, 225))
+        self.rig, self._delays_s = drawn.rig, drawn.delays_s
+        self._looks = Looks(seed) if drawn.varied else None
+        self._lenses = {camera.name: lens_parts(camera) for camera in self.rig.cameras if camera.distortion}
+        self._map_half_extent_m = map_half_extent_m
+        self._supersampling, self._threads = supersampling, threads
+        self._assets = assets or Assets.build()
+        self._city = CityPlan(seed)
+        names = self._city.stream("weather-name")
+        name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
+        self.weather = make_weather(name, self._city.stream("weather"))
+        if self._looks is not None:
+            self.weather = self._looks.weather(self.weather)
+        self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
+        self._ground = GroundPlan(self._city)
+        self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
+        self._scenery = Scenery(self._city, self._assets.furniture, self._looks)
+        self._around = lru_cache(maxsize=1)(self._make_surroundings)
+        self._template = lru_cache(maxsize=None)(self._make_template)
+        self._placed = lru_cache(maxsize=500)(self._make_placed)  # an actor that stands still is placed once
+
+    def time_s(self, index: int) -> float:
+        """Time of a frame, seconds since the start of the drive."""
+        return index / self.rate_hz
+
+    def world_from_ego(self, time_s: float) -> Pose:
+        """Pose of the ego vehicle, seconds after the start of the drive."""
+        (x, y), yaw = self.simulation.ego.pose(time_s)
+        return Pose.from_matrix(rigid((x, y, 0.0), rotation_about_z(yaw)))
+
+    def ego_motion(self, rate_hz: float = 50.0) -> EgoMotion:
+        """Poses and kinematics over the whole drive, `rate_hz` per second."""
+        last_s = (self.frames - 1) / self.rate_hz + max(self._delays_s.values(), default=0.0)
+        count = int(np.ceil(last_s * rate_hz)) + 1
+        times = np.arange(count) / rate_hz
+        poses = [self.world_from_ego(float(t)) for t in times]
+        motions = [self.simulation.ego.motion(float(t)) for t in times]
+        return EgoMotion(
+            FIRST_TIMESTAMP_NS + np.round(times * 1e9).astype(np.int64),
+            np.stack([p.translation for p in poses]), np.stack([p.quaternion for p in poses]),
+            *(np.stack([m[k] for m in motions]) for k in range(3)),
+        )  # fmt: skip
+
+    def states(self, index: int) -> list[ActorState]:
+        """The annotated objects around the vehicle at a frame, in the order of the object indices in its views."""
+        return [state for _, state in self._actors(index)]
+
+    def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
+        """The annotated objects around the vehicle at a frame, with their states."""
+        origin = self.world_from_ego(self.time_s(index)).translation[:2]
+        seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))
+        return [(a, state) for a, state in seen if state and np.hypot(*(state.position[:2] - origin)) < ACTORS_M]
+
+    def frame(self, index: int) -> RenderedFrame:
+        """Render a frame. index: 0 to frames - 1."""
+        actors, time_s = self._actors(index), self.time_s(index)
+        timestamp_ns = FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz)
+        stamp = FrameStamp(index, f"rendered-{self.seed}", timestamp_ns)
+        states = [state for _, state in actors]
+        pose = self.world_from_ego(time_s)
+        delays = {name: self._delays_s.get(name, 0.0) for name in self.rig.names}
+        views: dict[str, RenderedView] = {}
+        for delay in sorted(set(delays.values())):
+            later = [actor.state(time_s + delay) for actor, _ in actors] if delay else states
+            # An object that has gone in the meantime is drawn where it was.
+            seen = [state if moved is None else moved for state, moved in zip(states, later, strict=True)]
+            names = [name for name in self.rig.names if delays[name] == delay]
+            there = self.world_from_ego(time_s + delay)
+            views |= self._render_views(names, seen, there, time_s + delay, pose.translation[:2])
+        views = {name: views[name] for name in self.rig.names}
+        boxes = self._boxes(states, views, pose)
+        bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
+        pieces = self._ground.pieces_around(pose.translation[:2], self._map_half_extent_m * 1.5)
+        bev_map = draw_map(pieces, boxes, bev_from_world, self._map_half_extent_m)
+        poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
+        times = {name: timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
+        return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map, true_lines(pieces, bev_from_world))
+
+    def _render_views(
+        self, names: list[str], states: list[ActorState], world_from_ego: Pose, time_s: float, here: Array
+    ) -> dict[str, RenderedView]:
+        """The images of cameras that see the world at the same time. The object indices are positions in `states`.
+
+        here: (2,) world, metres, the point around which the scenery is made.
+        """
+        # Those of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again.
+        scenery, ground, shadows = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
+        near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
+        near = [states[k] for k in near_first]
+        actors = [self._placed(state.body, state.pose, *state.position.tolist(), state.yaw) for state in near]
+        signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
+        moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
+        shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
+        pattern = NO_PATTERN if self._looks is None else self._looks.pattern()
+        soup = TriangleSoup.gather([scenery, moving])
+        snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather, pattern)
+
+        def render_one(name: str) -> RenderedView:
+            pose = world_from_ego.matrix
+            if name in self._lenses:
+                return render_through_lens(snapshot, self._lenses[name], pose, self._supersampling)
+            return render_view(snapshot, self.rig[name], pose, self._supersampling)
+
+        if self._threads == 1:
+            return {name: render_one(name) for name in names}
+        with ThreadPoolExecutor(self._threads) as pool:
+            return dict(zip(names, pool.map(render_one, names), strict=True))
+
+    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
+        """The scenery around a world point, the texture of the ground, and the shadow map of the scenery."""
+        center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
+        texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
+        scenery = self._scenery.around(center, SCENERY_M)
+        if self._looks is not None:
+            texture = replace(texture, texels=self._looks.ground(texture.texels))
+            scenery = self._looks.scenery(scenery)
+        shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
+        return scenery, texture, shadows
+
+    def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
+        """The mesh of a body in the world."""
+        return self._template(body, pose).placed((x, y, z), yaw)
+
+    def _make_template(self, body: Body, pose: int) -> TriangleSoup:
+        """The mesh of a body in its size and colours."""
+        mesh, paint = body.variant.poses[pose % len(body.variant.poses)], body.paint
+        if self._looks is not None:
+            mesh, paint = self._looks.body(mesh, body.instance), self._looks.paint(paint, body.instance)
+        return TriangleSoup.from_mesh(mesh.fitted(body.size_lwh)).painted(paint, body.dye)
+
+    def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
+        """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""
+        x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
+        return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
+
+    def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
+        """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""
+        if not states:
+            return Boxes3D.empty()
+        visible = sum(view.visible for view in views.values())
+        unoccluded = sum(view.unoccluded for view in views.values())
+        sizes = np.stack([s.body.size_lwh for s in states])
+        centers = np.stack([s.position for s in states])
+        centers[:, 2] += sizes[:, 2] / 2
+        boxes = Boxes3D(
+            centers, sizes, np.array([s.yaw for s in states]), np.stack([s.velocity for s in states]),
+            np.array([s.body.variant.class_name for s in states]),
+            attributes=np.array([s.attribute for s in states]),
+            instances=np.array([s.body.instance for s in states]),
+            visibilities=np.asarray(visible) / np.maximum(unoccluded, 1),
+            num_points=np.asarray(visible).astype(np.int64),
+        )  # fmt: skip
+        origin = (pose.matrix @ self.rig.ego_from_bev)[:2, 3]
+        return boxes[np.hypot(*(boxes.centers[:, :2] - origin).T) < ANNOTATED_M]

@@ -1,0 +1,275 @@
+"""The rigs that are rendered: the default one, one from a file, or one drawn at random for training and validation."""
+
+import hashlib
+from dataclasses import astuple, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
+from bevcli.geometry.transforms import Array, rigid, rotation_about_z
+from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.workshop.synth.render.lens import lens_parts
+
+# name: x, y, z in the ego frame (metres), yaw (degrees), focal length (pixels at 1600 x 900)
+_MOUNTS = {
+    "CAM_FRONT": (1.72, 0.0, 1.50, 0.0, 1266.0),
+    "CAM_FRONT_RIGHT": (1.58, -0.50, 1.51, -56.0, 1260.0),
+    "CAM_FRONT_LEFT": (1.58, 0.50, 1.51, 56.0, 1260.0),
+    "CAM_BACK": (0.05, 0.0, 1.57, 180.0, 809.0),
+    "CAM_BACK_LEFT": (1.05, 0.48, 1.56, 109.0, 1256.0),
+    "CAM_BACK_RIGHT": (1.05, -0.48, 1.56, -111.0, 1256.0),
+}
+EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # of one that looks ahead
+
+
+def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
+    """Six horizontal cameras around the vehicle. width, height: of the images, pixels; the fields of view stay."""
+    cameras = []
+    for name, (*place, yaw_deg, focal) in _MOUNTS.items():
+        intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
+        rotation = rotation_about_z(np.radians(yaw_deg)) @ EGO_AXES_FROM_CAMERA
+        camera = Camera(name, 1600, 900, intrinsics, rigid(place, rotation))
+        cameras.append(camera.scaled(width / 1600, height / 900))
+    return CameraRig(tuple(cameras), default_ego_from_bev())
+
+
+def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] | None) -> CameraRig:
+    """The cameras to render.
+
+    rig: a rig, or the path of a calibration.json; default: `nuscenes_like_rig`. size: width and height of the images,
+    pixels; default: that of the rig.
+    Raises InputError where the file is wrong, or a camera has too wide a field of view for its lens model.
+    """
+    if rig is None:
+        where, found = "", nuscenes_like_rig()
+    elif isinstance(rig, CameraRig):
+        where, found = "rig: ", rig
+    else:
+        where, found = f"{rig}: ", read_calibration(Path(rig))
+    if size is not None:
+        found = replace(found, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in found.cameras))
+    for camera in found.cameras:
+        if camera.distortion is not None:
+            try:
+                lens_parts(camera)
+            except InputError as error:
+                raise InputError(f"{where}camera {camera.name}: {error}") from None
+    return found
+
+
+_STREAM = 0x7269_6773  # keeps the draws apart from those of the street with the same seed
+_CENTER_X_M = 1.4  # middle of the vehicle, ahead of the rear axle
+Range = tuple[float, float]
+_LIMITS: dict[str, Range] = {
+    **dict.fromkeys(("random_share", "front_share", "distorted_share", "delayed_share", "supersampled_share"), (0, 1)),
+    **dict.fromkeys(("coarse_share", "varied_share"), (0, 1)),
+    "cameras": (1, 16),
+    "fov_deg": (10, 140),
+    "jpeg_quality": (1, 100),
+    "coarsest": (0.1, 1),
+    "aspects": (0.3, 4),
+    "delay_s": (0, 0.1),
+}  # lowest and highest value of fields of `RigDistribution`
+
+
+@dataclass(frozen=True)
+class RigDistribution:
+    """The [training.rigs] table: the distribution of the rigs, and of how their images were taken.
+
+    A share is a probability from 0 to 1. A range is the lowest and the highest value, drawn uniformly.
+
+    Attributes:
+        random_share: share of the drives with a random rig. The others have the default rig.
+        cameras: range of the number of cameras.
+        fov_deg: range of the horizontal field of view. The cameras of a rig that looks all around get at least the
+            field of view at which they leave no gap, as far as the range allows.
+        fov_spread: cameras of a rig differ in their field of view by a factor of at most 1 + this, up or down.
+        aspects: widths divided by heights of the images; one of them for each rig.
+        focal_ratio: largest relative difference of the focal lengths along x and y.
+        principal_point: largest distance of the principal point from the middle, relative to width and height.
+        height_m: range of the cameras' height above the ground; the cameras of a rig differ by at most 0.15 m.
+        radius_m: range of the cameras' distance from the middle of the roof, along x; half of it along y.
+        front_share: share of the rigs that look ahead and to the sides only.
+        yaw_jitter_deg: largest deviation of a camera from even spacing.
+        tilt_deg: largest pitch and roll of a camera.
+        bev_tilt_deg: largest pitch and roll of the bev frame.
+        bev_height_m: range of the height of the bev frame's origin above the ground.
+        distorted_share: share of the rigs with lens distortion.
+        delayed_share: share of the rigs whose cameras take their images at different times.
+        delay_s: largest time of an image after that of its frame.
+        supersampled_share: share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel.
+        coarse_share: share of the rigs with images of a lower resolution than the model's, by a factor from
+            `coarsest` to 1.
+        coarsest: see `coarse_share`.
+        jpeg_quality: range of the quality of the images.
+        varied_share: share of the drives whose looks are varied: shapes, colours, patterns, light, nameless objects.
+    """
+
+    random_share: float = 0.0
+    cameras: tuple[int, int] = (4, 8)
+    fov_deg: Range = (45.0, 110.0)
+    fov_spread: float = 0.2
+    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)
+    focal_ratio: float = 0.02
+    principal_point: float = 0.06
+    height_m: Range = (0.8, 2.8)
+    radius_m: Range = (0.2, 1.8)
+    front_share: float = 0.2
+    yaw_jitter_deg: float = 12.0
+    tilt_deg: float = 3.0
+    bev_tilt_deg: float = 2.0
+    bev_height_m: Range = (0.0, 2.5)
+    distorted_share: float = 0.2
+    delayed_share: float = 0.4
+    delay_s: float = 0.05
+    supersampled_share: float = 0.5
+    coarse_share: float = 0.15
+    coarsest: float = 0.6
+    jpeg_quality: tuple[int, int] = (60, 95)
+    varied_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name} goes from a smaller to a larger number")
+        for name, (low, high) in _LIMITS.items():
+            value = getattr(self, name)
+            values = value if isinstance(value, tuple) else (value,)
+            if not values or not low <= min(values) <= max(values) <= high:
+                kind = "is a probability," if name.endswith("_share") else "must be"
+                raise ValueError(f"{name} {kind} from {low} to {high}")
+
+    @property
+    def digest(self) -> str:
+        """Eight hexadecimal digits that differ between distributions."""
+        stated = astuple(self) if self.varied_share else astuple(self)[:-1]  # older caches stay valid
+        return hashlib.sha256(repr(stated).encode()).hexdigest()[:8]
+
+
+@dataclass(frozen=True)
+class DrawnRig:
+    """The rig of a drive, and how its images are taken.
+
+    Attributes:
+        rig: the cameras.
+        delays_s: camera name to the time of its images after that of the frame, seconds; empty for none.
+        supersampling: samples per pixel along each axis.
+        jpeg_quality: 1 to 100.
+        varied: whether the looks of the drive are varied.
+    """
+
+    rig: CameraRig
+    delays_s: dict[str, float] = field(default_factory=dict)
+    supersampling: int = 1
+    jpeg_quality: int = 90
+    varied: bool = False
+
+
+def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:
+    """The rig of a seed: the default one, or a random one.
+
+    size: (width, height) in pixels of the largest images; those of another aspect ratio fit inside.
+    """
+    random = np.random.default_rng([seed, _STREAM])
+    is_random = random.random() < distribution.random_share
+    coarse = random.uniform(distribution.coarsest, 1) if random.random() < distribution.coarse_share else 1.0
+    samples = 2 if random.random() < distribution.supersampled_share else 1
+    quality = int(random.integers(distribution.jpeg_quality[0], distribution.jpeg_quality[1] + 1))
+    rig = nuscenes_like_rig(round(size[0] * coarse), round(size[1] * coarse))
+    if is_random:
+        rig = _random_rig(distribution, size, coarse, random)
+    delays = {}
+    if random.random() < distribution.delayed_share:
+        delays = {name: round(float(random.uniform(0, distribution.delay_s)), 3) for name in rig.names}
+    varied = np.random.default_rng([seed, _STREAM, 1]).random() < distribution.varied_share  # leaves the rest as it is
+    return DrawnRig(rig, delays, samples, quality, bool(varied))
+
+
+def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: float, random: Generator) -> CameraRig:
+    count = int(random.integers(distribution.cameras[0], distribution.cameras[1] + 1))
+    aspect = float(random.choice(distribution.aspects))
+    ahead_only = random.random() < distribution.front_share
+    yaws, spacing_deg = _yaws_deg(count, ahead_only, distribution, random)
+    low, high = distribution.fov_deg
+    fov_deg = random.uniform(min(max(low, spacing_deg), high), high)
+    height, radius = random.uniform(*distribution.height_m), random.uniform(*distribution.radius_m)
+    coefficients = _lens(distribution, random)
+    width_px = min(size[0], size[1] * aspect) * coarse
+    image_size = max(round(width_px), 16), max(round(width_px / aspect), 16)
+    cameras = []
+    for index, yaw_deg in enumerate(yaws):
+        spread = random.uniform(-1, 1)
+        own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
+        intrinsics = _intrinsics(image_size, own_fov, distribution, random)
+        place = _place(yaw_deg, radius, height, distribution, random)
+        tilt = _tilt(distribution.tilt_deg, random)
+        rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
+        distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
+        cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(place, rotation), distortion))
+    return CameraRig(tuple(cameras), _ego_from_bev(distribution, random))
+
+
+def _yaws_deg(
+    count: int, ahead_only: bool, distribution: RigDistribution, random: Generator
+) -> tuple[list[float], float]:
+    """Yaw of each camera, and the angle between the axes of neighbours; degrees."""
+    jitter = random.uniform(-1, 1, count) * distribution.yaw_jitter_deg
+    if ahead_only:
+        arc = random.uniform(140, 220)
+        return [float(yaw) for yaw in np.linspace(-arc / 2, arc / 2, count) + jitter], arc / max(count - 1, 1)
+    # A camera looks straight ahead, or two look past it.
+    first = 0.0 if random.random() < 0.75 else 180 / count
+    return [float(yaw) for yaw in first + np.arange(count) * 360 / count + jitter], 360 / count
+
+
+def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribution, random: Generator) -> Array:
+    """(3, 3) pixels."""
+    width, height = size
+    focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
+    ratio = 1 + random.uniform(-1, 1) * distribution.focal_ratio
+    x, y = 0.5 + random.uniform(-1, 1, 2) * distribution.principal_point
+    return np.array([[focal, 0, x * width], [0, focal * ratio, y * height], [0, 0, 1.0]])
+
+
+def _place(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
+    """(3,) ego, metres: on an ellipse around the middle of the vehicle, in the viewing direction."""
+    around = np.radians(yaw_deg + random.uniform(-20, 20))
+    x = _CENTER_X_M + radius * np.cos(around)
+    y = 0.5 * radius * np.sin(around)
+    z = np.clip(height + random.uniform(-0.15, 0.15), *distribution.height_m)
+    return np.array([x, y, z])
+
+
+def _lens(distribution: RigDistribution, random: Generator) -> tuple[float, ...] | None:
+    """Coefficients k1, k2, p1, p2 of all lenses of a rig; None for no distortion."""
+    drawn = random.uniform(-1, 1, 4) * (0.12, 0.02, 0.002, 0.002) + (-0.12, 0.03, 0, 0)
+    return tuple(float(k) for k in drawn) if random.random() < distribution.distorted_share else None
+
+
+def _fitting(coefficients: tuple[float, ...], intrinsics: Array, size: tuple[int, int]) -> Distortion:
+    """The distortion, weaker for wide lenses: as at a field of view of 70 degrees in the corner of the image."""
+    corner = np.hypot(size[0] / intrinsics[0, 0], size[1] / intrinsics[1, 1]) / 2
+    weaker = min(1.0, (0.7 / corner) ** 2)
+    k1, k2, p1, p2 = coefficients
+    scaled = (k1 * weaker, k2 * weaker**2, p1 * weaker, p2 * weaker)
+    return Distortion("brown_conrady", tuple(float(k) for k in scaled))
+
+
+def _tilt(largest_deg: float, random: Generator) -> Array:
+    """(3, 3) rotation by a pitch about y and a roll about x, in a frame with x forward."""
+    pitch, roll = np.radians(random.uniform(-1, 1, 2) * largest_deg)
+    about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+    return np.asarray(about_y @ about_x)
+
+
+def _ego_from_bev(distribution: RigDistribution, random: Generator) -> Array:
+    """(4, 4): x right, y forward, tilted, at a random height near the middle of the vehicle."""
+    tilt = _tilt(distribution.bev_tilt_deg, random)
+    origin = (random.uniform(0.5, 1.5), random.uniform(-0.1, 0.1), random.uniform(*distribution.bev_height_m))
+    heading = rotation_about_z(-np.pi / 2 + np.radians(random.uniform(-1, 1)))
+    return rigid(origin, tilt @ heading)

@@ -1,0 +1,143 @@
+"""Varied looks of a drive for training: other shapes, colours, patterns, light, and objects that have no name.
+
+Nothing is to look real: what all looks share is what also holds for photographs. Positions, sizes and classes of the
+annotated objects stay.
+"""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.workshop.synth.assets.mesh import Mesh, TriangleSoup, ball, block, cone, joined, rod
+from bevcli.workshop.synth.assets.paint import Color, Material
+from bevcli.workshop.synth.world.weather import Weather
+
+RECOLOURED_SHARE = 0.4  # of the colours of a mesh
+CLUTTER_PER_M = 0.12  # nameless objects for each metre of pavement
+BENT = 0.07  # largest shift of a point by `bent`, in sizes of the mesh
+
+
+@dataclass(frozen=True)
+class Looks:
+    """The varied looks of one drive. seed: the drive's."""
+
+    seed: int
+
+    def stream(self, *names: int | str) -> np.random.Generator:
+        """Random numbers for one purpose, the same for each drive of the seed."""
+        numbers = [zlib.crc32(str(name).encode()) for name in names]
+        return np.random.default_rng([self.seed, 0x6C6F6F6B, *numbers])
+
+    def body(self, mesh: Mesh, name: str) -> Mesh:
+        """The mesh of an individual with a shape and colours of its own. name: of the individual."""
+        rng = self.stream("body", name)
+        return recoloured(bent(mesh, rng), rng)
+
+    def paint(self, paint: NDArray[np.float32], name: str) -> NDArray[np.float32]:
+        """(3,) linear RGB: any colour for a half of the individuals, else the given one."""
+        rng = self.stream("paint", name)
+        return any_color(rng) if rng.random() < 0.5 else paint
+
+    def scenery(self, soup: TriangleSoup) -> TriangleSoup:
+        """The soup with other colours; the same for a mesh at the same place."""
+        albedo, facades = soup.albedo.copy(), soup.facades.copy()
+        for (start, end), (x, y, *_) in zip(soup.mesh_ranges, soup.mesh_spheres, strict=True):
+            rng = self.stream("scenery", int(10 * x), int(10 * y))
+            if rng.random() < RECOLOURED_SHARE:
+                changed = ~np.isin(soup.material[start:end], (Material.GLASS, Material.GLOW))
+                albedo[start:end][changed] = any_color(rng)
+        for facade in facades:
+            rng = self.stream("facade", int(facade[12]))
+            if rng.random() < RECOLOURED_SHARE:
+                facade[13:16] = any_color(rng)
+        return replace(soup, albedo=albedo, facades=facades)
+
+    def ground(self, texels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(K, 3) texels of the ground in other colours and with another contrast."""
+        rng = self.stream("ground")
+        tint, contrast = rng.uniform(0.85, 1.15, 3) * rng.uniform(0.6, 1.3), rng.uniform(0.6, 1.2)
+        levels = np.arange(256)[:, None]
+        table = np.clip((90 + (levels - 90) * contrast) * tint, 0, 255).astype(np.uint8)
+        return np.stack([table[texels[:, c], c] for c in range(3)], -1)
+
+    def weather(self, weather: Weather) -> Weather:
+        """Other colours of sun and sky, and another height of the sun."""
+        rng = self.stream("weather")
+        light = weather.light * rng.uniform(0.85, 1.15, (7, 3)) * rng.uniform(0.6, 1.3, (7, 1))
+        elevation, azimuth = rng.uniform(0.2, 1.4), rng.uniform(0, 2 * np.pi)
+        flat = np.cos(elevation)
+        to_sun = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+        kind = weather.kind._replace(haze_m=float(np.exp(rng.uniform(np.log(80), np.log(900)))))
+        return replace(weather, light=light, to_sun=to_sun, kind=kind)
+
+    def pattern(self) -> tuple[float, float, float]:
+        """Strength, waves per metre and hardness (0 to 1) of the pattern on all surfaces but the ground."""
+        rng = self.stream("pattern")
+        return (
+            float(rng.uniform(0, 0.9)),
+            float(np.exp(rng.uniform(np.log(1.5), np.log(40)))),
+            float(rng.random() < 0.4),
+        )
+
+    def clutter(self, length_m: float, *place: int) -> Iterator[tuple[TriangleSoup, float, float]]:
+        """Nameless objects on a pavement, with their distances along it and away from the kerb, metres."""
+        rng = self.stream("clutter", *place)
+        for _ in range(rng.poisson(length_m * CLUTTER_PER_M)):
+            yield TriangleSoup.from_mesh(nameless(rng)), rng.uniform(4, max(length_m - 4, 5)), rng.uniform(0.8, 4.5)
+
+
+def any_color(rng: np.random.Generator) -> NDArray[np.float32]:
+    """(3,) linear RGB of any brightness; greys are frequent."""
+    grey = rng.random() ** 2
+    color = grey + (rng.random(3) - grey) * rng.random()
+    return np.asarray(0.02 + 0.9 * color, np.float32)
+
+
+def recoloured(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """The mesh with some of its colours exchanged; glass and lamps stay."""
+    albedo = mesh.albedo.copy()
+    colors, of_face = np.unique(mesh.albedo, axis=0, return_inverse=True)
+    fixed = np.isin(mesh.material, (Material.GLASS, Material.GLOW))
+    for index in range(len(colors)):
+        if rng.random() < RECOLOURED_SHARE:
+            albedo[(of_face.reshape(-1) == index) & ~fixed] = any_color(rng)
+    return replace(mesh, albedo=albedo)
+
+
+def bent(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """The mesh bent smoothly inside its cuboid, the same on its left and right."""
+    points = mesh.faces.reshape(-1, 3).astype(np.float64)
+    low, size = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-6)
+    x, y, z = ((points - low) / size).T  # 0 to 1
+    (a, b, c), (power, taper, wave) = rng.uniform(-BENT, BENT, 3), rng.uniform(-1, 1, 3)
+    bump = 4 * x * (1 - x)
+    moved = np.stack([
+        x + bump * (a + b * z) + wave * 0.03 * np.sin(2 * np.pi * x),
+        0.5 + (y - 0.5) * (1 - 0.12 * abs(taper) * (z if taper > 0 else 1 - z)),
+        np.clip(z, 0, 1) ** np.exp(0.15 * power) * (1 + c * bump * z),
+    ], -1)  # fmt: skip
+    faces = (low + moved * size).reshape(-1, 3, 3).astype(np.float32)
+    return replace(mesh, faces=faces)
+
+
+def nameless(rng: np.random.Generator) -> Mesh:
+    """One to four blocks, balls, cones and poles on top of each other or side by side, 0.3 to 5 m."""
+    parts = []
+    for _ in range(int(rng.integers(1, 5))):
+        length, width, height = np.exp(rng.uniform(np.log(0.2), np.log((3.0, 1.2, 3.0))))
+        x, y, low = *rng.uniform(-0.5, 0.5, 2), float(rng.uniform(0, 1)) * (rng.random() < 0.4)
+        red, green, blue = (int(255 * c) for c in any_color(rng) ** 0.45)
+        color: Color = (red, green, blue)
+        kind = rng.integers(4)
+        if kind == 0:
+            parts.append(block((x, y, low + height / 2), (length, width, height), color))
+        elif kind == 1:
+            parts.append(ball((x, y, low + height / 2), (length / 2, width / 2, height / 2), color))
+        elif kind == 2:
+            parts.append(cone(low, low + height, width / 2, width / 2 * float(rng.random()) + 0.01, color))
+        else:
+            parts.append(rod((x, y, 0), (x + rng.uniform(-1, 1), y, height + 1), 0.03 + 0.1 * rng.random(), color))
+    return joined(parts)

@@ -1,0 +1,252 @@
+"""Augmentation: photometric distortion, exposure, noise, missing images, corruptions, grid mask, calibration noise.
+
+Boxes and maps stay as they are.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from functools import cache
+from statistics import NormalDist
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bevcli.frame import CameraImage, Frame
+from bevcli.geometry.cameras import CameraRig, camera_pose_noise
+from bevcli.geometry.transforms import Array
+from bevcli.jit import njit
+from bevcli.workshop.synth import corruptions
+from bevcli.workshop.synth.corruptions import ImageCorruption
+from bevcli.workshop.training.randomisation import RandomisationConfig
+
+MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
+CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
+MAX_HUE_DEG = 18.0
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """The [training.augmentation] table.
+
+    Attributes:
+        photometric: probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue.
+        grid_mask: probability (0 to 1) that a grid of grey squares covers an image.
+        exposure: largest change of the exposure of a camera, in stops (factors of 2); constant over a clip.
+        white_balance: largest relative change of a camera's red and blue; constant over a clip.
+        noise: largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise.
+        drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
+        calibration_share: probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip.
+        calibration_noise: largest level of that noise (`camera_pose_noise`), drawn uniformly from 0.
+        corrupted_share: probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness,
+            motion blur or few colours, of any severity.
+        lost_cameras_share: probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or
+            black images.
+        randomisation: of the images that enter the network.
+    """
+
+    photometric: float = 0.5
+    grid_mask: float = 0.7
+    exposure: float = 0.0
+    white_balance: float = 0.0
+    noise: float = 0.0
+    drop_image: float = 0.0
+    calibration_share: float = 0.0
+    calibration_noise: float = 4.0
+    corrupted_share: float = 0.0
+    lost_cameras_share: float = 0.0
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+
+    def __post_init__(self) -> None:
+        amounts = ("exposure", "white_balance", "noise", "calibration_noise")
+        others = (*amounts, "randomisation")
+        wrong = [name for name, share in vars(self).items() if name not in others and not 0 <= share <= 1]
+        if wrong:
+            raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
+        if min(vars(self)[name] for name in amounts) < 0 or self.white_balance >= 1:
+            raise ValueError(
+                "exposure, white_balance, noise and calibration_noise must not be negative, and white_balance must be "
+                "below 1"
+            )
+
+
+def augmented(clip: list[Frame], config: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
+    """Copies of the frames of a clip with all changes but the grid mask, which is for the network's input."""
+    vary_images, vary_rig = ImageVariation(config, random), CalibrationVariation(config, random)
+    worsen = BadConditions(config, random)
+    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
+    return [distort_images(frame, config.photometric, random) for frame in frames]
+
+
+class ImageVariation:
+    """Exposure, white balance and noise of the cameras of one clip, drawn once; missing images."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        self._config, self._random = config, random
+        self._tables = defaultdict[str, NDArray[np.uint8]](self._table)  # by camera
+        stops = random.uniform(-1, 1) * config.exposure if config.exposure else 0.0
+        self._clip_stops = stops / 2  # half of the change is common to all cameras
+        self._noise = max(0.0, random.uniform(-1, 1)) * config.noise if config.noise else 0.0
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame with its images changed and some of them left out."""
+        config, names = self._config, list(frame.images)
+        if config.drop_image:
+            names = [name for name in names if self._random.random() >= config.drop_image] or names[:1]
+        if not (config.exposure or config.white_balance or self._noise) and len(names) == len(frame.images):
+            return frame
+        return replace(frame, images={name: self._changed(name, frame.images[name]) for name in names})
+
+    def _changed(self, name: str, image: CameraImage) -> CameraImage:
+        pixels = np.asarray(cv2.LUT(image.pixels_bgr, self._tables[name]), dtype=np.uint8)
+        if self._noise:
+            pixels = noisy(pixels, self._noise, self._random)
+        return replace(image, pixels_bgr=pixels)
+
+    def _table(self) -> NDArray[np.uint8]:
+        """(1, 256, 3) the new value of each pixel value of a channel, of one camera."""
+        stops = self._clip_stops + self._random.uniform(-0.5, 0.5) * self._config.exposure
+        blue, red = 1 + self._random.uniform(-1, 1, 2) * self._config.white_balance
+        gains = np.array([blue, 1.0, red]) * 2.0**stops
+        return (np.arange(256)[None, :, None] * gains).clip(0, 255).round().astype(np.uint8)
+
+
+def noisy(pixels_bgr: NDArray[np.uint8], deviation: float, random: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 with normal noise of a standard deviation in grey levels, independent in each pixel and channel.
+
+    The noise is made of one random integer: a tenth of the time of `random.standard_normal`.
+    """
+    levels, out = np.rint(_quantiles() * deviation).astype(np.int16), np.empty(pixels_bgr.shape, np.uint8)
+    _add_noise(
+        np.ascontiguousarray(pixels_bgr).reshape(-1), levels, random.integers(2**63, dtype=np.uint64), out.reshape(-1)
+    )
+    return out
+
+
+@cache
+def _quantiles() -> Array:
+    """(4096,) equally likely values of the standard normal distribution."""
+    return np.array([NormalDist().inv_cdf((place + 0.5) / 4096) for place in range(4096)])
+
+
+@njit(nogil=True)
+def _add_noise(pixels, levels, seed, out) -> None:  # type: ignore[no-untyped-def]
+    """levels: (4096,) of which 12 random bits choose one. The random numbers are those of SplitMix64."""
+    state = seed
+    for start in range(0, len(pixels), 5):
+        state += np.uint64(0x9E3779B97F4A7C15)
+        bits = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        bits ^= bits >> np.uint64(31)
+        for place in range(start, min(start + 5, len(pixels))):
+            pixel = np.int32(pixels[place]) + np.int32(levels[bits & np.uint64(4095)])
+            out[place] = np.uint8(min(max(pixel, np.int32(0)), np.int32(255)))
+            bits >>= np.uint64(12)
+
+
+# Corruptions to train on, and their levels. The others of `bevcli.workshop.synth.corruptions` are kept for scores.
+TRAINED_CORRUPTIONS: tuple[tuple[ImageCorruption, tuple[int, ...]], ...] = (
+    (corruptions.low_light, tuple(corruptions.LOW_LIGHT)),
+    (corruptions.fog, tuple(corruptions.FOG)),
+    (corruptions.snow, tuple(corruptions.SNOW)),
+    (corruptions.brightness, tuple(corruptions.BRIGHTNESS)),
+    (corruptions.motion_blur, tuple(corruptions.MOTION_BLUR)),
+    (corruptions.color_quantisation, (1, 2, 3)),
+)
+MOST_LOST_CAMERAS = 4
+
+
+class BadConditions:
+    """A corruption of all images of one clip, and cameras that deliver nothing, both drawn once."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        self._random, self._lost, self._black = random, 0, False
+        self._corruption: tuple[ImageCorruption, int] | None = None
+        if random.random() < config.corrupted_share:
+            corrupt, levels = TRAINED_CORRUPTIONS[random.integers(len(TRAINED_CORRUPTIONS))]
+            self._corruption = corrupt, int(random.choice(levels))
+        if random.random() < config.lost_cameras_share:
+            self._lost, self._black = int(random.integers(1, MOST_LOST_CAMERAS + 1)), bool(random.random() < 0.5)
+        self._order: dict[str, int] = {}  # camera -> its place among those that are lost one after the other
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame with its images corrupted, and some of them left out or black."""
+        if self._corruption is None and not self._lost:
+            return frame
+        if not self._order:
+            places = self._random.permutation(len(frame.rig.names))
+            self._order = dict(zip(frame.rig.names, map(int, places), strict=True))
+        lost = min(self._lost, len(self._order) - 1)
+        images = {}
+        for name, image in frame.images.items():
+            if self._order[name] >= lost:
+                pixels = image.pixels_bgr
+                if self._corruption is not None:
+                    corrupt, level = self._corruption
+                    pixels = corrupt(pixels, level, self._random)
+                images[name] = replace(image, pixels_bgr=pixels)
+            elif self._black:
+                images[name] = replace(image, pixels_bgr=np.zeros_like(image.pixels_bgr))
+        return replace(frame, images=images)
+
+
+class CalibrationVariation:
+    """Noise on the poses of the cameras of one clip, drawn once."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        noisy = config.calibration_share > 0 and random.random() < config.calibration_share
+        self._level = random.uniform(0, config.calibration_noise) if noisy else 0.0
+        self._noise = defaultdict[str, Array](lambda: camera_pose_noise(self._level, random))  # by camera
+        self._noisy: tuple[CameraRig, CameraRig] | None = None  # a rig as it was read, and with noise
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame whose cameras state wrong poses, or the frame itself. Frames share their noisy rig."""
+        if not self._level:
+            return frame
+        if self._noisy is None or self._noisy[0] is not frame.rig:
+            cameras = tuple(
+                replace(camera, ego_from_camera=camera.ego_from_camera @ self._noise[camera.name])
+                for camera in frame.rig.cameras
+            )
+            self._noisy = (frame.rig, replace(frame.rig, cameras=cameras))
+        return replace(frame, rig=self._noisy[1])
+
+
+def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:
+    """A copy of the frame with `distort` applied to each image."""
+    if probability == 0:
+        return frame
+    pixels = {name: distort(image.pixels_bgr, probability, random) for name, image in frame.images.items()}
+    return replace(frame, images={name: replace(frame.images[name], pixels_bgr=each) for name, each in pixels.items()})
+
+
+def distort(pixels_bgr: NDArray[np.uint8], probability: float, random: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 with brightness, contrast, saturation and hue changed, each with the given probability."""
+    applied = random.random(4) < probability
+    brightness = random.uniform(-MAX_BRIGHTNESS, MAX_BRIGHTNESS) * applied[0]
+    contrast, saturation = random.uniform(*CONTRAST_RANGE), random.uniform(*SATURATION_RANGE)
+    hue_deg = random.uniform(-MAX_HUE_DEG, MAX_HUE_DEG) * applied[3]
+    pixels = (pixels_bgr.astype(np.float32) + np.float32(brightness)) * np.float32(contrast if applied[1] else 1)
+    if applied[2] or applied[3]:
+        hsv = cv2.cvtColor(pixels.clip(0, 255) / np.float32(255), cv2.COLOR_BGR2HSV)
+        hsv[..., 0] = (hsv[..., 0] + hue_deg) % 360
+        hsv[..., 1] = (hsv[..., 1] * (saturation if applied[2] else 1)).clip(0, 1)
+        pixels = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR) * np.float32(255)
+    return pixels.clip(0, 255).astype(np.uint8)
+
+
+def mask_images(images: Tensor, probability: float, random: np.random.Generator) -> None:
+    """Covers normalised images (..., 3, H, W) with a grid of grey squares in place, each with the given probability."""
+    for image in images.flatten(0, -4):
+        if random.random() < probability:
+            height, width = image.shape[-2:]
+            period = int(random.integers(2, max(3, min(height, width))))
+            rows, columns = (_stripes(extent, period, random) for extent in (height, width))
+            image.masked_fill_(torch.from_numpy(rows[:, None] & columns), 0)
+
+
+def _stripes(extent: int, period: int, random: np.random.Generator) -> NDArray[np.bool_]:
+    """(extent,) bool: true in the first half of each period, with a random phase."""
+    return (np.arange(extent) + random.integers(period)) % period < period / 2

@@ -1,0 +1,305 @@
+"""Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
+
+import contextlib
+import json
+import math
+import os
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.distributed
+from torch import Tensor, nn
+
+from bevcli.config import TRAINING, load_config, load_table
+from bevcli.errors import InputError, OutputError
+from bevcli.geometry.cameras import CameraRig
+from bevcli.model.network import Network, build_network
+from bevcli.parsing.documents import read_json
+from bevcli.runs.folder import OWN, folder_lock
+from bevcli.weights.fetch import weights_file
+from bevcli.workshop.synth.drives import Drives, check_training_seeds
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
+from bevcli.workshop.synth.splits import split_of, training_drives, write_split
+from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.backbone_weights import start_backbone
+from bevcli.workshop.training.changes import with_changes
+from bevcli.workshop.training.drive_checks import check_training_drives
+from bevcli.workshop.training.files import require_tensorboard
+from bevcli.workshop.training.frame_losses import LossConfigs
+from bevcli.workshop.training.options import Log, TrainOptions
+from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.warm_start import WarmStart, warm_start
+from bevcli.writing import write_whole
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process among those that train together.
+
+    Attributes:
+        rank: of this process, 0 to size - 1; the leader has rank 0.
+        size: the number of processes, 1 without torchrun.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """True in the leader, which writes files and prints."""
+        return self.rank == 0
+
+    def average_gradients(self, trained: nn.Module) -> None:
+        """Replaces each gradient by its mean over the processes; a missing gradient counts as zero."""
+        if self.size > 1:
+            learned = [parameter for parameter in trained.parameters() if parameter.requires_grad]
+            for parameter in learned:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+            self._average([parameter.grad for parameter in learned if parameter.grad is not None])
+
+    def average_statistics(self, trained: nn.Module) -> None:
+        """Replaces the running statistics of batch norms (all float buffers) by their mean over the processes."""
+        if self.size > 1:
+            self._average([buffer for buffer in trained.buffers() if buffer.is_floating_point()])
+
+    def _average(self, tensors: list[Tensor]) -> None:
+        flat = torch.cat([tensor.flatten() for tensor in tensors])
+        torch.distributed.all_reduce(flat)
+        flat /= self.size
+        for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+            tensor.copy_(mean.view_as(tensor))
+
+
+def join_process_group(device: torch.device) -> ProcessGroup:
+    """Joins the group in which torchrun started this process; a group of one without torchrun.
+
+    On GPUs each process takes the one of its local rank.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return ProcessGroup()
+    if device.type == "cuda":
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())
+
+
+def leave_process_group(group: ProcessGroup) -> None:
+    """Ends the communication with the other processes."""
+    if group.size > 1:
+        torch.distributed.destroy_process_group()
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """The [training.optimizer] table.
+
+    Attributes:
+        learning_rate: the peak learning rate.
+        backbone_share: learning rate of the image backbone relative to the rest; 1 for an untrained backbone.
+        weight_decay: of AdamW.
+        warm_up_steps: steps in which the rate rises linearly.
+        warm_up_start: relative rate at step 0.
+        final_share: relative rate at the end of the cosine decay.
+        max_gradient_norm: gradients are clipped to this L2 norm.
+        average: decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is
+            evaluated and released, so that a training may end before its learning rate has decayed.
+    """
+
+    learning_rate: float = 2e-4
+    backbone_share: float = 0.1
+    weight_decay: float = 0.01
+    warm_up_steps: int = 500
+    warm_up_start: float = 1 / 3
+    final_share: float = 1e-3
+    max_gradient_norm: float = 35.0
+    average: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
+            raise ValueError("learning_rate and max_gradient_norm must be positive, warm_up_steps not negative")
+        if not 0 <= self.average < 1:
+            raise ValueError("average must be from 0 to below 1")
+
+    def learning_rate_at(self, step: int, steps: int) -> float:
+        """The learning rate of a step (0 to steps - 1)."""
+        cosine = (1 + math.cos(math.pi * step / steps)) / 2
+        share = self.final_share + (1 - self.final_share) * cosine
+        if step < self.warm_up_steps:
+            share *= self.warm_up_start + (1 - self.warm_up_start) * step / self.warm_up_steps
+        return self.learning_rate * share
+
+
+CHECKPOINT = "checkpoint.pt"  # in the output folder
+
+
+@dataclass(frozen=True)
+class TrainingConfig(LossConfigs):
+    """The [training] table of a model file.
+
+    Attributes:
+        steps: number of steps. A step draws one batch of clips, or `clips.in_turn` batches.
+        held_out: the last drives, so many, are for evaluation only; 0 evaluates on the training drives.
+        evaluate_every: steps between evaluations.
+        checkpoint_every: steps between checkpoints.
+        freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
+        frozen_stages: the backbone's stem and its first stages, so many, keep their weights and the statistics of their
+            batch norms; 0 trains all of it.
+        loaders: processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all
+            cores but two.
+        weights_dtype: data type of weights.safetensors.
+        clips: how clips are drawn.
+        augmentation: image augmentation.
+        rigs: the rigs of rendered drives.
+        optimizer: AdamW and the learning rate schedule.
+    """
+
+    steps: int = 10_000
+    held_out: int = 2
+    evaluate_every: int = 1000
+    checkpoint_every: int = 250
+    freeze_batch_norm: bool = False
+    frozen_stages: int = 0
+    loaders: int = 0
+    weights_dtype: Literal["float32", "float16"] = "float32"
+    clips: ClipConfig = field(default_factory=ClipConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    rigs: RigDistribution = field(default_factory=RigDistribution)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1:
+            raise ValueError("steps, evaluate_every and checkpoint_every must be positive")
+        if min(self.held_out, self.loaders, self.frozen_stages) < 0:
+            raise ValueError("held_out, loaders and frozen_stages must not be negative")
+
+
+CORES_OF_TRAINING = 2  # that make no batches, with a GPU
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """Everything that a `Trainer` needs.
+
+    Attributes:
+        model: is trained in place.
+        config: the [training] table.
+        drives: to train on.
+        held_out: to evaluate on; empty to evaluate on `drives`.
+        out: the output folder, which exists.
+        device: device to train on.
+        seed: determines all random draws, together with the step and the rank of the process.
+        group: the processes that train together.
+        notes: about the drives, for the user.
+        log: where the learning curves are written, besides the CSV files; None for nowhere.
+        warm_starts: what the training starts from; empty for random weights, or if it is resumed.
+        lock: keeps other trainings out of the folder until it is closed; empty in other processes than the leader.
+    """
+
+    model: Network
+    config: TrainingConfig
+    drives: Drives
+    held_out: Drives
+    out: Path
+    device: torch.device
+    seed: int = 0
+    group: ProcessGroup = field(default_factory=ProcessGroup)
+    notes: tuple[str, ...] = ()
+    log: Log | None = None
+    warm_starts: tuple[WarmStart, ...] = ()
+    lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+
+    @property
+    def loaders(self) -> int:
+        """The number of processes that make batches, 1 for a thread of this process."""
+        if self.config.loaders or self.device.type == "cpu":
+            return self.config.loaders or 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - CORES_OF_TRAINING)
+
+    def changed_settings(self) -> tuple[str, ...]:
+        """A note where the settings differ from those of the training so far in this folder; stores them."""
+        file, old = self.out / OWN / "training.json", {}
+        settings = {"seed": self.seed, "steps": self.config.steps, **asdict(self.config.optimizer)}
+        if (self.out / CHECKPOINT).exists() and file.exists():  # else a new training, or one of an older version
+            old = read_json(file)
+        write_whole(file, json.dumps(settings).encode(), parents=True)
+        changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
+        return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
+
+
+def prepare_training(
+    model_name_or_file: str, device: torch.device, data: DriveOptions, options: TrainOptions = TrainOptions()
+) -> TrainingJob:
+    """A training job, ready for `Trainer`. Joins the other processes if torchrun started several.
+
+    Initial weights are drawn from PyTorch's global generator: call torch.manual_seed before to reproduce them.
+    data: the drives; rendered ones are kept in the output folder.
+
+    Raises BevcliError where a file, the choice of drives, or the output folder is wrong; nothing is written then.
+    """
+    model_config = load_config(model_name_or_file)
+    config = training_config(model_name_or_file, options)
+    model_config.check_training(config.clips.frames)
+    out = options.out or Path("runs") / f"train-{model_config.name}"
+    check_folder(out, resume=options.resume)
+    if options.log is not None:
+        require_tensorboard()
+    check_training_seeds(data.rendered or ())
+    if data.split is not None and options.held_out is not None:
+        raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
+    rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
+    drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
+    own = None if data.split is None and config.held_out == 0 else evaluated
+    notes = check_training_drives(data, drives, own, config.clips, model_config)
+    if data.rendered is not None and not (out / "drives").exists():
+        notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
+    if config.freeze_batch_norm and not (options.weights or options.backbone_weights or options.resume):
+        notes += (
+            "the model starts from random weights, but its file keeps the statistics of batch norms: pass `weights` or "
+            '`changes={"freeze_batch_norm": "false"}`',
+        )
+    model, started = build_network(model_config), []
+    if options.weights is not None and not options.resume:
+        started += [warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)]
+    if options.backbone_weights is not None and not options.resume:
+        backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
+        started, notes = [*started, backbone], (*notes, *about)
+    group, lock = join_process_group(device), contextlib.ExitStack()
+    if group.leads and not (options.resume and not out.exists()):
+        lock.enter_context(folder_lock(out))
+        check_folder(out, resume=options.resume)  # again: another training may have been faster
+    split = split_of(data, config.held_out)
+    if group.leads and split is not None and split.validate:
+        write_split(out / "split.toml", split)
+    rest = options.seed, group, notes, options.log, tuple(started), lock
+    return TrainingJob(model, config, drives, evaluated, out, device, *rest)
+
+
+def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:
+    """The [training] table of a model's file with the changes of the options. Raises ConfigError."""
+    config = load_table(model_name_or_file, TRAINING, TrainingConfig)
+    held_out = config.held_out if options.held_out is None else options.held_out
+    config = replace(config, steps=options.steps or config.steps, held_out=held_out)
+    return with_changes(config, options.changes)
+
+
+def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
+    """The rig in a calibration.json, or for "random" the distribution of the [training.rigs] table of a model file.
+
+    With "random" every drive has a random rig. Raises InputError or ConfigError where a file is wrong.
+    """
+    if choice == "random":
+        return replace(load_table(model, TRAINING, TrainingConfig).rigs, random_share=1.0)
+    return rig_for_rendering(choice, None)
+
+
+def check_folder(out: Path, *, resume: bool) -> None:
+    """Raises OutputError if an output folder holds a training that is not to be resumed."""
+    if (out / CHECKPOINT).exists() and not resume:
+        raise OutputError(
+            f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
+        )

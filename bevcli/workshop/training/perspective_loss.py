@@ -1,0 +1,342 @@
+"""Perspective supervision (BEVFormerV2, Yang et al. 2023): a detector on the image features alone, and its loss.
+
+The detection head trains the image backbone only through the sampling points of the BEV queries. Here each box trains
+the features of the pixels that show it. Head and loss exist in training only. The targets follow FCOS3D (Wang et al.
+2021): a box is detected on one level, chosen by its size in the image, by the pixels near its projected centre.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bevcli.geometry.boxes import BOX_EDGES
+from bevcli.model.pillar_projection import project_points
+from bevcli.model.upload import upload
+from bevcli.workshop.training.detection_loss import AnyTargets, PaddedTargets, padded
+from bevcli.workshop.training.matching import focal_loss
+
+BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
+MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)
+POSITIVE_RADIUS = 1.5  # strides from the projected centre, along x and y, as in FCOS3D
+NEAREST_PIXEL = 0.5001  # strides; at least one pixel is this near to any point of the image
+MIN_CENTER_DEPTH_M = 0.5  # a box whose centre is nearer or behind the camera has no target
+OUTLINE_DEPTH_M = 0.1  # the part of a box nearer than this is cut off before the outline is projected
+
+
+@dataclass(frozen=True)
+class FeatureLocations:
+    """The S pixels of all feature maps of one image, level by level from fine to coarse, row by row.
+
+    Attributes:
+        pixels: (S, 2) x and y of their centres, pixels of the network's input.
+        strides: (L, 2) distance of neighbours along x and y on each level, pixels of the network's input.
+        levels: (S,) int64, the level of each.
+    """
+
+    pixels: Tensor
+    strides: Tensor
+    levels: Tensor
+
+
+@dataclass(frozen=True)
+class ImageObjects:
+    """G boxes as each of P cameras sees them. Only `outlines` and `visible` are valid for a centre behind the camera.
+
+    Attributes:
+        visible: (P, G) bool, whether any part of the box lies inside the image.
+        outlines: (P, G, 4) left, top, right, bottom of the part inside the image, pixels.
+        centers: (P, G, 2) x and y of the projected box centre, pixels; may lie outside the image.
+        depths: (P, G) of the box centre along the optical axis, metres.
+        focal: (P,) focal length, pixels: the geometric mean of fx and fy.
+        log_sizes: (P, G, 3) logarithms of length, width, height in metres.
+        rotations: (P, G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis.
+    """
+
+    visible: Tensor
+    outlines: Tensor
+    centers: Tensor
+    depths: Tensor
+    focal: Tensor
+    log_sizes: Tensor
+    rotations: Tensor
+
+
+@dataclass(frozen=True)
+class PerspectiveTargets:
+    """Targets of the S locations of P images. A location that is neither positive nor ignored is background.
+
+    Attributes:
+        positive: (P, S) bool, the locations that detect a box.
+        labels: (P, S) int64, classes of their boxes.
+        boxes: (P, S, 8) box numbers: offset from the location to the projected centre (x, y) in strides; log of the
+            depth in metres times stride divided by focal length; log length, width, height in metres; sine and cosine
+            of the heading relative to the viewing ray. Only those of positive locations are valid.
+        ignored: (P, S) bool, the locations that are neither positive nor background.
+    """
+
+    positive: Tensor
+    labels: Tensor
+    boxes: Tensor
+    ignored: Tensor
+
+
+@lru_cache(32)
+def feature_locations(
+    shapes: tuple[tuple[int, int], ...], image_size: tuple[int, int], device: torch.device
+) -> FeatureLocations:
+    """The locations of feature maps that all cover the whole image, as the encoder samples them.
+
+    shapes: rows and columns of each map. image_size: (height, width) of the network's input, pixels.
+    """
+    pixels, strides, levels = [], [], []
+    for level, (rows, columns) in enumerate(shapes):
+        stride = torch.tensor([image_size[1] / columns, image_size[0] / rows])
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        pixels.append((torch.stack([x, y], -1).flatten(0, 1) + 0.5) * stride)
+        strides.append(stride)
+        levels.append(torch.full((rows * columns,), level))
+    return FeatureLocations(
+        *(upload(part, device) for part in (torch.cat(pixels), torch.stack(strides), torch.cat(levels)))
+    )
+
+
+def perspective_targets(
+    image_from_bev: Tensor, truth: PaddedTargets, locations: FeatureLocations, image_size: tuple[int, int]
+) -> PerspectiveTargets:
+    """The targets of P images.
+
+    A box is positive on the finest level on which half the longer side of its outline spans at most 8 strides, or on
+    the coarsest level. Positive are the pixels inside its outline up to 1.5 strides from its projected centre, and
+    always the nearest pixel. If the centre lies outside the image, the nearest point of the outline takes its place.
+    Of several boxes a pixel detects the one with the nearest centre in the image.
+
+    The pixels of a visible box are ignored if its centre is behind the camera, or further outside the image than the
+    outline is large: such a box has no usable target, but it is not background either.
+
+    Args:
+        image_from_bev: (P, 4, 4), bev metres to pixels of the network's input.
+        truth: of P frames, G boxes of each; those outside the image are skipped.
+        image_size: (height, width) of the network's input, pixels.
+    """
+    objects = project_objects(image_from_bev, truth.codes, image_size)
+    start, end = objects.outlines.split(2, dim=-1)  # (P, G, 2)
+    anchors = objects.centers.clamp(start, end)
+    visible = objects.visible & truth.exists
+    usable = visible & (objects.depths >= MIN_CENTER_DEPTH_M)
+    usable &= ((objects.centers - anchors).abs() <= end - start).all(-1)
+
+    mean_strides = locations.strides.prod(-1).sqrt()  # (L,)
+    half_extents = (end - start).amax(-1) / 2
+    levels = (half_extents[..., None] > MAX_HALF_EXTENT * mean_strides[:-1]).sum(-1)  # (P, G)
+    pixels, strides = locations.pixels[:, None], locations.strides[levels]  # (S, 1, 2), (P, G, 2)
+    to_anchor = (pixels - anchors[:, None]) / strides[:, None]  # (P, S, G, 2) strides
+    distance = to_anchor.abs().amax(-1)
+    inside = ((pixels >= start[:, None]) & (pixels <= end[:, None])).all(-1)  # (P, S, G)
+    near = (inside & (distance <= POSITIVE_RADIUS)) | (distance <= NEAREST_PIXEL)
+    detects = near & usable[:, None] & (locations.levels[:, None] == levels[:, None])
+
+    positive = detects.any(-1)
+    detected = to_anchor.norm(dim=-1).where(detects, torch.inf).argmin(-1)  # (P, S)
+    depths = objects.depths[..., None] * strides.prod(-1, keepdim=True).sqrt() / objects.focal[:, None, None]
+    numbers = [objects.centers, strides, depths.log(), objects.log_sizes, objects.rotations]
+    chosen = torch.cat(numbers, -1).gather(1, detected[..., None].expand(-1, -1, 10))
+    offsets = (chosen[..., :2] - locations.pixels) / chosen[..., 2:4]
+    boxes = torch.cat([offsets, chosen[..., 4:]], -1)
+    ignored = (inside & (visible & ~usable)[:, None]).any(-1) & ~positive
+    return PerspectiveTargets(positive, truth.labels.gather(1, detected), boxes, ignored)
+
+
+def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> ImageObjects:
+    """The boxes of P frames, each as one camera sees them.
+
+    Args:
+        image_from_bev: (P, 4, 4), bev metres to pixels of the network's input.
+        codes: (P, G, 10) box codes (see `bevcli.model.box_coding`).
+        image_size: (height, width) of the network's input, pixels.
+    """
+    matrix = image_from_bev[:, :3].double()  # on the CPU if image_from_bev is: not every device has float64
+    cameras = -torch.linalg.solve(matrix[..., :3], matrix[..., 3]).float()  # their positions, metres, bev frame
+    optical_axes = image_from_bev[:, 2, :3]  # unit vectors
+    along_axes = (image_from_bev[:, :2, :3] * optical_axes[:, None]).sum(-1)  # the principal points
+    focal = (image_from_bev[:, :2, :3].square().sum(-1) - along_axes.square()).sqrt().prod(-1).sqrt()
+
+    image_from_bev, cameras, focal = (upload(part, codes.device) for part in (image_from_bev, cameras, focal))
+    points = _entries(codes, 0, 1, 4)
+    centers, depths = project_points(image_from_bev[:, None], points)
+    outlines = _outlines(image_from_bev, codes, image_size)
+    visible = (outlines[..., 2:] > outlines[..., :2]).all(-1)
+
+    rays = points[..., :2] - cameras[:, None, :2]
+    rays = rays / rays.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    headings = _headings(codes)
+    sine = rays[..., 0] * headings[..., 1] - rays[..., 1] * headings[..., 0]
+    cosine = (rays * headings).sum(-1)
+    return ImageObjects(
+        visible, outlines, centers, depths, focal, _entries(codes, 3, 2, 5), torch.stack([sine, cosine], -1)
+    )  # fmt: skip
+
+
+def _entries(codes: Tensor, *indices: int) -> Tensor:
+    """(..., K), the entries at K indices of codes (..., 10). `codes[..., indices]` would wait for a GPU."""
+    return torch.stack([codes[..., index] for index in indices], -1)
+
+
+@lru_cache(8)
+def _corner_signs(device: torch.device) -> Tensor:
+    """(8, 3) 1 or -1: ahead or behind, left or right, above or below."""
+    signs = torch.tensor([[1.0, 1], [-1, 1], [-1, -1], [1, -1]]).repeat(2, 1)
+    return upload(torch.cat([signs, torch.tensor([-1.0] * 4 + [1.0] * 4)[:, None]], 1), device)
+
+
+@lru_cache(8)
+def _edges(device: torch.device) -> Tensor:
+    """(24,) the corner at the first end of each edge of a box, then that at its other end."""
+    return upload(torch.as_tensor(np.asarray(BOX_EDGES).T.copy()).flatten(), device)
+
+
+def _outlines(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """(P, G, 4) left, top, right, bottom of the visible parts, pixels; not left < right or top < bottom if invisible.
+
+    Each edge is cut off at OUTLINE_DEPTH_M before it is projected: a box may lie partly behind the camera.
+    """
+    corners, matrix = _corners(codes), image_from_bev[:, None, None]
+    projected = (matrix[..., :3, :3] * corners[..., None, :]).sum(-1) + matrix[..., :3, 3]  # (P, G, 8, 3)
+    one, other = projected.index_select(2, _edges(codes.device)).chunk(2, dim=2)  # (P, G, 12, 3) each
+    ends = torch.cat([_cut(one, other), _cut(other, one)], 2)  # (P, G, 24, 3)
+    in_front = (torch.maximum(one[..., 2], other[..., 2]) > OUTLINE_DEPTH_M).repeat(1, 1, 2)[..., None]
+    pixels = ends[..., :2] / ends[..., 2:].clamp(min=OUTLINE_DEPTH_M)
+    start = pixels.where(in_front, torch.inf).amin(2)
+    end = pixels.where(in_front, -torch.inf).amax(2)
+    right, bottom = end[..., 0].clamp(max=image_size[1]), end[..., 1].clamp(max=image_size[0])
+    return torch.cat([start.clamp(min=0), torch.stack([right, bottom], -1)], -1)
+
+
+def _cut(ends: Tensor, others: Tensor) -> Tensor:
+    """The ends (..., 3) of edges, those behind OUTLINE_DEPTH_M moved along the edge to that depth."""
+    depth, other_depth = ends[..., 2:], others[..., 2:]
+    crosses = (depth < OUTLINE_DEPTH_M) & (other_depth > OUTLINE_DEPTH_M)
+    share = (OUTLINE_DEPTH_M - depth) / (other_depth - depth)
+    return torch.where(crosses, ends + share * (others - ends), ends)
+
+
+def _corners(codes: Tensor) -> Tensor:
+    """(P, G, 8, 3) corners in the bev frame, metres, in the order of `Boxes3D.corners`."""
+    signs = _corner_signs(codes.device)
+    half_length, half_width, half_height = (_entries(codes, 3, 2, 5).exp() / 2)[..., None, :].unbind(-1)  # (P, G, 1)
+    forward = _headings(codes)[..., None, :]  # (P, G, 1, 2)
+    left = torch.stack([-forward[..., 1], forward[..., 0]], -1)
+    ground = (signs[:, 0] * half_length)[..., None] * forward + (signs[:, 1] * half_width)[..., None] * left
+    above = half_height * signs[:, 2]
+    return torch.cat([ground, above[..., None]], -1) + _entries(codes, 0, 1, 4)[..., None, :]
+
+
+def _headings(codes: Tensor) -> Tensor:
+    """(..., 2) unit vectors of the headings in the bev frame, because yaw = -angle - pi/2."""
+    return -codes[..., 6:8]
+
+
+class PerspectiveHead(nn.Module):
+    """One branch for the classes and one for the boxes, shared by all levels."""
+
+    def __init__(self, channels: int, classes: int, layers: int) -> None:
+        super().__init__()
+        self.class_branch = _branch(channels, classes, layers)
+        self.box_branch = _branch(channels, BOX_NUMBERS, layers)
+        nn.init.constant_(self.class_branch[-1].bias, -math.log(99))  # type: ignore[arg-type]  # focal prior
+
+    def forward(self, feature_maps: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Classes and boxes at the S locations of P images, level by level from fine to coarse, row by row.
+
+        feature_maps: (P, C, H_l, W_l) of each level.
+        Returns class logits (P, S, classes) and box numbers (P, S, 8), as `PerspectiveTargets` describes them.
+        """
+        logits, boxes = (
+            torch.cat([branch(features).flatten(2).movedim(1, -1) for features in feature_maps], 1)
+            for branch in (self.class_branch, self.box_branch)
+        )
+        return logits, boxes
+
+
+def _branch(channels: int, outputs: int, layers: int) -> nn.Sequential:
+    """`layers` convolutions with group norm, and one that predicts. A group has about 8 channels, as in FCOS3D."""
+    groups = math.gcd(channels, max(1, channels // 8))
+    modules: list[nn.Module] = []
+    for _ in range(layers):
+        convolution = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        modules += [convolution, nn.GroupNorm(groups, channels), nn.ReLU()]
+    prediction = nn.Conv2d(channels, outputs, 3, padding=1)
+    nn.init.normal_(prediction.weight, std=0.01)
+    nn.init.zeros_(prediction.bias)  # type: ignore[arg-type]
+    return nn.Sequential(*modules, prediction)
+
+
+@dataclass(frozen=True)
+class PerspectiveLossConfig:
+    """The [training.perspective_loss] table.
+
+    Attributes:
+        weight: of the whole loss; 0 disables it.
+        layers: hidden convolutions of each of the head's two branches.
+        class_weight: of the classes within the loss.
+        offset_weight: of the offsets to the projected centre within the loss.
+        depth_weight: of the log depths within the loss.
+        size_weight: of the log sizes within the loss.
+        rotation_weight: of the rotations within the loss.
+    """
+
+    weight: float = 0.0
+    layers: int = 2
+    class_weight: float = 2.0
+    offset_weight: float = 0.25
+    depth_weight: float = 1.0
+    size_weight: float = 0.25
+    rotation_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) < 0:
+            raise ValueError("layers and the weights must not be negative")
+
+
+def perspective_loss(
+    head: PerspectiveHead,
+    feature_maps: Sequence[Tensor],
+    image_from_bev: Tensor,
+    has_image: Tensor,
+    image_size: tuple[int, int],
+    targets: AnyTargets,
+    config: PerspectiveLossConfig,
+) -> dict[str, Tensor]:
+    """Focal loss of all pixels and L1 loss of the positive ones, both divided by the number of positive pixels.
+
+    Args:
+        feature_maps: (B·N, C, H_l, W_l) of each level, any number of them.
+        image_from_bev: (B, N, 4, 4), bev metres to pixels of the network's input.
+        has_image: (B, N) bool; a camera without an image contributes nothing.
+        image_size: (height, width) of the network's input, pixels.
+        targets: B, all boxes of a frame, also those outside the BEV grid.
+    """
+    truth, cameras = padded(targets), image_from_bev.shape[1]
+    of_images = replace(
+        truth, **{name: getattr(truth, name).repeat_interleave(cameras, 0) for name in ("labels", "codes", "exists")}
+    )
+    logits, boxes = head(feature_maps)
+    shapes = tuple((features.shape[-2], features.shape[-1]) for features in feature_maps)
+    locations = feature_locations(shapes, image_size, logits.device)
+    of_locations = perspective_targets(image_from_bev.flatten(0, 1), of_images, locations, image_size)
+    seen = upload(has_image.flatten(), logits.device)[:, None]
+    positive, counted = of_locations.positive & seen, ~of_locations.ignored & seen
+    count = positive.sum().clamp(min=1)
+    of_boxes = positive[..., None]
+    class_targets = torch.zeros_like(logits).scatter_(-1, of_locations.labels[..., None], of_boxes.to(logits.dtype))
+    classes = config.class_weight * (focal_loss(logits, class_targets) * counted[..., None]).sum() / count
+    errors = F.l1_loss(boxes.where(of_boxes, 0), of_locations.boxes.where(of_boxes, 0), reduction="none")  # (P, S, 8)
+    offset, depth, size, rotation = (part.sum() for part in errors.split([2, 1, 3, 2], dim=-1))
+    box_error = config.offset_weight * offset + config.depth_weight * depth
+    box_error = (box_error + config.size_weight * size + config.rotation_weight * rotation) / count
+    return {"perspective classes": config.weight * classes, "perspective boxes": config.weight * box_error}

@@ -1,0 +1,103 @@
+"""`bevcli train`: train a model on sequences with ground truth or on rendered drives."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bevcli.cli.bridge import Part, model_option, print_note
+from bevcli.errors import InputError
+from bevcli.inference.options import ModelOptions
+from bevcli.printing import counted, say
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.options import ModelFileOptions, TrainOptions
+
+if TYPE_CHECKING:
+    from bevcli.workshop.training.trainer import Trainer
+
+PANEL = "Train"
+
+
+def train(
+    model: Annotated[
+        str | None,
+        model_option("A model name or a FILE.toml; required. Its training table holds the settings.", old=("",)),
+    ] = None,
+    *,
+    model_options: Annotated[ModelOptions, Part(only=("device",))],
+    drives: Annotated[DriveOptions, Part(only=("data", "rendered", "split", "class_map"))],
+    file_options: ModelFileOptions,
+    options: TrainOptions,
+) -> None:
+    """Train a model; write its weights, checkpoints and learning curves.
+
+    A step is one update of the weights. If clips.learn is "all", it is one for each frame of clips.in_turn batches.
+
+    The last drives are held out for evaluation (--held-out), or a file states them (--split). Ctrl-C and SIGTERM write
+    a checkpoint after the current step; --resume continues from it, on a CPU with the same result. Run
+    weights.safetensors with `bevcli run --weights`.
+
+    `bevcli train --init my.toml --data DIR …` writes a model file for these drives; then train with `--model my.toml`.
+
+    `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
+    """
+    import torch
+
+    from bevcli.cli.stop_signals import StopSignals
+    from bevcli.inference.load import choose_device
+    from bevcli.workshop.training.job import leave_process_group, prepare_training
+    from bevcli.workshop.training.model_file import write_model_file
+    from bevcli.workshop.training.trainer import Trainer
+
+    if file_options.init is not None:
+        if model or options != TrainOptions():
+            raise InputError("`init` trains nothing: remove the model and the options of a training")
+        device = choose_device(model_options.device)
+        say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
+        return
+    if file_options.preset is not None:
+        raise InputError("`preset` is for `init`: remove it")
+    if not model:
+        raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
+    torch.manual_seed(options.seed)
+    job = prepare_training(model, choose_device(model_options.device), drives, options)
+    with job.lock:
+        trainer = Trainer(job, resume=options.resume)
+        if job.group.leads:
+            _run(trainer)
+        else:
+            with StopSignals("step") as signals:
+                trainer.run(stop=signals.received)
+    leave_process_group(job.group)
+
+
+def _run(trainer: "Trainer") -> None:
+    """Train in the process that prints. Raises typer.Exit after a stop."""
+    from bevcli.cli.progress import Progress
+    from bevcli.cli.stop_signals import StopSignals
+
+    job, first = trainer.job, trainer.done
+    updates, steps = job.config.clips.updates, job.config.steps - first
+    if steps < 0:
+        raise InputError(f"{job.out}: has done {first} steps already (expected at most `steps={job.config.steps}`)")
+
+    def after_update(loss: float) -> None:
+        progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
+        progress.advance()
+
+    counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
+    say(f"{job.config.clips}; {counted(steps, 'steps')}; drives: {counts}; output: {job.out}", err=True)
+    for note in (*job.notes, *job.changed_settings()):
+        print_note(note)
+    for start in job.warm_starts:
+        say(start.table())
+    with Progress(steps * updates, "updates") as progress:
+        with StopSignals("step") as signals:
+            trainer.run(
+                lambda: progress.reach((trainer.done - first) * updates),  # after a step of fewer updates
+                lambda step, scores: progress.message(f"step {step}: {scores}"),
+                signals.received,
+                after_update,
+            )
+        if trainer.done < job.config.steps:
+            progress.message(f"stopped after step {trainer.done}: continue with --resume --out {job.out}")
+            raise typer.Exit(signals.exit_code)

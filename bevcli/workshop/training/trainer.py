@@ -1,0 +1,379 @@
+"""The training loop: clips in; updates of the weights, checkpoints and learning curves out."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice, product, repeat
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from bevcli.errors import BevcliError
+from bevcli.inference.cpu_settings import trim_memory
+from bevcli.inference.load import choose_precision
+from bevcli.inference.runner import Runner, StepOptions
+from bevcli.model.backbone import Backbone
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
+from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.network import Network
+from bevcli.model.step import ModelOutputs
+from bevcli.workshop.training import files
+from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
+from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
+from bevcli.workshop.training.loading import BatchMaker, loaded_batches
+from bevcli.workshop.training.randomisation import randomised_inputs
+from bevcli.workshop.training.samples import Batch
+from bevcli.workshop.training.validation import Validation, validate
+
+T = TypeVar("T")
+
+
+class FrozenStages:
+    """A copy of the stem and the first stages of a backbone, computed as in inference: faster, the same results.
+
+    Batch norms are folded into their convolutions and, on a CPU, oneDNN runs the residual blocks, one image at a time,
+    whose feature maps fit into the caches.
+    """
+
+    def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
+        """stages: how many, from the first. dtype: of the computation and its results."""
+        self._device = backbone.conv1.weight.device
+        self._dtype = dtype
+        part = copy.deepcopy(backbone)
+        part.stages = nn.ModuleList(part.stages[:stages])
+        part.output_stages = tuple(range(1, len(part.stages) + 1))
+        part.eval().requires_grad_(False)
+        fold_batch_norms(part, self._device)
+        part.to(dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if self._device.type == "cpu":
+            use_onednn(part)
+        self._part = part
+
+    @contextlib.contextmanager
+    def used_by(self, backbone: Backbone) -> Iterator[None]:
+        """Inside, the backbone takes the maps of its first stages from here."""
+        backbone.frozen_maps = self._maps
+        try:
+            yield
+        finally:
+            backbone.frozen_maps = None
+
+    @torch.no_grad()
+    def _maps(self, images: Tensor) -> list[Tensor]:
+        """images: (B, 3, H, W) -> the map of each stage, without gradient."""
+        with torch.autocast(self._device.type, enabled=False):
+            images = images.to(self._dtype).contiguous(memory_format=torch.channels_last)
+            if self._device.type != "cpu":
+                return list(self._part(images))
+            each = [self._part(image) for image in images.split(1)]
+            return [torch.cat(maps) for maps in zip(*each, strict=True)]
+
+
+def forward_clip(
+    model: Network, batch: Batch, *, learn_all: bool = False, freeze_batch_norm: bool = False
+) -> Iterator[ModelOutputs]:
+    """The outputs, in training mode, for the last frame of a batch of clips.
+
+    The frames before it only build its history, in evaluation mode and without gradient, as in the papers. Of a model
+    with a window of frames, this applies to the image features of the earlier frames.
+
+    Args:
+        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
+        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
+    """
+    frames = len(batch.inputs)
+    first_learned = 0 if learn_all else frames - 1
+    memory: Any = None
+    model.eval()
+    with torch.no_grad():
+        for place in range(first_learned):
+            memory = model.remember(batch, place, memory)
+    model.train()
+    for module in model.modules():
+        if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
+            module.eval()
+    for place in range(first_learned, frames):
+        outputs, memory = model.learn(batch, place, memory)
+        yield outputs
+
+
+def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
+    """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone.
+
+    Frozen parameters get no gradient, so that it leaves them alone.
+    """
+    in_backbone = {id(parameter) for parameter in backbone.parameters()}
+    others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
+    groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
+    # On a GPU, fused: one kernel instead of hundreds.
+    fused = next(trained.parameters()).device.type == "cuda" or None
+    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=fused)
+
+
+@contextlib.contextmanager
+def rounded_products(rounds: bool) -> Iterator[None]:
+    """Inside, a CUDA GPU rounds the factors of float32 products to TF32 if it is to: several times as fast."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if rounds else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
+    """Sets the learning rate of the next step; each parameter group takes its share of it."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate * group["share"]
+
+
+@torch.no_grad()
+def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
+    """Moves a running average of a state dict towards it, in place; integers are copied."""
+    moved = [key for key, value in state.items() if value.is_floating_point()]
+    torch._foreach_lerp_([average[key] for key in moved], [state[key] for key in moved], 1 - decay)
+    for key in state.keys() - set(moved):
+        average[key].copy_(state[key])
+
+
+class _Update:
+    """The numbers of an update, on their way from the device."""
+
+    def __init__(self, numbers: Mapping[str, Tensor]) -> None:
+        self._names = tuple(numbers)
+        values = torch.stack([value.detach() for value in numbers.values()])
+        self._values = values.to("cpu", non_blocking=True)
+        self._arrived: torch.cuda.Event | None = None
+        if values.device.type == "cuda":
+            self._arrived = torch.cuda.Event()
+            self._arrived.record()
+
+    def read(self) -> dict[str, float]:
+        """The numbers by name. Waits for a GPU to finish this update, but none after it."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return dict(zip(self._names, self._values.tolist(), strict=True))
+
+
+class Trainer:
+    """A training that can be interrupted at any time and resumed from its last checkpoint.
+
+    Writes checkpoint.pt, weights.safetensors, loss.csv, validation.csv and curves.png into the output folder.
+
+    Attributes:
+        job: model, drives and settings.
+        trained: all modules that are trained: the model and the auxiliary heads.
+        optimizer: of their parameters.
+        done: the number of steps done.
+        maker: makes the batches.
+        waited_s: time for which the training had to wait for batches, seconds.
+    """
+
+    def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
+        """Prepares model and optimizer. Raises WeightsError if the checkpoint to resume from is missing or wrong."""
+        self.job = job
+        job.model.backbone.freeze(job.config.frozen_stages)
+        self._losses = FrameLosses(job.model, job.config)
+        self.trained = nn.ModuleDict({"model": job.model, **self._losses.auxiliary_heads}).to(job.device)
+        self.optimizer = make_optimizer(self.trained, job.model.backbone, job.config.optimizer)
+        self._average: dict[str, Tensor] | None = None
+        if job.config.optimizer.average > 0:
+            self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
+        self.done, self.waited_s = 0, 0.0
+        if resume:
+            self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
+        choose_kernels(job.model, job.device, gradients=True)
+        taught = job.config.distillation_loss
+        self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
+        self.maker = BatchMaker(
+            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
+            in_bytes=job.device.type == "cuda",
+        )  # fmt: skip
+        self._frozen: FrozenStages | None = None
+        if job.config.frozen_stages:
+            dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
+            self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
+        if job.group.leads:
+            events = files.event_writer(job.out / "tensorboard", self.done) if job.log else None
+            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done, "training", events)
+            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done, "validation", events)
+
+    def run(
+        self,
+        after_step: Callable[[], None] = lambda: None,
+        after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
+        stop: Callable[[], bool] = lambda: False,
+        after_update: Callable[[float], None] = lambda loss: None,
+    ) -> None:
+        """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
+
+        Args:
+            after_step: called by the leader after each step.
+            after_validation: called by the leader with the number of steps done and the scores.
+            stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
+            after_update: called after each update of the weights, with the loss.
+        """
+        job, config = self.job, self.job.config
+        remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
+        turns = product(remaining, range(config.clips.in_turn))
+        loaded = loaded_batches(self.maker, turns, job.loaders, pin=gpu)
+        with contextlib.closing(loaded) as batches, rounded_products(gpu):
+            self._run(batches, after_step, after_validation, stop, after_update)
+        job.model.eval()
+
+    def _run(
+        self,
+        batches: Iterator[Batch],
+        after_step: Callable[[], None],
+        after_validation: Callable[[int, Validation], None],
+        stop: Callable[[], bool],
+        after_update: Callable[[float], None],
+    ) -> None:
+        job, config = self.job, self.job.config
+        while self.done < config.steps:
+            row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
+            trim_memory()
+            self.done += 1
+            last, stopped = self.done == config.steps, stop()
+            if job.group.leads:
+                self._loss_curve.add(self.done, row)
+                if self.done % config.evaluate_every == 0 or last:
+                    after_validation(self.done, self._validate())
+                if self.done % config.checkpoint_every == 0 or last or stopped:
+                    files.save_checkpoint(job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
+                after_step()
+            if stopped:
+                break
+
+    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """The same batches, with the time spent waiting for them added to `waited_s`."""
+        for _ in repeat(None):
+            begun = time.perf_counter()
+            batch = next(batches, None)
+            self.waited_s += time.perf_counter() - begun
+            if batch is None:
+                return
+            yield batch
+
+    @property
+    def _learn_all(self) -> bool:
+        return self.job.config.clips.learn == "all"
+
+    def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
+        """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
+        job, config = self.job, self.job.config
+        rate = config.optimizer.learning_rate_at(self.done, config.steps)
+        set_learning_rate(self.optimizer, rate)
+        gpus = [job.device] if job.device.type == "cuda" else []
+        frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
+        with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
+            seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
+            torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
+            rows = []
+            learned = alternated(self._clip_losses(self._uploaded(batch)) for batch in batches)
+            for update in delayed(map(self._update, learned), 1 if gpus else 0):
+                rows.append(self._read(update))
+                after_update(rows[-1]["loss"])
+        job.group.average_statistics(self.trained)
+        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+        norm = means.pop("gradient norm")
+        return means | {"learning rate": rate, "gradient norm": norm}
+
+    def _uploaded(self, batch: Batch) -> Batch:
+        """The batch on the device, with its images normalised."""
+        return batch.to(self.job.device).normalised(self.job.model.config.image)
+
+    def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
+        """The losses of each frame to train on, lazily: the model may be updated in between."""
+        job, config = self.job, self.job.config
+        random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
+        batch = replace(batch, inputs=randomised_inputs(batch.inputs, *random))
+        outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
+        learned = len(batch.targets)
+        lessons: Iterator[Lesson | None] = repeat(None)
+        if self._teacher is not None:
+            shown = batch if batch.plain is None else batch.plain
+            lessons = islice(self._teacher.lessons(shown), len(batch.inputs) - learned, None)
+        for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
+            with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
+                output, taught = next(outputs), next(lessons)
+            yield self._losses(inputs, output, targets, taught)
+
+    def _update(self, losses: dict[str, Tensor]) -> _Update:
+        """One update of the weights."""
+        total = torch.stack(list(losses.values())).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        self.job.group.average_gradients(self.trained)
+        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm)
+        self.optimizer.step()
+        if self._average is not None:
+            update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
+        return _Update({"loss": total, **losses, "gradient norm": norm})
+
+    def _read(self, update: _Update) -> dict[str, float]:
+        """The numbers of an update. Raises BevcliError if the loss is not finite."""
+        row = update.read()
+        if not math.isfinite(row["loss"]):
+            raise BevcliError(
+                f"step {self.done + 1}: the loss is {row['loss']}; lower the learning rate, and `resume` "
+                f"from the last checkpoint in {self.job.out}"
+            )
+        return row
+
+    def averaged_model(self) -> Network:
+        """A copy of the model, with the running mean of its weights where `optimizer.average` asks for it."""
+        model = copy.deepcopy(self.job.model)
+        if self._average is not None:
+            model.load_state_dict(self._average)
+        return model
+
+    def _validate(self) -> Validation:
+        """Scores the model, writes its weights and the learning curves."""
+        job = self.job
+        options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
+        # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
+        model = self.averaged_model()
+        runner = Runner(model, job.device, options)
+        scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
+        self._validation_curve.add(self.done, scores.row())
+        dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
+        files.save_weights(job.out / "weights.safetensors", model, dtype)
+        files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
+        return scores
+
+
+def delayed(items: Iterable[T], places: int) -> Iterator[T]:
+    """The items, each when so many later ones have been made."""
+    waiting = deque[T]()
+    for item in items:
+        waiting.append(item)
+        if len(waiting) > places:
+            yield waiting.popleft()
+    yield from waiting
+
+
+def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
+    """The first item of each iterator, then the second of each, and so on until all are exhausted."""
+    remaining: Iterable[Iterator[T]] = iterators
+    while remaining:
+        going = []
+        for iterator in remaining:
+            for item in islice(iterator, 1):
+                yield item
+                going.append(iterator)
+        remaining = going
+
+
+def computes_in_bfloat16(device: torch.device) -> bool:
+    """True where the device has bfloat16 instructions, so that mixed precision is faster."""
+    return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()

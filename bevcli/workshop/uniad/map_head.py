@@ -1,0 +1,239 @@
+"""The panoptic map head of UniAD (Hu et al. 2023): a BEV map to lane lines and drivable area.
+
+After Panoptic SegFormer (Li et al. 2022): an encoder refines the BEV map, a location decoder finds things, and two mask
+decoders paint the masks of things and of stuff.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bevcli.frame import MOST_MAP_CLASSES
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.decoder import DecoderConfig, best_classes
+from bevcli.model.feed_forward import FeedForward
+from bevcli.model.segmentation import LocationDecoder, split_heads
+from bevcli.workshop.uniad.map_encoder import FlatListAttention, MapEncoder
+
+NORM_EPS = 1e-6
+QUERIES_AT_ONCE = 20  # the attention maps of all queries together would need hundreds of megabytes
+
+
+@dataclass(frozen=True)
+class MapHeadConfig:
+    """The map head. The defaults are those of the published weights.
+
+    Attributes:
+        stuff: classes with one mask each.
+        things: classes of instances, in the order of the class logits.
+        thing_queries: T, the number of thing queries.
+        max_things: K, the number of pairs of a query and a class that get a mask, those with the best scores.
+        encoder_layers: layers of the encoder.
+        location_layers: layers of the location decoder.
+        thing_mask_layers: layers of the mask decoder of things.
+        stuff_mask_layers: layers of the mask decoder of stuff.
+        attention_heads: heads of all attentions.
+        points: sampling points of a head of the deformable attentions.
+        attention_levels: feature levels that the deformable attentions are built for. The map head has one map, so 1
+            is plain deformable attention. The published weights were trained with 4, where `FlatListAttention` reads
+            offsets and weights in another order.
+        feed_forward_width: channels inside the feed-forward networks of encoder and location decoder.
+        mask_feed_forward_width: channels inside the feed-forward networks of the mask decoders.
+        dropout: probability in encoder and location decoder, 0 to below 1.
+        min_mask: value of a mask above which a cell belongs to it.
+        min_score: things with a lower score are left out.
+        max_overlap: a thing is left out if a larger share of its cells belongs to things with better scores.
+        thing_offset_m: x, y in metres, bev frame, added to the cells of things: the published weights were trained with
+            lines around the ego origin and drivable area around the lidar, which is 0.94 m further ahead.
+    """
+
+    stuff: tuple[str, ...] = ("drivable_area",)
+    things: tuple[str, ...] = ("divider", "pedestrian_crossing", "contour")
+    thing_queries: int = 300
+    max_things: int = 100
+    encoder_layers: int = 6
+    location_layers: int = 6
+    thing_mask_layers: int = 4
+    stuff_mask_layers: int = 6
+    attention_heads: int = 8
+    points: int = 4
+    attention_levels: int = 4
+    feed_forward_width: int = 512
+    mask_feed_forward_width: int = 1024
+    dropout: float = 0.1
+    min_mask: float = 0.5
+    min_score: float = 0.1
+    max_overlap: float = 0.4
+    thing_offset_m: tuple[float, float] = (0.0, -0.94)
+
+    def __post_init__(self) -> None:
+        count = len(self.classes)
+        if not (self.stuff and self.things) or len(set(self.classes)) < count or count > MOST_MAP_CLASSES:
+            raise ValueError(
+                f"stuff and things need at least one class each, together at most {MOST_MAP_CLASSES}, and none twice"
+            )
+        counts = (self.thing_mask_layers, self.stuff_mask_layers, self.attention_levels, self.mask_feed_forward_width)
+        if min(counts) < 1 or not 1 <= self.max_things <= self.thing_queries * len(self.things):
+            raise ValueError(
+                "layers, attention_levels and mask_feed_forward_width must be positive, and max_things from 1 to the "
+                "number of pairs of a query and a class"
+            )
+        self.transformer(min(self.encoder_layers, self.location_layers))  # checks the other numbers
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """All classes of the map: stuff, then things."""
+        return (*self.stuff, *self.things)
+
+    def transformer(self, layers: int) -> DecoderConfig:
+        """Encoder or location decoder, whose layers are those of the object decoder."""
+        return DecoderConfig.of_head(self, layers, self.thing_queries)
+
+
+@dataclass(frozen=True)
+class MapOutputs:
+    """Thing queries, and the masks of the K selected things and of stuff.
+
+    A query is selected once for each of its classes that is among the best scores.
+
+    Attributes:
+        class_logits: (B, T, things) of the last layer of the location decoder.
+        locations: (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the
+            map.
+        queries: (B, K) int64, the thing query of each selected thing, by falling score.
+        labels: (B, K) int64, its class, an index into `MapHeadConfig.things`.
+        scores: (B, K), its class score, 0 to 1.
+        thing_masks: (B, K, Y·X), 0 or larger, without an upper limit; the index of a cell is row * columns + column.
+        stuff_masks: (B, S, Y·X), the same for the S stuff classes.
+    """
+
+    class_logits: Tensor
+    locations: Tensor
+    queries: Tensor
+    labels: Tensor
+    scores: Tensor
+    thing_masks: Tensor
+    stuff_masks: Tensor
+
+
+class MapHead(nn.Module):
+    """Encoder, location decoder, and the mask decoders of things and stuff."""
+
+    def __init__(self, config: MapHeadConfig, channels: int, grid: BevGrid) -> None:
+        super().__init__()
+        self.max_things = config.max_things
+        levels, heads, width = config.attention_levels, config.attention_heads, config.mask_feed_forward_width
+        self.encoder = MapEncoder(config.transformer(config.encoder_layers), channels, grid, levels)
+        self.location_decoder = LocationDecoder(
+            config.transformer(config.location_layers),
+            channels,
+            (grid.rows, grid.columns),
+            branch_layers=3,
+            refines_extent=True,
+            attention=partial(FlatListAttention, levels=levels),
+        )
+        self.class_branch = nn.Linear(channels, len(config.things))
+        # The first half of the channels is the content of a query, the second half its position.
+        self.stuff_queries = nn.Parameter(torch.randn(len(config.stuff), 2 * channels))
+        self.thing_masks = MaskDecoder(channels, heads, config.thing_mask_layers, width, self_attention=False)
+        self.stuff_masks = MaskDecoder(channels, heads, config.stuff_mask_layers, width, self_attention=True)
+
+    def forward(self, bev: Tensor) -> MapOutputs:
+        """bev: (B, Y·X, C), before any rotation to the next frame."""
+        cells = self.encoder(bev)
+        things, locations = self.location_decoder(cells)
+        class_logits = self.class_branch(things)
+        scores, queries, labels = best_classes(class_logits, self.max_things)
+        selected = things.gather(1, queries[..., None].expand(-1, -1, things.shape[-1]))  # (B, K, C)
+        content, position = self.stuff_queries.chunk(2, dim=-1)
+        return MapOutputs(
+            class_logits=class_logits,
+            locations=locations,
+            queries=queries,
+            labels=labels,
+            scores=scores,
+            thing_masks=self.thing_masks(selected, cells),
+            stuff_masks=self.stuff_masks(content.expand(len(bev), -1, -1), cells, position),
+        )
+
+
+class MaskDecoder(nn.Module):
+    """Layers of attention to the cells, and a mask for each query."""
+
+    def __init__(self, channels: int, heads: int, layers: int, width: int, *, self_attention: bool) -> None:
+        """Random weights. With self_attention, the queries of a layer attend to each other first.
+
+        width: channels between the two linear layers of a feed-forward network.
+        """
+        super().__init__()
+        self.layers = nn.ModuleList(MaskLayer(channels, heads, width, self_attention) for _ in range(layers))
+        self.masks = MaskProjection(channels, heads)
+
+    def forward(self, query: Tensor, cells: Tensor, position: Tensor | None = None) -> Tensor:
+        """The masks (B, Q, Y·X), 0 or larger, without an upper limit. A mask has the cells above 0.5.
+
+        Args:
+            query: (B, Q, C).
+            cells: (B, Y·X, C).
+            position: (Q, C), added to the queries before each layer and before the masks; None for none.
+        """
+        for layer in self.layers:
+            query = layer(query if position is None else query + position, cells)
+        return self.masks(query if position is None else query + position, cells)
+
+
+class MaskLayer(nn.Module):
+    """Self-attention (where there is one), attention to all cells, and feed-forward network, with norms."""
+
+    def __init__(self, channels: int, heads: int, width: int, self_attention: bool) -> None:
+        super().__init__()
+        self.heads = heads
+        self.self_attention = nn.MultiheadAttention(channels, heads, batch_first=True) if self_attention else None
+        self.self_attention_norm = nn.LayerNorm(channels, NORM_EPS) if self_attention else None
+        self.query_projection = nn.Linear(channels, channels)
+        self.key_projection = nn.Linear(channels, channels)
+        self.value_projection = nn.Linear(channels, channels)
+        self.output_projection = nn.Linear(channels, channels)
+        self.feed_forward = FeedForward(channels, width, dropout=0.0, activation="gelu")
+        self.norms = nn.ModuleList(nn.LayerNorm(channels, NORM_EPS) for _ in range(2))
+
+    def forward(self, query: Tensor, cells: Tensor) -> Tensor:
+        """query: (B, Q, C), cells: (B, Y·X, C) -> refined queries (B, Q, C)."""
+        if self.self_attention is not None and self.self_attention_norm is not None:
+            attended, _ = self.self_attention(query, query, query, need_weights=False)
+            query = self.self_attention_norm(query + attended)
+        queries = split_heads(self.query_projection(query), self.heads)
+        keys, values = (split_heads(part(cells), self.heads) for part in (self.key_projection, self.value_projection))
+        attended = F.scaled_dot_product_attention(queries, keys, values)  # (B, heads, Q, C / heads)
+        query = self.norms[0](query + self.output_projection(attended.transpose(1, 2).flatten(2)))
+        return self.norms[1](query + self.feed_forward(query))
+
+
+class MaskProjection(nn.Module):
+    """Masks from the attention of the queries to the cells: two layers of ReLU over the heads."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query_projection = nn.Linear(channels, channels)
+        self.key_projection = nn.Linear(channels, channels)
+        self.hidden = nn.Linear(heads, heads)
+        self.output = nn.Linear(heads, 1)
+
+    def forward(self, query: Tensor, cells: Tensor) -> Tensor:
+        """query: (B, Q, C), cells: (B, Y·X, C) -> masks (B, Q, Y·X), 0 or larger."""
+        queries = split_heads(self.query_projection(query), self.heads)
+        keys = split_heads(self.key_projection(cells), self.heads).transpose(-1, -2)  # (B, heads, C / heads, Y·X)
+        parts = (part @ keys / math.sqrt(part.shape[-1]) for part in queries.split(QUERIES_AT_ONCE, dim=2))
+        return torch.cat([self._masks(part) for part in parts], dim=1)
+
+    def _masks(self, attention: Tensor) -> Tensor:
+        """attention: (B, heads, q, Y·X) -> (B, q, Y·X)."""
+        for layer in (self.hidden, self.output):
+            attention = torch.einsum("gh,bhqs->bgqs", layer.weight, attention) + layer.bias[:, None, None]
+            attention = attention.relu_()
+        return attention[:, 0]

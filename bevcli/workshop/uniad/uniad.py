@@ -1,0 +1,301 @@
+"""UniAD's first stage (Hu et al. 2023): BEVFormer's BEV map, track queries that follow objects, and a panoptic map."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NoReturn
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bevcli.errors import BevcliError, ConfigError
+from bevcli.frame import BevMap
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
+from bevcli.model.box_coding import boxes_of_codes
+from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import ObjectQueries
+from bevcli.model.ego_motion import EgoMotionConfig
+from bevcli.model.network import STAGES
+from bevcli.model.pillar_projection import PillarHits
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.upload import upload
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
+from bevcli.workshop.uniad.map_merging import merge_map
+from bevcli.workshop.uniad.memory_bank import Memories, MemoryBank
+from bevcli.workshop.uniad.official_keys import NAMES, QUERIES, UNUSED
+from bevcli.workshop.uniad.query_interaction import QueryInteraction
+from bevcli.workshop.uniad.track_queries import (
+    EGO,
+    NO_TRACK,
+    FrameMotion,
+    TrackQueries,
+    TrackQueryConfig,
+    live_and_die,
+    with_tracks,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UniADConfig(ModelConfig):
+    """A whole UniAD, first stage. The last one of decoder.queries is the ego query: it describes the own vehicle.
+
+    Attributes:
+        track_queries: the life of tracks, and the modules that update their queries.
+        map_head: the map head.
+    """
+
+    architecture: ClassVar[str] = "UniAD"
+    has_tracks: ClassVar[bool] = True
+
+    ego_motion: EgoMotionConfig = field(default_factory=lambda: EgoMotionConfig(first_frame="original"))
+    track_queries: TrackQueryConfig = field(default_factory=TrackQueryConfig)
+    map_head: MapHeadConfig = field(default_factory=MapHeadConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.heads != ("detection",):
+            raise ValueError('heads must be ["detection"]: UniAD has a map head of its own')
+        if self.decoder.queries < 2 or self.decoder.training_groups != 1:
+            raise ValueError("decoder.queries must be at least 2, one object and the ego query; training_groups 1")
+        if self.channels % self.track_queries.attention_heads or self.channels % self.map_head.attention_heads:
+            raise ValueError(f"channels is {self.channels}; it must be a multiple of the attention_heads")
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        return self.map_head.classes
+
+    def check_training(self, clip_frames: int) -> None:
+        raise ConfigError(f"{self.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UniADOutputs(ModelOutputs):
+    """The outputs of one step for the N queries of the frame: the learned ones, then those of the tracks.
+
+    Attributes:
+        ids: (N,) int64 identities after births and deaths; NO_TRACK and EGO for queries without one.
+        scores: (N,) the highest class score of each query.
+        tracks: what the next frame needs.
+        map: of the map head; None where it was not asked for.
+    """
+
+    stay_on_device: ClassVar[tuple[str, ...]] = ("bev", "tracks", "map")
+
+    ids: Tensor
+    scores: Tensor
+    tracks: TrackQueries
+    map: MapOutputs | None = None
+
+
+@dataclass(frozen=True)
+class TrackMemory:
+    """The memory of a UniAD.
+
+    Attributes:
+        bev: (1, Y·X, C), the BEV map of the last frame; None where a scene has ended.
+        tracks: of the last frame, with their memories.
+        pose: world_from_ego of that frame.
+        ego_from_bev: (4, 4) of that frame.
+        timestamp_ns: of that frame.
+    """
+
+    bev: Tensor | None
+    tracks: TrackQueries
+    pose: Pose
+    ego_from_bev: Array
+    timestamp_ns: int
+
+
+class UniAD(BEVFormer):
+    """The whole model: a recurrence, in which the BEV map and the tracks of a frame go on to the next.
+
+    Identities stay different over all scenes of a run.
+    """
+
+    config: UniADConfig
+    config_class = UniADConfig
+    memory_type = TrackMemory
+    stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
+    official_names = NAMES
+    figures = ()
+
+    def __init__(self, config: UniADConfig) -> None:
+        super().__init__(config)
+        tracks = config.track_queries
+        self.memory_bank = MemoryBank(config.channels, tracks.attention_heads, tracks.memory_interval)
+        self.query_interaction = QueryInteraction(config.channels, tracks.attention_heads)
+        self.map_head = MapHead(config.map_head, config.channels, config.bev_grid)
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        history: Tensor | None = None,
+        tracks: TrackQueries | None = None,
+        motion: FrameMotion | None = None,
+    ) -> UniADOutputs:
+        """One step of one sequence.
+
+        Args:
+            inputs: a batch of 1.
+            history: (1, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame.
+            tracks: of the previous frame; None for the first frame of all.
+            motion: since the previous frame; needed with tracks.
+        """
+        bev = self.device_part(self.host_part(inputs, history))
+        outputs = self.track(bev, tracks, motion)
+        with torch.autocast(bev.device.type, enabled=False):
+            return replace(outputs, map=self.map_head(bev.float()))
+
+    def device_part(self, inputs: EncoderInputs) -> Tensor:
+        """The BEV map (B, Y·X, C): the number of tracks changes, and the CPU chooses them."""
+        return self.encode(inputs)
+
+    def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
+        """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
+        # In float32, as the decoder of BEVFormer.
+        with torch.autocast(bev.device.type, enabled=False):
+            queries = self._queries(tracks, motion)
+            class_logits, box_codes, embedding = self.decoder(bev.float(), self.detection_head, queries)
+            scores = class_logits[-1, 0].sigmoid().amax(-1)
+            ids, kept = self._tracks(queries, embedding[0], box_codes[-1, 0], scores, tracks)
+        return UniADOutputs(bev, class_logits, box_codes, ids=ids, scores=scores, tracks=kept)
+
+    def _queries(self, tracks: TrackQueries | None, motion: FrameMotion | None) -> ObjectQueries:
+        """The queries of a frame: the learned ones, then those of the tracks."""
+        learned = self.decoder.object_queries(batch=1)
+        if tracks is None or not len(tracks):
+            return learned
+        assert motion is not None
+        heights = self.decoder.reference_points(tracks.position)[:, 2].sigmoid()
+        return with_tracks(learned, tracks, motion, heights, self.config.bev_grid)
+
+    def _tracks(
+        self, queries: ObjectQueries, embedding: Tensor, codes: Tensor, scores: Tensor, before: TrackQueries | None
+    ) -> tuple[Tensor, TrackQueries]:
+        """The identities of N queries, and the tracks for the next frame.
+
+        Args:
+            queries: (1, N, …) as they entered the decoder.
+            embedding: (N, C) after its last layer.
+            codes: (N, 10) box codes of its last layer.
+            scores: (N,).
+            before: the tracks whose queries are the last ones.
+        """
+        config, learned = self.config.track_queries, self.config.decoder.queries
+        ids = torch.full((learned,), NO_TRACK, device=scores.device)
+        ids[-1] = EGO
+        misses, next_id = torch.zeros_like(ids), 0
+        memories = Memories.empty(embedding[:learned], config.memory_length)
+        if before is not None:
+            ids, misses = torch.cat([ids, before.ids]), torch.cat([misses, before.misses])
+            memories, next_id = memories.followed_by(before.memories), before.next_id
+        ids, misses, next_id = live_and_die(ids, misses, scores, next_id, config)
+        alive = ids >= 0
+        embedding, position, content = embedding[alive], queries.position[0, alive], queries.content[0, alive]
+        memories = memories[alive]
+        if alive.any():
+            embedding, memories = self.memory_bank(embedding, memories)
+            position, content = self.query_interaction(embedding, position, content)
+        return ids, TrackQueries(position, content, codes[alive], ids[alive], misses[alive], memories, next_id)
+
+    def step(  # type: ignore[override]  # with a memory of its own
+        self, prepared: PreparedFrame, memory: TrackMemory | None, upcoming: Sequence[PreparedFrame] = ()
+    ) -> tuple[UniADOutputs, TrackMemory]:
+        frame, device = prepared.frame, self.device
+        is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
+        previous_pose = memory.pose if memory is not None and is_known else None
+        inputs = model_inputs([prepared], [previous_pose], self.config)
+        inputs = replace(inputs, images=upload(inputs.images, device))
+        history = tracks = motion = None
+        if memory is not None:
+            history = None if memory.bev is None else memory.bev.to(device)
+            tracks, motion = memory.tracks.to(device), _motion(prepared, memory, device)
+        outputs: UniADOutputs = self(inputs, history, tracks, motion)
+        rig, stamp = frame.rig, frame.stamp
+        known = TrackMemory(outputs.bev, outputs.tracks, frame.world_from_ego, rig.ego_from_bev, stamp.timestamp_ns)
+        return outputs, known
+
+    def restarted(self, memory: TrackMemory) -> TrackMemory:
+        """See `TemporalModel`: the next identity, and the pose for EgoMotionConfig.first_frame "original"."""
+        return replace(memory, bev=None, tracks=memory.tracks.ended())
+
+    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
+        assert isinstance(outputs, UniADOutputs)
+        return decode_tracks(outputs, self.config)
+
+    def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
+        assert isinstance(outputs, UniADOutputs)
+        grid, head = self.config.bev_grid, self.config.map_head
+        return None if outputs.map is None else merge_map(outputs.map, head, grid).bev_map(grid, head)
+
+    def exchange_parts(self) -> None:
+        """See `TemporalModel`: nothing is constant, because the tracks and the learned queries attend to each other."""
+
+    def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
+        bev = super().run_on_shapes(images, camera_index, hits)
+        self.map_head(bev)
+        return bev
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> NoReturn:
+        raise BevcliError(
+            f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
+            "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
+        )
+
+    @classmethod
+    def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+        unused = [key for key in state if UNUSED.match(key)] if QUERIES in state else []
+        left = {key: tensor for key, tensor in state.items() if key not in unused}
+        return left, f"{len(unused)} keys, such as {unused[0]}" if unused else ""
+
+    @classmethod
+    def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
+        yield from super().part_names(config)
+        yield "tracks: memory bank", "memory_bank"
+        yield "tracks: query interaction", "query_interaction"
+        yield "map head: encoder", "map_head.encoder"
+        yield "map head: location decoder", "map_head.location_decoder"
+        yield "map head: class branch", "map_head.class_branch"
+        yield "map head: stuff queries", "map_head.stuff_queries"
+        yield "map head: mask decoder of things", "map_head.thing_masks"
+        yield "map head: mask decoder of stuff", "map_head.stuff_masks"
+
+
+def _motion(prepared: PreparedFrame, memory: TrackMemory, device: torch.device) -> FrameMotion:
+    frame = prepared.frame
+    world_from_bev = frame.world_from_ego.matrix @ frame.rig.ego_from_bev
+    bev_from_previous_bev = inverse(world_from_bev) @ memory.pose.matrix @ memory.ego_from_bev
+    seconds = (frame.stamp.timestamp_ns - memory.timestamp_ns) / 1e9
+    return FrameMotion(torch.from_numpy(bev_from_previous_bev).float().to(device), seconds)
+
+
+def decode_tracks(outputs: UniADOutputs, config: UniADConfig) -> Boxes3D:
+    """The boxes with the best scores, by falling score, bev frame: one for each query, of its best class.
+
+    Boxes of tracks whose score is high enough have an identity in `instances` and their own score in `track_scores`.
+    As in the released code, the other queries give boxes too: those that do not start a track, tracks with a miss,
+    and the ego query. Boxes outside track_queries.center_range_m are left out, and so are all but
+    config.decoder.max_boxes.
+    """
+    tracks = config.track_queries
+    scores, best = outputs.scores.topk(min(config.decoder.max_boxes, len(outputs.scores)))
+    labels = outputs.class_logits[-1, 0, best].argmax(-1)
+    all_codes = outputs.box_codes[-1, 0, best].double()
+    inside = (all_codes[:, [0, 1, 4]].abs() <= torch.tensor(tracks.center_range_m, device=scores.device)).all(-1)
+    has_track = (outputs.ids[best] >= 0) & (scores >= tracks.keep_score)
+    columns = (all_codes, scores.double(), labels, outputs.ids[best], has_track)
+    codes, box_scores, classes, ids, followed = (column[inside].cpu().numpy() for column in columns)
+    boxes = boxes_of_codes(codes, np.asarray(config.classes)[classes], box_scores)
+    centers = boxes.centers
+    if tracks.box_z == "bottom":
+        centers = centers + boxes.sizes_lwh * (0, 0, 0.5)
+    return replace(
+        boxes,
+        centers=centers,
+        instances=np.where(followed, ids.astype("<U20"), ""),
+        track_scores=np.where(followed, box_scores, np.nan),
+        duplicates=np.zeros(len(boxes), dtype=bool),
+    )

@@ -1,0 +1,200 @@
+"""Scores of lines of the map, forecasts and planned paths of a run, from its files and the ground truth.
+
+The futures of true objects are the places where the same objects are in later frames of the ground truth.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.evaluation.inputs import ScoredInput
+from bevcli.evaluation.pairing import FramePairs
+from bevcli.frame import FrameStamp, Plan
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import default_ego_from_bev
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.sequences.files.json_fields import pose_from_json
+from bevcli.workshop.vad.line_scores import LineScores, evaluate_lines
+from bevcli.workshop.vad.lines_file import LinesWriter, read_lines
+from bevcli.workshop.vad.motion_scores import MotionSums, evaluate_motion
+from bevcli.workshop.vad.plan_file import PlanWriter, read_plans
+from bevcli.workshop.vad.planning_scores import PlannedFrame, PlanScores, evaluate_plans
+
+Scored = Literal["map", "motion", "plan"]
+DRIVING: tuple[Scored, ...] = ("map", "motion", "plan")
+TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
+LATE_S = 0.1  # a frame this near counts as one at the time of a step
+
+
+class Drives:
+    """The frames of a ground truth by scene and time, with boxes in the world frame."""
+
+    def __init__(self, truth: Iterable[FrameBoxes]) -> None:
+        self._scenes: dict[str, list[FrameBoxes]] = {}
+        for frame in sorted(truth, key=lambda frame: frame.stamp.timestamp_ns):
+            self._scenes.setdefault(frame.stamp.scene, []).append(frame)
+        self._times = {
+            scene: np.array([frame.stamp.timestamp_ns for frame in frames]) for scene, frames in self._scenes.items()
+        }
+
+    def after(self, stamp: FrameStamp, seconds: float) -> FrameBoxes | None:
+        """The frame of the same scene so many seconds later; None where there is none within LATE_S."""
+        wanted = stamp.timestamp_ns + round(seconds * 1e9)
+        times = self._times[stamp.scene]
+        nearest = int(np.abs(times - wanted).argmin())
+        return self._scenes[stamp.scene][nearest] if abs(times[nearest] - wanted) <= LATE_S * 1e9 else None
+
+
+def with_true_futures(boxes: Boxes3D, stamp: FrameStamp, drives: Drives, times_s: Sequence[float] | Array) -> Boxes3D:
+    """Boxes in the world frame with one future each: NaN from the first step on in which the object is not there.
+
+    Raises InputError where the boxes have no identities.
+    """
+    if len(boxes) and boxes.instances is None:
+        raise InputError(f'frame {stamp.index}: true boxes have no "instance": futures need identities')
+    places = np.full((len(boxes), 1, len(times_s), 2), np.nan)
+    alive = np.ones(len(boxes), dtype=bool)
+    for step, seconds in enumerate(times_s):
+        frame = drives.after(stamp, seconds)
+        later = Boxes3D.empty() if frame is None else frame.boxes
+        names = () if later.instances is None else later.instances
+        row_of = {name: row for row, name in enumerate(names) if name}
+        for place, name in enumerate(() if boxes.instances is None else boxes.instances):
+            alive[place] &= name in row_of
+            if alive[place]:
+                places[place, 0, step] = later.centers[row_of[name], :2]
+    seconds = np.broadcast_to(np.asarray(times_s)[:, None], (*places.shape[:3], 1))
+    return replace(boxes, futures=np.concatenate([seconds, places], axis=-1))
+
+
+@dataclass(frozen=True)
+class DrivingScores:
+    """Scores that were asked for; the others are None. notes: what was assumed or left out."""
+
+    lines: LineScores | None = None
+    motion: Mapping[str, MotionSums] | None = None
+    plan: PlanScores | None = None
+    notes: tuple[str, ...] = ()
+
+
+def evaluate_driving(
+    asked: Sequence[Scored], predictions: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs
+) -> DrivingScores:
+    """Score what is asked for.
+
+    predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
+    """
+    folder = predictions if predictions.is_dir() else predictions.parent
+    lines = _lines(folder / LinesWriter.file_name, truth, pairs) if "map" in asked else None
+    motion = _motion(found, truth, pairs) if "motion" in asked else None
+    plan, notes = _plan(folder / PlanWriter.file_name, truth, pairs) if "plan" in asked else (None, ())
+    return DrivingScores(lines, motion, plan, notes)
+
+
+def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
+    """The drives of the ground truth, which an option needs in the world frame."""
+    if pairs.frame_of_reference != "world":
+        raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
+    if truth.boxes.frame_of_reference != "world":
+        raise InputError(
+            "forecasts and paths need ground truth in the world frame "
+            f"(found the {truth.boxes.frame_of_reference} frame)"
+        )
+    return Drives(truth.boxes.frames)
+
+
+def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
+    assert truth.lines is not None
+    found, true = read_lines(file), truth.lines()
+    if found.frame_of_reference != true.frame_of_reference:
+        raise InputError(
+            f"`map`: predicted lines are in the {found.frame_of_reference} frame, true ones in the "
+            f"{true.frame_of_reference} frame (expected the same)"
+        )
+    found_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (found, true))
+    stamps = [(one.stamp, other.stamp) for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)]
+    lines = [(found_of[one], true_of[other]) for one, other in stamps if one in found_of and other in true_of]
+    if not lines:
+        raise InputError("`map`: no frame has both predicted and true lines")
+    return evaluate_lines(lines, true.classes)
+
+
+def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
+    """The scores of forecasts of the objects whose centre is in the area that the model sees."""
+    drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
+    ranges = [found.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
+    low, high = np.array(ranges, dtype=np.float64).T
+
+    def inside(boxes: Boxes3D, bev_from_world: Array) -> Boxes3D:
+        centers = apply(bev_from_world, boxes.centers)[:, :2]
+        return boxes[((centers >= low) & (centers <= high)).all(1)]
+
+    def scored(predicted: FrameBoxes, true: FrameBoxes, world_from_ego: Array) -> tuple[Boxes3D, Boxes3D]:
+        bev_from_world = inverse(world_from_ego @ ego_from_bev_of(predicted))
+        with_futures = with_true_futures(true.boxes, true.stamp, drives, times)
+        return inside(predicted.boxes, bev_from_world), inside(with_futures, bev_from_world)
+
+    return evaluate_motion(map(scored, pairs.predictions, pairs.ground_truth, pairs.reference_from_ego))
+
+
+def _times(predictions: Sequence[FrameBoxes]) -> Array:
+    """(T,) seconds of the steps of the predicted futures."""
+    for frame in predictions:
+        if frame.boxes.futures is not None and len(frame.boxes):
+            return np.asarray(frame.boxes.futures[0, 0, :, 0])
+    raise InputError('`motion`: the predictions have no "futures" (expected those of a model that forecasts)')
+
+
+def ego_from_bev_of(frame: FrameBoxes) -> Array:
+    """(4, 4), that a frame states, or else nuScenes'."""
+    stated = frame.extras.get("ego_from_bev")
+    if stated is None:
+        return default_ego_from_bev()
+    return pose_from_json(stated, "ego_from_bev", f"frame {frame.stamp.index}").matrix
+
+
+def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
+    drives, frames, left_out, guessed, times = _drives(truth, pairs, "plan"), [], 0, 0, np.zeros(0)
+    plans = {planned.stamp: planned for planned in read_plans(file)}
+    for predicted, true, world_from_ego in zip(
+        pairs.predictions, pairs.ground_truth, pairs.reference_from_ego, strict=True
+    ):
+        if predicted.stamp not in plans:
+            continue
+        planned = plans[predicted.stamp]
+        if planned.frame_of_reference != "world":
+            raise InputError(f"{file}: `plan`: needs paths in the world frame (found the ego frame)")
+        plan, ego_from_bev = planned.plan, ego_from_bev_of(predicted)
+        later = [frame for seconds in plan.times_s if (frame := drives.after(true.stamp, seconds)) is not None]
+        if len(later) < len(plan.times_s):
+            left_out += 1
+            continue
+        times, guessed = plan.times_s, guessed + (not plan.command)
+        frames.append(_planned(plan, world_from_ego @ ego_from_bev, ego_from_bev, later))
+    if not frames:
+        raise InputError(f"{file}: `plan`: no frame has a planned path and {max(times, default=3):g} s of ground truth")
+    notes = [f"{left_out} frames at the end of scenes have no whole driven path: left out"] if left_out else []
+    if guessed:
+        notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")
+    return evaluate_plans(frames, float(times[0])), tuple(notes)
+
+
+def _planned(plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]) -> PlannedFrame:
+    bev_from_world = inverse(world_from_bev)
+    origins = [frame.world_from_ego.matrix @ ego_from_bev[:, 3] for frame in later if frame.world_from_ego is not None]
+    driven = apply(bev_from_world, np.array(origins)[:, :3])[:, :2]
+    command = plan.command or followed(driven, plan.commands)
+    path = apply(bev_from_world, plan.paths[plan.commands.index(command)])[:, :2]
+    return PlannedFrame(path, driven, [frame.boxes.transformed(bev_from_world) for frame in later])
+
+
+def followed(driven: Array, commands: Sequence[str]) -> str:
+    """The command that a driven path (T, 2) follows, by its last place; the first command where that is unknown."""
+    across = driven[-1, 0]
+    command = "right" if across >= TURN_M else "left" if across <= -TURN_M else "straight"
+    return command if command in commands else commands[0]

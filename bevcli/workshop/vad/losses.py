@@ -1,0 +1,192 @@
+"""The losses of VAD's own heads: lines, futures, and the planned path with its constraints (VAD, section 3.4).
+
+The constraints know the scene from the model's own lines and futures, which they do not change.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from bevcli.frame import LINE_CLASSES
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.step import FrameTruth
+from bevcli.workshop.training.matching import focal_loss
+from bevcli.workshop.vad.config import LossWeights, VADConfig
+from bevcli.workshop.vad.decoding import VADOutputs
+from bevcli.workshop.vad.line_loss import line_losses, line_targets
+from bevcli.workshop.vad.motion_head import MotionOutputs
+
+DIVIDER, _, BOUNDARY = LINE_CLASSES
+SURE = 0.5  # lines and vehicles with lower scores constrain nothing
+BOUNDARY_M = 1.0  # places keep this distance from boundaries
+NEAR_M = 3.0  # vehicles further away cannot be hit
+ACROSS_M, ALONG_M = 1.5, 3.0  # distance to vehicles, across and along the lane
+LANE_M = 2.0  # dividers up to this distance give the direction
+MOVED_M = 1.0  # a shorter path has no direction
+
+
+def head_losses(
+    outputs: VADOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]], config: VADConfig
+) -> dict[str, Tensor]:
+    """The weighted scalar losses of lines, futures and paths by name.
+
+    truths: B. matches: of each frame the object queries that are matched to boxes, and the indices of these.
+    """
+    weights, grid, device = config.loss_weights, config.bev_grid, outputs.plan.device
+    targets = [line_targets(truth.lines, config.line_decoder, grid, device) for truth in truths]
+    losses = line_losses(outputs.lines, targets, weights, _extent(config, device))
+    losses |= motion_losses(outputs.motion, [truth.boxes for truth in truths], matches, weights)
+    return losses | plan_losses(outputs, truths, config)
+
+
+def motion_losses(
+    outputs: MotionOutputs, truths: Sequence[Boxes3D], matches: Sequence[tuple[Tensor, Tensor]], weights: LossWeights
+) -> dict[str, Tensor]:
+    """The weighted scalar losses, divided by the number of matched boxes whose next place is known.
+
+    truths: B, each with one future. matches: as for `head_losses`.
+    """
+    mode_targets, counted = torch.zeros_like(outputs.mode_logits), torch.ones_like(outputs.mode_logits)
+    errors, number = outputs.offsets.new_zeros(()), 0
+    for element, (boxes, (queries, objects)) in enumerate(zip(truths, matches, strict=True)):
+        true = true_offsets(boxes, outputs.offsets.device)[objects]  # (K, T, 2)
+        known = true.isfinite().all(-1)
+        counted[element, queries[~known[:, 0]]] = 0
+        queries, true, known = queries[known[:, 0]], true[known[:, 0]].nan_to_num(), known[known[:, 0]]
+        modes = best_modes(outputs.offsets[element, queries], true, known)
+        mode_targets[element, queries, modes] = 1
+        found = outputs.offsets[element, queries, modes]
+        errors = errors + (F.l1_loss(found, true, reduction="none") * known[..., None]).sum()
+        number += len(queries)
+    classes = (focal_loss(outputs.mode_logits, mode_targets) * counted).sum()
+    return {"futures": weights.future * errors / max(number, 1), "modes": weights.mode * classes / max(number, 1)}
+
+
+def true_offsets(boxes: Boxes3D, device: torch.device) -> Tensor:
+    """(G, T, 2) movement of each box in each step, metres; NaN if unknown. The boxes have one future each."""
+    assert boxes.futures is not None
+    places = np.concatenate([boxes.centers[:, None, :2], boxes.futures[:, 0, :, 1:]], axis=1)
+    return torch.tensor(np.diff(places, axis=1), dtype=torch.float32, device=device)
+
+
+@torch.no_grad()
+def best_modes(offsets: Tensor, true: Tensor, known: Tensor) -> Tensor:
+    """(K,) the mode that is nearest to the true place in the last known step.
+
+    Args:
+        offsets: (K, M, T, 2).
+        true: (K, T, 2), zero where unknown.
+        known: (K, T) bool, true from the first step to the last known one.
+    """
+    summed = ((offsets - true[:, None]) * known[:, None, :, None]).sum(2)  # (K, M, 2) error of the last known place
+    return summed.norm(dim=-1).argmin(-1)
+
+
+def plan_losses(outputs: VADOutputs, truths: Sequence[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
+    """The weighted scalar losses of the paths of the commands that were followed.
+
+    Each is the mean over frames and steps; unknown steps count as zero. As published, the mean of the distances is
+    also over the paths of the other commands, which count as zero, and over x and y.
+    """
+    weights, totals, commands = config.loss_weights, outputs.plan.new_zeros(4), config.commands
+    for element, truth in enumerate(truths):
+        if truth.command in commands:
+            offsets = outputs.plan[element, commands.index(truth.command)]  # (T, 2)
+            totals = totals + path_losses(offsets, truth, *scene_of(outputs, element, config)) / len(truths)
+    shares = totals.new_tensor([weights.plan / len(commands), weights.boundary, weights.collision, weights.direction])
+    names = ("plan", "plan boundaries", "plan collisions", "plan directions")
+    return dict(zip(names, totals * shares, strict=True))
+
+
+def path_losses(offsets: Tensor, truth: FrameTruth, boundaries: Tensor, dividers: Tensor, vehicles: Tensor) -> Tensor:
+    """(4,) mean L1 distance of the movements (T, 2), and the means of the constraints. The others: see `scene_of`."""
+    driven = torch.tensor(truth.driven, dtype=torch.float32, device=offsets.device)
+    true = torch.cat([driven.new_zeros(1, 2), driven]).diff(dim=0)
+    known, path = true.isfinite().all(-1), offsets.cumsum(0)
+    errors = (offsets - true.nan_to_num()).abs().mean(-1)
+    along, apart = direction_loss(path, dividers), collision_loss(path, vehicles).mean(-1)
+    return (torch.stack([errors, boundary_loss(path, boundaries), apart, along]) * known).mean(-1)
+
+
+@torch.no_grad()
+def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """The surroundings of a frame as the model sees them, bev frame, metres.
+
+    Boundaries (L, P, 2), dividers (D, P, 2), and places of vehicles in their best futures (V, T, 2).
+    """
+    start = torch.tensor([config.bev_grid.x_range_m[0], config.bev_grid.y_range_m[0]], device=outputs.plan.device)
+    lines = outputs.lines.points[-1, element] * _extent(config, start.device) + start  # (N, P, 2)
+    scores, classes = outputs.lines.class_logits[-1, element].sigmoid(), config.line_decoder.classes
+
+    def sure(name: str) -> Tensor:
+        return lines[scores[:, classes.index(name)] >= SURE] if name in classes else lines[:0]
+
+    best, labels = outputs.class_logits[-1, element].sigmoid().max(-1)  # (Q,)
+    is_vehicle = torch.tensor([one.vehicle for one in config.object_classes.values()], device=start.device)
+    seen = (best >= SURE) & is_vehicle[labels]
+    modes = outputs.motion.mode_logits[element, seen].argmax(-1)
+    offsets = outputs.motion.offsets[element, seen, modes]  # (V, T, 2)
+    vehicles = outputs.box_codes[-1, element, seen, None, :2] + offsets.cumsum(1)
+    return sure(BOUNDARY), sure(DIVIDER), vehicles
+
+
+def _extent(config: VADConfig, device: torch.device) -> Tensor:
+    """(2,) of the range in x and y, metres."""
+    (x0, x1), (y0, y1) = config.bev_grid.x_range_m, config.bev_grid.y_range_m
+    return torch.tensor([x1 - x0, y1 - y0], device=device)
+
+
+def boundary_loss(path: Tensor, boundaries: Tensor) -> Tensor:
+    """(T,) metres by which the places of a path (T, 2) are nearer than BOUNDARY_M to a point of a boundary.
+
+    From the step on that crosses the nearest boundary it is zero: the gradient would lead further away.
+    """
+    if not len(boundaries):
+        return path.new_zeros(len(path))
+    distances = (path[:, None, None] - boundaries).norm(dim=-1)  # (T, L, P)
+    nearest = boundaries[distances.amin(-1).argmin(-1)]  # (T, P, 2)
+    starts = torch.cat([path.new_zeros(1, 2), path[:-1]]).detach()
+    crossed = crosses(starts, path.detach(), nearest).cumsum(0) > 0
+    return (BOUNDARY_M - distances.amin((-1, -2))).relu() * ~crossed
+
+
+def crosses(starts: Tensor, ends: Tensor, lines: Tensor) -> Tensor:
+    """(T,) whether the segment from start to end, both (T, 2), meets a segment of the line (T, P, 2) of its row."""
+    step, sides = (ends - starts)[:, None], lines.diff(dim=1)  # (T, 1, 2), (T, P - 1, 2)
+    between = lines[:, :-1] - starts[:, None]
+    area = _cross(step, sides)
+    along, on_line = _cross(between, sides) / area, _cross(between, step) / area
+    return ((area != 0) & (along >= 0) & (along <= 1) & (on_line >= 0) & (on_line <= 1)).any(-1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def collision_loss(path: Tensor, vehicles: Tensor) -> Tensor:
+    """(T, 2) metres by which the places of a path (T, 2) are too near to a vehicle, in x and in y.
+
+    vehicles: (V, T, 2).
+    """
+    if not len(vehicles):
+        return torch.zeros_like(path)
+    apart = path - vehicles  # (V, T, 2)
+    is_far = apart.norm(dim=-1, keepdim=True) > NEAR_M
+    return (path.new_tensor([ACROSS_M, ALONG_M]) - apart.abs().masked_fill(is_far, torch.inf).amin(0)).relu()
+
+
+def direction_loss(path: Tensor, dividers: Tensor) -> Tensor:
+    """(T,) angle, 0 to pi/2, between the steps of a path (T, 2) and the nearest divider; 0 where none is near."""
+    if not len(dividers) or (path[-1] - path[0]).norm() < MOVED_M:
+        return path.new_zeros(len(path))
+    distances = (path.detach()[:, None, None] - dividers).norm(dim=-1)  # (T, D, P)
+    near, line = distances.amin(-1).min(-1)
+    points, steps = dividers[line], torch.arange(len(path), device=path.device)  # (T, P, 2)
+    segment = distances[steps, line].argmin(-1).clamp(max=points.shape[1] - 2)
+    along = points[steps, segment + 1] - points[steps, segment]
+    moved = torch.cat([path.diff(dim=0), path.diff(dim=0)[-1:]])
+    angles = torch.atan2(_cross(moved, along).abs(), (moved * along).sum(-1).abs())
+    return angles * (near <= LANE_M)
