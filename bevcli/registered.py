@@ -12,6 +12,8 @@ Group = Literal[
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
+    "bevcli.scores",
+    "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",
 ]

@@ -28,6 +28,13 @@ OWN: dict[Group, dict[str, str]] = {
         "kitti-raw": "bevcli.workshop.formats.labels.kitti_raw:FORMAT",
         "openlabel": "bevcli.workshop.formats.labels.openlabel:FORMAT",
     },
+    "bevcli.scores": {
+        "tracking": "bevcli.workshop.scores.options:SCORER",
+        "vad": "bevcli.workshop.vad.score_options:SCORER",
+    },
+    "bevcli.plots": {
+        "scores": "bevcli.workshop.scores.plots:write_plots",
+    },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
         "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",

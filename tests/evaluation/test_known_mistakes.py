@@ -7,7 +7,7 @@ import pytest
 
 from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.scores_report import FrameScores
+from bevcli.evaluation.evaluate import FrameScores
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.workshop.batch.reproduce import known_mistakes

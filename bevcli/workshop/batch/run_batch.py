@@ -26,11 +26,11 @@ from bevcli.runs.folder import folder_lock
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.drives import Drive
 from bevcli.workshop.batch.job import ATTEMPTS, FAILED, READING_THREADS, RECORD, RESULTS, Job, Record, read_record
+from bevcli.workshop.batch.joint_scores import DriveMatches, score_jointly
 from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
 from bevcli.workshop.batch.report import write_report
 from bevcli.workshop.batch.storage import LocalFolder, Storage, open_storage
 from bevcli.workshop.batch.worker import MATCHES, StoppedError, Worker
-from bevcli.workshop.vad.joint_scores import DriveMatches, score_jointly
 
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 DESCRIPTION = "batch.json"  # says that a folder is a batch

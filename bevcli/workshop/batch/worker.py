@@ -32,8 +32,8 @@ from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.workshop.batch.drives import Drive, fetch_scene
 from bevcli.workshop.batch.find_like import FramePooling
 from bevcli.workshop.batch.job import ATTEMPTS, FAILED, RECORD, RESULTS, SCORE_BINS, Job, Record, read_record
+from bevcli.workshop.batch.joint_scores import DriveMatches
 from bevcli.workshop.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
-from bevcli.workshop.vad.joint_scores import DriveMatches
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 _SCRATCH = "bevcli-batch-"

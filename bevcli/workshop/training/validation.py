@@ -8,17 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.evaluation.config import DetectionConfig, TrackingConfig
+from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.scores_report import FrameScores, finite
+from bevcli.evaluation.evaluate import FrameScores, finite
+from bevcli.evaluation.inputs import Compared, FramePairs
+from bevcli.evaluation.scorers import score_results
 from bevcli.evaluation.segmentation import evaluate_segmentation
-from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
+from bevcli.frame import MAP_CLASSES, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import ObjectClass
-from bevcli.geometry.transforms import Array, inverse
+from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
+from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.workshop.synth.drives import Drives
-from bevcli.workshop.tracking_scores.scoring import TrackingScores, evaluate_tracking
 
 
 @dataclass(frozen=True)
@@ -92,22 +94,23 @@ def validate(
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     classes = runner.config.object_classes
     config = DetectionConfig.of(classes).cut_at(range_m)
-    tracking = None if runner.options.tracker is None else TrackingConfig.of(classes).cut_at(range_m)
+    tracked = runner.options.tracker is not None
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
-    tracks: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]] = []
+    tracks: list[tuple[FrameBoxes, FrameBoxes]] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
         places, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
         for frame, prediction, _ in runner.run(sequence, places, preprocessor):
             if frame.ground_truth is not None:
-                if tracking is not None:
+                if tracked:
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
-                    place = frame.world_from_ego.translation[:2]
-                    tracks.append((prediction.boxes_world, frame.ground_truth, stamp, place))
+                    sides = (prediction.boxes_world, frame.ground_truth)
+                    found, true = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
+                    tracks.append((found, true))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -121,7 +124,7 @@ def validate(
     return Validation(
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
-        None if tracking is None else _score_tracks(tracks, tracking),
+        score_results({"tracking": True}, Compared(_pairs(tracks), classes, range_m)) if tracked else {},
         drives=tuple(of_drives),
     )
 
@@ -146,7 +149,8 @@ def boxes_ego(
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
-def _score_tracks(frames: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]], config: TrackingConfig) -> TrackingScores:
-    """Tracking scores. frames: predicted and ground truth boxes in the world frame, stamp, and place of the vehicle."""
-    found, true, stamps, places = zip(*frames, strict=True) if frames else ((),) * 4
-    return evaluate_tracking(found, true, stamps, config, np.array(places).reshape(-1, 2))
+def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
+    """Predicted and true boxes in the world frame, for the scores of tracks."""
+    found, true = zip(*frames, strict=True) if frames else ((), ())
+    poses = [frame.world_from_ego.matrix for frame in true]
+    return FramePairs("world", found, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())

@@ -15,8 +15,9 @@ from matplotlib.patches import Circle, Polygon
 
 from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.evaluate import Scores
+from bevcli.evaluation.inputs import FramePairs
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
-from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.writing import whole_file
 
@@ -33,6 +34,16 @@ _ERROR_TITLES = {
     "vel_err": "velocity error (m/s)",
     "attr_err": "attribute error (1 - accuracy)",
 }
+
+
+def write_plots(scores: Scores, folder: Path) -> list[Path]:
+    """Write the plots of scores as PNG files into a folder; return their paths. Raises OutputError."""
+    figures = {
+        "precision_recall.png": draw_precision_recall(scores.detection),
+        "errors_by_range.png": draw_errors_by_range(scores.detection),
+        "misses_and_false_alarms.png": draw_bev_sheet(scores.detection, scores.pairs),
+    }
+    return save_figures(figures, folder)
 
 
 def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -> Figure:

@@ -1,16 +1,24 @@
-"""evaluate_tracking: from boxes with identities to AMOTA and the metrics that come with it."""
+"""The tracking metrics of the nuScenes devkit: from boxes with identities to AMOTA and what comes with it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from statistics import median
+from typing import Any, Self
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import TrackingConfig
+from bevcli.evaluation.config import ClassRanges, ranges_m
+from bevcli.evaluation.evaluate import number
+from bevcli.evaluation.inputs import Compared
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.tracking_scores.association import (
+from bevcli.printing import aligned
+from bevcli.workshop.scores.association import (
     MATCH,
     MISS,
     SWITCH,
@@ -22,6 +30,39 @@ from bevcli.workshop.tracking_scores.association import (
     scored_tracks,
 )
 
+
+@dataclass(frozen=True)
+class TrackingConfig(ClassRanges):
+    """All parameters of the tracking metrics; the defaults are the nuScenes devkit's (tracking_nips_2019).
+
+    Attributes:
+        match_distance_m: centres that are closer on the ground can match.
+        recall_levels: number of recall levels from `min_recall` to 1 over which AMOTA and AMOTP are means.
+        min_recall: the lowest recall level.
+        frame_period_s: duration that one frame counts in tid and lgd, whatever the timestamps are.
+        mostly_tracked, mostly_lost: an object counts as mostly tracked when it is matched in at least, and as mostly
+            lost when it is matched in less than, this share of its frames.
+    """
+
+    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _tracked_ranges_m(NUSCENES_CLASSES))
+    match_distance_m: float = 2.0
+    recall_levels: int = 40
+    min_recall: float = 0.1
+    frame_period_s: float = 0.5
+    mostly_tracked: float = 0.8
+    mostly_lost: float = 0.2
+
+    @classmethod
+    def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
+        """The metrics of those of these classes that are tracked, each within its range."""
+        return cls(_tracked_ranges_m(classes))
+
+
+def _tracked_ranges_m(classes: Mapping[str, ObjectClass]) -> dict[str, float]:
+    """The ranges of the tracked classes, in the order of their names, as the devkit has them."""
+    return ranges_m(classes[name] for name in sorted(classes) if classes[name].tracked)
+
+
 # The metrics at one threshold, and what a class counts that reaches no recall level. None: the class's own number.
 WORST = {
     "recall": 0.0, "motar": 0.0, "gt": None, "mota": 0.0, "motp": 2.0, "mt": 0.0, "ml": None, "faf": 500.0,
@@ -29,6 +70,15 @@ WORST = {
 }  # fmt: skip
 WORST_AMOTA, WORST_AMOTP = 0.0, 2.0
 METRICS = ("amota", "amotp", *WORST)
+# Column -> metric and number of decimals, in two tables.
+_QUALITY = {
+    "AMOTA": ("amota", 3), "AMOTP m": ("amotp", 3), "MOTA": ("mota", 3), "MOTP m": ("motp", 3), "recall": ("recall", 3),
+    "MOTAR": ("motar", 3), "GT": ("gt", 0), "MT": ("mt", 0), "ML": ("ml", 0),
+}  # fmt: skip
+_ERRORS = {
+    "TP": ("tp", 0), "FP": ("fp", 0), "FN": ("fn", 0), "IDS": ("ids", 0), "FRAG": ("frag", 0), "FAF": ("faf", 1),
+    "TID s": ("tid", 2), "LGD s": ("lgd", 2),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -171,18 +221,80 @@ class TrackingScores:
         config: the parameters that they were computed with.
         scenes: number of scenes.
         frames: number of frames.
+        notes: differences from nuScenes, one line each.
     """
 
     classes: Mapping[str, ClassTracking]
     config: TrackingConfig
     scenes: int
     frames: int
+    notes: tuple[str, ...] = ()
 
     @property
     def overall(self) -> dict[str, float]:
         """Metric -> its sum or its mean over the classes that have ground truth; NaN where no class has any."""
         classes = self.classes.values()
         return {name: _over_classes(name, [scores.metrics[name] for scores in classes]) for name in METRICS}
+
+    def to_dict(self) -> dict[str, Any]:
+        config = self.config
+        content = {
+            "label_metrics": {
+                name: {label: scored.metrics[name] for label, scored in self.classes.items()} for name in METRICS
+            },
+            **self.overall,
+            "best_thresholds": {name: scored.best_threshold for name, scored in self.classes.items()},
+            "scenes": self.scenes,
+            "frames": self.frames,
+            "cfg": {
+                "class_range": {name: float(limit) for name, limit in config.class_ranges_m.items()},
+                "dist_th_tp": config.match_distance_m,
+                "num_thresholds": config.recall_levels,
+                "min_recall": config.min_recall,
+            },
+        }
+        return {"tracking": content}
+
+    def tables(self) -> Iterator[str]:
+        """The metrics by class, and their sums or means over the classes, in two tables; AMOTA."""
+        overall = self.overall
+        rows = {**{name: scored.metrics for name, scored in self.classes.items()}, "all": overall}
+        for columns in (_QUALITY, _ERRORS):
+            cells = [
+                (name, *(number(values[metric], digits) for metric, digits in columns.values()))
+                for name, values in rows.items()
+            ]
+            yield aligned([("class", *columns), *cells])
+        switches = overall["ids"] / self.scenes if self.scenes else math.nan
+        yield (
+            f"AMOTA {number(overall['amota'])}   AMOTP {number(overall['amotp'])} m   "
+            f"identity switches {number(switches, 1)} per scene (scenes: {self.scenes}, frames: {self.frames})"
+        )
+
+
+def score_tracks(_: object, compared: Compared) -> TrackingScores:
+    """The scores of the tracks: the function of a `Scorer`. Raises InputError as `evaluate_tracking`."""
+    pairs = compared.pairs
+    config = TrackingConfig.of(compared.classes)
+    config = config.for_frames(compared.max_range_m, ego_pose_known=pairs.ego_pose_known)
+    stamps = [frame.stamp for frame in pairs.ground_truth]
+    scores = evaluate_tracking(*pairs.boxes, stamps, config, pairs.ego_xy)
+    return replace(scores, notes=tuple(_notes(stamps, config, pairs.frame_of_reference)))
+
+
+def _notes(stamps: Sequence[FrameStamp], config: TrackingConfig, frame_of_reference: str) -> Iterator[str]:
+    if frame_of_reference != "world":
+        yield (
+            f"tracks are scored in the {frame_of_reference} frame: gaps in tracks are interpolated there, not in the "
+            "world frame"
+        )
+    ordered = pairwise(sorted(stamps, key=lambda stamp: (stamp.scene, stamp.timestamp_ns)))
+    gaps = [(b.timestamp_ns - a.timestamp_ns) / 1e9 for a, b in ordered if a.scene == b.scene]
+    if gaps and not 0.8 < median(gaps) / config.frame_period_s < 1.25:
+        yield (
+            f"frames are {median(gaps):.2g} s apart, but TID and LGD count {config.frame_period_s:g} s for each of "
+            "them, as in the nuScenes devkit"
+        )
 
 
 def evaluate_tracking(
