@@ -43,7 +43,6 @@ WINGS: dict[str, set[str]] = {
     "benchmark": {"engines"},
     "calibration": set(),
     "engines": {"benchmark"},
-    "explain": set(),
     "formats": {"vad"},
     "robustness": {"calibration", "engines", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},

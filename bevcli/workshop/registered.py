@@ -45,7 +45,6 @@ OWN: dict[Group, dict[str, str]] = {
         "calibrate": "bevcli.workshop.calibration.command:calibrate",
         "convert": "bevcli.workshop.formats.convert_command:convert",
         "demo": "bevcli.workshop.synth.demo_command:demo",
-        "explain": "bevcli.workshop.explain.command:explain",
         "export-onnx": "bevcli.workshop.engines.export_command:export_onnx",
         "find-like": "bevcli.workshop.batch.find_like_command:find_like",
         "quantize": "bevcli.workshop.engines.quantize_command:quantize",

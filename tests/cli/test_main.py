@@ -64,7 +64,6 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
         ("run", SAMPLE, "--model", "nope.toml"),
         ("viz", "nope"),
         ("eval", SAMPLE, "nope"),
-        ("explain", "nope"),
         ("export", "nope", "--format", "csv"),
         ("export-onnx", "nope.toml"),
         ("find-like", "0", "--frame", "0", "--in", "nope"),
