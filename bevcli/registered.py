@@ -8,7 +8,9 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.results",
     "bevcli.sequences",
+    "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",

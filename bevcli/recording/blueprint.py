@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.ground_lines import KINDS
+from bevcli.recording.ground_lines import line_kinds
 from bevcli.recording.log_static import legend_entries, legend_size
 from bevcli.recording.recorded import Recorded, frame_rate_hz
 
@@ -118,7 +118,7 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
 
 
 def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
-    drawn_in_images, names = ("boxes", "ground_truth", "pillars", "probes", *KINDS), recorded.drive.rig.names
+    drawn_in_images, names = ("boxes", "ground_truth", "pillars", "probes", *line_kinds()), recorded.drive.rig.names
     excluded = [f"- /{entities.overlay(name, kind)}/**" for name in names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]

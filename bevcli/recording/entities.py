@@ -2,8 +2,8 @@
 
 `world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
 in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and
-longitudes, where the drive states its place on Earth. Lines on the ground of one of
-`bevcli.recording.ground_lines.KINDS` are directly below `world` and `bev`, such as "bev/map_lines".
+longitudes, where the drive states its place on Earth. Lines on the ground are directly below `world` and `bev`, by
+their kind (`bevcli.recording.ground_lines.line_kinds`), such as "bev/map_lines".
 """
 
 import rerun as rr
@@ -79,6 +79,6 @@ def class_mesh(class_name: str) -> str:
 
 def overlay(name: str, kind: str) -> str:
     """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars", "probes",
-    or one of `bevcli.recording.ground_lines.KINDS`.
+    or a kind of lines on the ground.
     """
     return f"{camera(name)}/{kind}"

@@ -7,7 +7,6 @@ import numpy as np
 import rerun as rr
 
 from bevcli._version import __version__
-from bevcli.frame import MapLines, Plan
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import hex_of_color
@@ -25,7 +24,6 @@ from bevcli.recording.colors import (
     STAGE_COLORS,
     Color,
     colormap,
-    line_colors,
     map_colors,
 )
 from bevcli.recording.components import components
@@ -220,10 +218,8 @@ def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
 
 def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds."""
-    of_map = line_colors(config.results.get(MapLines, ()))
-    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in of_map.items()]
-    plans = [("planned path", EGO_COLOR)] if Plan in config.results else []
-    return [*lines, *plans, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
+    of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
+    return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:

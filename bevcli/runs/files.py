@@ -16,7 +16,7 @@ from bevcli.config import as_table
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.formats.csv_table import CsvWriter
 from bevcli.evaluation.formats.nuscenes import SubmissionWriter
-from bevcli.frame import Frame, MapLines, Plan, Prediction, Sequence
+from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
@@ -30,8 +30,6 @@ from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.viewer.recording_file import restore_index
-from bevcli.workshop.vad.lines_file import LinesWriter
-from bevcli.workshop.vad.plan_file import PlanWriter
 from bevcli.writing import whole_file, write_whole
 
 BEV = "BEV features"
@@ -39,8 +37,6 @@ RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "resul
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
 BLOCK = 1 << 20  # bytes
 Growing = TypeVar("Growing", bound=GrowingFile)
-ResultWriter = LinesWriter | PlanWriter
-RESULT_WRITERS: Mapping[type, type[ResultWriter]] = {MapLines: LinesWriter, Plan: PlanWriter}  # by the type of results
 
 
 @dataclass(frozen=True)
@@ -123,7 +119,7 @@ class RunFiles:
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
-        self._results: dict[type[Any], ResultWriter] = {}
+        self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
         self._growing: defaultdict[str, _Growing] = defaultdict(_Growing)  # by the names of `FilesState.kept`
         self._map_frames = [] if resume is None else list(resume.map_frames)
         self._bev_frames = [] if resume is None else list(resume.bev_frames)
@@ -152,9 +148,8 @@ class RunFiles:
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
             for kind, names in config.results.items():
-                write: Callable[..., ResultWriter] = RESULT_WRITERS[kind]
                 facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
-                self._results[kind] = self._open(RESULT_WRITERS[kind].file_name, write, **facts)
+                self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
             if resume is not None and SUBMISSION in resume.sizes:
                 self._submission = self._open(SUBMISSION, SubmissionWriter)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
@@ -193,7 +188,7 @@ class RunFiles:
             self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
-            writer.write(ground, next((result for result in prediction.results if isinstance(result, kind)), None))
+            writer.write(ground, result_of(kind, prediction.results))
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
         self._check_that_files_exist()
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
@@ -264,7 +259,7 @@ class RunFiles:
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
-        paths += [self._out / writer.file_name for writer in self._results.values()]
+        paths += [self._out / kind.file_name for kind in self._results]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 

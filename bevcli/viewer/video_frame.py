@@ -16,7 +16,7 @@ from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
 from bevcli.recording.colors import Color, class_colors, map_colors
-from bevcli.recording.ground_lines import KINDS
+from bevcli.recording.ground_lines import line_kinds
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
 
@@ -215,7 +215,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         return np.clip(points * scale, -FAR, FAR)
 
     boxes = entities.overlay(tile.camera, "boxes")
-    for kind in KINDS:
+    for kind in line_kinds():
         draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
     draw_strips(canvas, frame, boxes, to_canvas)
@@ -237,7 +237,7 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
         _draw_placed(canvas, frame, entities.BEV_SEGMENTATION, segmentation, to_canvas)
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
-    for kind in KINDS:
+    for kind in line_kinds():
         draw_faded_strips(canvas, frame, f"{entities.BEV}/{kind}", to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)

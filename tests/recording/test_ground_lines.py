@@ -11,14 +11,14 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
 
 from bevcli.config import load_config
-from bevcli.frame import MapLines, Plan
 from bevcli.geometry.transforms import apply
 from bevcli.recording import entities
-from bevcli.recording.colors import line_colors
-from bevcli.recording.ground_lines import FUTURES, HALF_VEHICLE_M, future_lines
+from bevcli.recording.ground_lines import FUTURES, future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.workshop.vad.map_lines import MapLines, line_colors
+from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
 
 TIMES = np.array([0.5, 1.0])
 LINES = MapLines(
