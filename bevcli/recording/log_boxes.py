@@ -1,6 +1,7 @@
 """Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
@@ -111,13 +112,17 @@ def log_boxes_3d(
     ids = np.array([places.get(name, 0) for name in boxes.classes.tolist()])
     labels = labels_in_scene(boxes, ego_xy)
     row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
-    track = {} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}
+    scored = boxes if boxes.scores is not None else replace(boxes, scores=np.ones(len(boxes)))
+    columns = {column.recorded: getattr(scored, name) for name, column in OPTIONAL_COLUMNS.items() if column.recorded}
     facts = any_values(
-        score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
-        name=_names(boxes),
-        **track,
+        name=_texts(boxes.classes),
+        **{
+            name: _texts(values) if values.dtype.kind == "U" else values
+            for name, values in columns.items()
+            if values is not None
+        },
     )
     stream.log(entities.BOXES, row, facts)
     moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
@@ -150,7 +155,7 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
     pale = _with_alpha(colors[found], 150)
     for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
         row = components(rr.Boxes3D, **_shape(truth[chosen]), colors=color, radii=THIN)
-        stream.log(entity, row, any_values(name=_names(truth[chosen])))
+        stream.log(entity, row, any_values(name=_texts(truth.classes[chosen])))
 
 
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
@@ -205,8 +210,8 @@ def quaternions(boxes: Boxes3D) -> Array:
     return np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)
 
 
-def _names(boxes: Boxes3D) -> pa.Array:
-    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that an empty list is a value too
+def _texts(values: NDArray[np.str_]) -> pa.Array:
+    return pa.array(values.tolist(), pa.utf8())  # typed, so that an empty list is a value too
 
 
 def _marks(boxes: Boxes3D, marks: Marks) -> tuple[tuple[NDArray[np.float32], ...], tuple[Color, ...]]:

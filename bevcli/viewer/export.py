@@ -1,13 +1,14 @@
 """The boxes of a recording, and their export: a table (.csv), or a boxes file that `bevcli eval` reads (.json)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
@@ -49,8 +50,7 @@ def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
         yaws=2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]),
         velocities=np.hstack([frame.array(entity, f"velocity_{axis}", 1, count, nan=True) for axis in "xy"]),
         classes=np.array(frame.texts(entity, "name", count), dtype=np.str_),
-        scores=frame.array(entity, "score", 1, count)[:, 0],
-        instances=np.array(frame.texts(entity, "track", count), dtype=np.str_) if frame.has(entity, "track") else None,
+        **{name: _column(frame, column, count) for name, column in OPTIONAL_COLUMNS.items() if column.recorded},
     )
     if (boxes.sizes_lwh <= 0).any():
         raise frame.wrong(entity, "Boxes3D:half_sizes", "sizes above 0", boxes.sizes_lwh.min() / 2)
@@ -61,3 +61,13 @@ def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
         raise frame.wrong(entities.EGO, "pose", "a rotation and a place", "another matrix")
     world_from_ego[:3, 3] += origin
     return FrameBoxes(stamp, Pose.from_matrix(world_from_ego), boxes)
+
+
+def _column(frame: RecordedFrame, column: Column, count: int) -> Any:
+    """An optional column of the boxes; None where the recording does not have it."""
+    if not frame.has(entities.BOXES, column.recorded) and column.values != "score":
+        return None
+    if column.values == "text":
+        return np.array(frame.texts(entities.BOXES, column.recorded, count), dtype=np.str_)
+    values = frame.array(entities.BOXES, column.recorded, 1, count)[:, 0]
+    return values.astype({"flag": bool, "count": np.int64}.get(column.values, np.float64))

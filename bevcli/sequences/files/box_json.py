@@ -11,50 +11,45 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.files.class_names import ClassNames
 
 FUTURE_DECIMALS = 3  # millimetres
-# Optional members: column of Boxes3D, and the value of a box that has none.
-OPTIONAL: dict[str, tuple[str, Any]] = {
-    "score": ("scores", None),
-    "attribute": ("attributes", ""),
-    "instance": ("instances", ""),
-    "track_score": ("track_scores", math.nan),
-    "duplicate": ("duplicates", False),
-    "visibility": ("visibilities", math.nan),
-    "num_points": ("num_points", -1),
-}
 _OWN_NAMES = ClassNames()
 _Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
-_Share = Annotated[float, Meta(ge=0, le=1, description="0 to 1")]
-_ShareOrNaN = Annotated[float, Meta(description="0 to 1")]  # its range is checked by column
-_Text = Annotated[str, Meta(description="a string")]
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
 _Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
 _Numbers = Annotated[list[float], Meta(description="a list of numbers")]
-_Count = Annotated[int, Meta(ge=0, description="an integer, 0 or more")]
+# Types of the optional members, by `Column.values`. The range of shares is checked by column.
+_TYPES: dict[str, Any] = {
+    "score": Annotated[float, Meta(ge=0, le=1, description="0 to 1")] | UnsetType,
+    "share": Annotated[float, Meta(description="0 to 1")] | UnsetType | None,
+    "text": Annotated[str, Meta(description="a string")] | UnsetType | None,
+    "flag": Annotated[bool, Meta(description="true or false")] | UnsetType,
+    "count": Annotated[int, Meta(ge=0, description="an integer, 0 or more")] | UnsetType,
+}
 
 
-class _Box(Struct, forbid_unknown_fields=True):
-    """A box in JSON. futures: M modes of T steps, each x and y; null if unknown."""
+class _FixedMembers(Struct, forbid_unknown_fields=True):
+    """A box in JSON without its optional columns. futures: M modes of T steps, each x and y; null if unknown."""
 
     name: Annotated[str, Meta(min_length=1, description="a name")] = field(name="class")
     center: _Vector
     size_lwh: _Vector
     yaw: Annotated[float, Meta(description="a number")]
     velocity: Annotated[tuple[float | None, float | None], Meta(description="2 numbers")] | None = None
-    score: _Share | UnsetType = UNSET
-    attribute: _Text | UnsetType | None = UNSET
-    instance: _Text | UnsetType | None = UNSET
-    track_score: _ShareOrNaN | UnsetType | None = UNSET
-    duplicate: Annotated[bool, Meta(description="true or false")] | UnsetType = UNSET
-    visibility: _ShareOrNaN | UnsetType | None = UNSET
-    num_points: _Count | UnsetType = UNSET
     futures: _Futures | None = None
     future_times_s: _Numbers = []
     future_scores: _Numbers | None = None
+
+
+_Box: Any = msgspec.defstruct(
+    "_Box",
+    [(column.key, _TYPES[column.values], UNSET) for column in OPTIONAL_COLUMNS.values()],
+    bases=(_FixedMembers,),
+    forbid_unknown_fields=True,
+)
 
 
 def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
@@ -79,17 +74,18 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         yaws=np.array([row.yaw for row in rows]),
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
-        **{name: _column(rows, key, unknown) for key, (name, unknown) in OPTIONAL.items()},
+        **{name: _column(rows, column) for name, column in OPTIONAL_COLUMNS.items()},
         **_futures(rows, where),
     )
     without = [place for place, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
         raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
-    for key, shares in (("track_score", boxes.track_scores), ("visibility", boxes.visibilities)):
-        if shares is not None:
-            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, key, "0 to 1")
-    for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
-        _require(np.isfinite(column), column, where, key, "finite numbers")
+    for name, column in OPTIONAL_COLUMNS.items():
+        shares = getattr(boxes, name)
+        if column.values == "share" and shares is not None:
+            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, column.key, "0 to 1")
+    for key, values in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
+        _require(np.isfinite(values), values, where, key, "finite numbers")
     _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, where, "size_lwh", "numbers above 0")
     return boxes
 
@@ -108,14 +104,12 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         "velocity": velocities,
     }
     objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    for key, (name, unknown) in OPTIONAL.items():
-        column = getattr(boxes, name)
-        if column is not None:
-            known = ~np.isnan(column) if isinstance(unknown, float) else column != unknown
-            known = column >= 0 if name == "num_points" else known  # two unknown numbers may add up to -2
-            for box, value, is_known in zip(objects, column.tolist(), known.tolist(), strict=True):
+    for name, column in OPTIONAL_COLUMNS.items():
+        values = getattr(boxes, name)
+        if values is not None:
+            for box, value, is_known in zip(objects, values.tolist(), _is_known(values, column).tolist(), strict=True):
                 if is_known:
-                    box[key] = value
+                    box[column.key] = value
     _add_futures(objects, boxes)
     return objects
 
@@ -143,12 +137,21 @@ def _description(kind: Any) -> str:
     return str(notes[0].description)
 
 
-def _column(rows: Sequence[_Box], key: str, unknown: Any) -> NDArray[Any] | None:
+def _column(rows: Sequence[Any], column: Column) -> NDArray[Any] | None:
     """An optional column; None where no box has it."""
-    values = [getattr(row, key) for row in rows]
+    values = [getattr(row, column.key) for row in rows]
     if values.count(UNSET) == len(values):
         return None
-    return np.array([unknown if value is UNSET or value is None else value for value in values])
+    return np.array([column.unknown if value is UNSET or value is None else value for value in values])
+
+
+def _is_known(values: NDArray[Any], column: Column) -> NDArray[np.bool_]:
+    """(N,) for which boxes an optional column is written. Scores always are, so that NaN is an error."""
+    if column.values == "score":
+        return np.ones(len(values), dtype=bool)
+    if column.values == "count":
+        return values >= 0  # two unknown numbers may add up to -2
+    return ~np.isnan(values) if column.values == "share" else values != column.unknown
 
 
 def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
@@ -172,7 +175,7 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
             box["future_scores"] = boxes.future_scores[place].tolist()
 
 
-def _futures(rows: Sequence[_Box], where: str) -> dict[str, Any]:
+def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
     """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
     having = {place: row for place, row in enumerate(rows) if row.futures}
     if not having:
