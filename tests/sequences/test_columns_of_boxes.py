@@ -21,7 +21,7 @@ from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.evaluation.matching import with_all_columns
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.viewer.export import read_recording
+from bevcli.viewer.recording_reader import read_recording
 sys.path.insert(0, sys.argv[3])
 from memory_drive import MemorySequence
 from recorded_drive import NamedModel, boxes_ahead, predict

@@ -11,8 +11,7 @@ from bevcli.evaluation.box_format import BoxFormat
 from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS
 from bevcli.parsing.csv_tables import cell_of
 from bevcli.printing import counted
-from bevcli.sequences.files.box_json import boxes_to_json
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file
 
