@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-
-from bevcli.frame import DriveFacts, FrameStamp
-from bevcli.geometry.cameras import CameraRig
-from bevcli.recording.colors import Color, class_colors
-from bevcli.recording.options import RecordingOptions
-
-if TYPE_CHECKING:
-    from bevcli.model.config import ModelConfig
-
-
-from collections.abc import Iterable, Sequence
-from typing import Any
-
 import rerun as rr
 
 from bevcli._version import __version__
+from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
-from bevcli.geometry.cameras import Camera
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
@@ -38,6 +26,8 @@ from bevcli.recording.colors import (
     MISSED_COLOR,
     RING_COLOR,
     STAGE_COLORS,
+    Color,
+    class_colors,
     colormap,
     map_colors,
 )
@@ -45,6 +35,7 @@ from bevcli.recording.components import components
 from bevcli.recording.log_cameras import UNSEEN, labels_2d
 from bevcli.recording.mesh_file import Mesh
 from bevcli.recording.meshes import VehicleMesh, default_vehicle
+from bevcli.recording.options import RecordingOptions
 
 UNTRAINED = "untrained weights"
 FROM_RENDERED = "trained on renderings"

@@ -30,7 +30,12 @@ TIMEOUT_S = 20.0
 
 
 class RrdFile(GrowingFile):
-    """Receives the bytes of a recording.
+    """Receives the bytes of a recording, which a thread of ours writes.
+
+    rerun's own writer waits for ever when the disk is full. So rerun writes into a pipe, which never fails, and a
+    thread moves the bytes into the file. rerun keeps the index of a stream in memory until the stream ends, about
+    0.3 MB a frame. A long recording therefore consists of several streams, one after the other in one file without an
+    index.
 
         file = RrdFile(path)
         stream.set_sinks(file.sink())
@@ -146,7 +151,7 @@ class RrdFile(GrowingFile):
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
-INDEXED_FRAMES = 200  # a longer recording has no index, see `rrd_file`
+INDEXED_FRAMES = 200  # a longer recording has no index, see `RrdFile`
 
 
 class LiveSink(Protocol):
