@@ -255,7 +255,7 @@ def _log_in_images(stream: rr.RecordingStream, kind: str, lines: GroundLines, ca
     counts = np.full(len(cameras), len(ends))
     parts = cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, [posed.camera for posed in cameras])
     own_colors, radii = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4), ui_points(lines.width)
-    for posed, found in zip(cameras, parts, strict=True):
-        colors = own_colors[found.owners]
-        strips = components(rr.LineStrips2D, strips=found.segments, colors=colors, radii=radii, draw_order=15)
+    for posed, visible in zip(cameras, parts, strict=True):
+        colors = own_colors[visible.owners]
+        strips = components(rr.LineStrips2D, strips=visible.segments, colors=colors, radii=radii, draw_order=15)
         stream.log(entities.overlay(posed.name, kind), strips)

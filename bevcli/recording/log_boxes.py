@@ -112,8 +112,8 @@ def log_boxes_3d(
 
     boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
-    places = {name: place for place, name in enumerate(classes, 1)}
-    ids = np.array([places.get(name, 0) for name in boxes.classes.tolist()])
+    ids_of_classes = {name: index for index, name in enumerate(classes, 1)}
+    ids = np.array([ids_of_classes.get(name, 0) for name in boxes.classes.tolist()])
     labels = labels_in_scene(boxes, ego_xy)
     row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
     scored = boxes if boxes.scores is not None else replace(boxes, scores=np.ones(len(boxes)))

@@ -66,16 +66,16 @@ def cut_to_images(
     """
     ends, kept = clip_near(ends)
     own_counts = np.bincount(np.repeat(np.arange(len(cameras)), counts)[kept], minlength=len(cameras))
-    places = np.cumsum(own_counts)[:-1]
-    own_ends, own_owners = np.split(ends[kept], places), np.split(owners[kept], places)
+    ends_of_cameras = np.cumsum(own_counts)[:-1]
+    own_ends, own_owners = np.split(ends[kept], ends_of_cameras), np.split(owners[kept], ends_of_cameras)
     for i, camera in enumerate(cameras):
         if camera.distortion is not None:
             own_ends[i], own_owners[i] = _cut(own_ends[i]), np.repeat(own_owners[i], PIECES_PER_EDGE)
     pixels = [camera.project(own)[0] for camera, own in zip(cameras, own_ends, strict=True)]
     sizes = np.repeat([(camera.width, camera.height) for camera in cameras], [len(own) for own in pixels], axis=0)
     segments, inside = clip_to_image(np.concatenate(pixels), *sizes.T)
-    places = np.cumsum([len(own) for own in pixels])[:-1]
-    parts = zip(*(np.split(whole, places) for whole in (segments, inside)), own_owners, strict=True)
+    ends_of_cameras = np.cumsum([len(own) for own in pixels])[:-1]
+    parts = zip(*(np.split(whole, ends_of_cameras) for whole in (segments, inside)), own_owners, strict=True)
     return [ImageLines(own[shown], owner[shown]) for own, shown, owner in parts]
 
 
@@ -120,10 +120,11 @@ LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
 UNSEEN = ui_points(0.01)  # of a point that shows only its label
 
 
-def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> Components:
-    """Texts at places (L, 2), in the units of their view. options: of `rr.Points2D`."""
-    positions = np.asarray(places)
-    return components(rr.Points2D, positions=positions, labels=texts, radii=UNSEEN, show_labels=True, **options)
+def labels_2d(positions: ArrayLike, texts: list[str], **options: Any) -> Components:
+    """Texts at positions (L, 2), in the units of their view. options: of `rr.Points2D`."""
+    return components(
+        rr.Points2D, positions=np.asarray(positions), labels=texts, radii=UNSEEN, show_labels=True, **options
+    )
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
@@ -301,8 +302,8 @@ def log_boxes_in_images(
     """
     for posed, lines in zip(cameras, _lines_of(boxes, cameras), strict=True):
         stream.log(entities.overlay(posed.name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-        places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
-        labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
+        positions, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
+        labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
         stream.log(entities.overlay(posed.name, "boxes/labels"), labels)
 
 
@@ -315,7 +316,7 @@ def log_ground_truth_in_images(
 
 
 def _lines_of(boxes: Boxes3D, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
-    return lines_in_images(boxes, [one.camera for one in cameras], [one.camera_from_world for one in cameras])
+    return lines_in_images(boxes, [posed.camera for posed in cameras], [posed.camera_from_world for posed in cameras])
 
 
 def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:

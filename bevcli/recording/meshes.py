@@ -142,7 +142,7 @@ def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
     Raises InputError for a file that `read_mesh` does not take, and for one of more than MOST_TRIANGLES triangles.
     """
     colors = class_colors(classes.values())
-    return {name: _read(name, Path(one.mesh), colors[name]) for name, one in classes.items() if one.mesh}
+    return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
 
 
 def _read(name: str, path: Path, color: Color) -> Mesh:
@@ -171,7 +171,7 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
 
 def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
     """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
-    for name in (name for name, one in classes.items() if one.mesh):
+    for name in (name for name, settings in classes.items() if settings.mesh):
         own = boxes[boxes.classes == name]
         # The last one has no size: an entity without poses would show its mesh at the origin.
         poses = components(

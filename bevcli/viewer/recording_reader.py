@@ -76,13 +76,13 @@ class RecordedFrame:
         count: the N that is expected, if any is. nan: NaN, for a number that is not known, may be among them.
         """
         flat = self._flat(entity, component, width)
-        numbers = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
-        found = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if numbers else np.zeros(1)
-        if not numbers or len(found) % width or count not in (None, len(found) // width):
+        is_numeric = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
+        values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if is_numeric else np.zeros(1)
+        if not is_numeric or len(values) % width or count not in (None, len(values) // width):
             raise self.wrong(entity, component, f"values of {width} numbers", flat, count)
-        if not (np.isfinite(found) | (nan & np.isnan(found))).all():
+        if not (np.isfinite(values) | (nan & np.isnan(values))).all():
             raise self.wrong(entity, component, "finite numbers", "NaN or infinity")
-        return found.reshape(-1, width)
+        return values.reshape(-1, width)
 
     def strips(self, entity: str, component: str) -> list[Array]:
         """The values of a component that are lists of points, (P, 2) each."""

@@ -99,8 +99,8 @@ def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canv
     step = np.ceil(opacity / 255 * OPACITIES).astype(int)
     for level in np.unique(step[step > 0]):
         below = canvas.copy()
-        for place in np.flatnonzero(step == level):
-            _draw_line(canvas, strips[place], colors[place], to_canvas)
+        for index in np.flatnonzero(step == level):
+            _draw_line(canvas, strips[index], colors[index], to_canvas)
         canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
 
 
@@ -298,8 +298,8 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
     counts = Counter(frame.texts(entities.BOXES, "name"))
     for index, (name, color) in enumerate(_class_colors(frame).items()):
-        place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
+        position = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
+        _draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
     for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
         _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
@@ -321,15 +321,15 @@ def _class_colors(frame: RecordedFrame) -> dict[str, Color]:
 def _named_colors(frame: RecordedFrame, names: str, colors: str) -> dict[str, Color]:
     """The colours that the recording states, by name."""
     keys = frame.texts(entities.RUN, names)
-    found = frame.texts(entities.RUN, colors, len(keys))
+    values = frame.texts(entities.RUN, colors, len(keys))
     try:
-        return {name: color_of_hex(color) for name, color in zip(keys, found, strict=True)}
+        return {name: color_of_hex(color) for name, color in zip(keys, values, strict=True)}
     except ValueError:
-        raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", found) from None
+        raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", values) from None
 
 
-def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str) -> None:
-    x, y = place
+def _draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: str) -> None:
+    x, y = position
     cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), color[::-1], -1)
     draw_text(canvas, text, (x + 24, y), TEXT)
 
@@ -365,8 +365,9 @@ def write_video(recording: Path, video: Path, count: int, rate: float, on_frame:
 
 def _check_complete(video: str, count: int) -> None:
     """Raises OSError where a video lacks frames: OpenCV does not tell that a disk is full."""
-    found = cv2.VideoCapture(video)
-    if not (found.isOpened() and found.get(cv2.CAP_PROP_FRAME_COUNT) >= count - 1):  # computed from the times in a WebM
+    capture = cv2.VideoCapture(video)
+    frames = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else -1  # computed from the times in a WebM
+    if frames < max(count - 1, 0):
         raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
 
 
