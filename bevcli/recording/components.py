@@ -40,12 +40,12 @@ def components(archetype: Any, **fields: Any) -> Components:
     type, an array of numbers (colours as `packed` takes or returns them), a list of texts, or whatever rerun takes. A
     value that can be hashed is converted once.
     """
-    found: Components = []
+    batches: Components = []
     for name, value in fields.items():
         if value is not None:
             descriptor, kind = _field(archetype, name)
-            found.append(_Component(_converted(archetype, name, kind, value), descriptor))
-    return found
+            batches.append(_Component(_converted(archetype, name, kind, value), descriptor))
+    return batches
 
 
 def any_values(**values: Any) -> Components:

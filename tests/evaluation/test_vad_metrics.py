@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevcli.frame import MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.workshop.vad.driving_metrics import (
@@ -26,6 +25,7 @@ from bevcli.workshop.vad.driving_metrics import (
     occupancy,
     similarity,
 )
+from bevcli.workshop.vad.map_lines import MapLines
 
 VEHICLES = range(14, 24)
 HUMANS = range(2, 9)

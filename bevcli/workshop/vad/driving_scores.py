@@ -13,7 +13,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import number
 from bevcli.evaluation.inputs import Compared, FramePairs, ScoredInput
-from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Plan
+from bevcli.frame import FrameStamp, Ground, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
@@ -31,8 +31,8 @@ from bevcli.workshop.vad.driving_metrics import (
     evaluate_motion,
     evaluate_plans,
 )
-from bevcli.workshop.vad.lines_file import TRUE_LINES, FrameLines, LinesFile, LinesWriter, read_lines
-from bevcli.workshop.vad.plan_file import PlanWriter, read_plans
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.vad.plan import Plan, read_plans
 from bevcli.workshop.vad.score_options import DrivingScoreOptions
 
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
@@ -148,9 +148,9 @@ def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> Drivin
     found, truth, pairs = compared.predictions, compared.truth, compared.pairs
     assert found is not None
     assert truth is not None
-    lines = _lines(found.path.with_name(LinesWriter.file_name), truth, pairs) if options.map else None
+    lines = _lines(found.path.with_name(MapLines.file_name), truth, pairs) if options.map else None
     motion = _motion(found, truth, pairs) if options.motion else None
-    plan, notes = _plan(found.path.with_name(PlanWriter.file_name), truth, pairs) if options.plan else (None, ())
+    plan, notes = _plan(found.path.with_name(Plan.file_name), truth, pairs) if options.plan else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 
@@ -192,7 +192,7 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
         return read_lines(file)
     drive, frames = truth.open_drive(), []
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
-        if (lines := frame.ground_truth_lines) is None:
+        if (lines := result_of(MapLines, frame.ground_truth_results)) is None:
             expansion = f"the map expansion in {truth.path / 'maps' / 'expansion'}"
             expected = expansion if is_nuscenes_root(truth.path) else "a drive that has them"
             where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
