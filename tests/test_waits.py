@@ -11,10 +11,6 @@ ALLOWED = {
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "workshop/batch/find_like.py",
-        "ThreadPoolExecutor",
-    ): "the tasks read files; packages of object stores have time limits of their own",
-    (
         "workshop/batch/run_batch.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",

@@ -40,7 +40,6 @@ OWN: dict[Group, dict[str, str]] = {
         "demo": "bevcli.workshop.synth.demo_command:demo",
         "explain": "bevcli.workshop.explain.command:explain",
         "export-onnx": "bevcli.workshop.engines.export_command:export_onnx",
-        "find-like": "bevcli.workshop.batch.find_like_command:find_like",
         "quantize": "bevcli.workshop.engines.quantize_command:quantize",
         "render": "bevcli.workshop.synth.command:render",
         "reproduce": "bevcli.workshop.batch.reproduce_command:reproduce",

@@ -122,7 +122,7 @@ def test_drives_run_again_if_input_or_option_differs_not_order(batch, tmp_path):
     moved = tmp_path / "moved"
     shutil.move(tmp_path / "drives/d002", moved / "d002")
     assert batch([*paths[:2], str(moved / "d002")], resume=True).skipped == 3
-    assert batch(paths[:2], resume=True, options={"embed": True}).skipped == 0
+    assert batch(paths[:2], resume=True, options={"evaluate": True}).skipped == 0
 
 
 def test_a_folder_with_a_batch_or_other_files_is_not_overwritten(batch, fleet, tmp_path):

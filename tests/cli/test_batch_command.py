@@ -1,4 +1,4 @@
-"""`bevcli batch` and `bevcli find-like` as commands: exit codes, messages and the files that they name."""
+"""`bevcli batch` as a command: exit codes, messages and the files that they name."""
 
 import pytest
 from command_line import MINI_TOML, command
@@ -20,7 +20,7 @@ def place(tmp_path_factory):
 def test_the_commands_end_with_what_they_wrote(place):
     (place / "list.txt").write_text("drives/d001\ndrives/missing\n")
     arguments = ("batch", "drives/d000", "--list", "list.txt", "--out", "out", "--model", "mini.toml", "--untrained")
-    done = command(place, *arguments, "--workers", "1", "--retries", "0", "--embed")
+    done = command(place, *arguments, "--workers", "1", "--retries", "0")
     assert done.returncode == 3, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0] == "drives   2 of 3 done, 1 failed"
@@ -29,10 +29,6 @@ def test_the_commands_end_with_what_they_wrote(place):
     ]
     assert f"failed: missing: {place}/drives/missing: is missing" in done.stderr
     assert "3/3 drives" in done.stderr
-    found = command(place, "find-like", "d000", "--frame", "0", "--in", "out", "--html", "similar.html")
-    assert found.returncode == 0, found.stderr
-    assert found.stdout.splitlines()[1].split()[1].startswith("d001-")
-    assert (place / "similar.html").exists()
 
 
 def test_mistakes_are_one_line(place):

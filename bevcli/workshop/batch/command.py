@@ -64,7 +64,6 @@ def batch(
         options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
         with_absolute_paths(model),
         run=replace(run_options, recording=recording),
-        embed=options.embed,
         evaluate=options.evaluate,
         retries=workers.retries,
     )

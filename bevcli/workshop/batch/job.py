@@ -45,7 +45,6 @@ class Job:
         source: options of `open_sequence`; the scene is that of the drive.
         own: options of formats; a format that is missing has its defaults.
         run: options of `run_into_folder`.
-        embed: whether a vector per frame is written.
         evaluate: whether drives with ground truth are scored.
         retries: further attempts after a drive has failed.
     """
@@ -55,7 +54,6 @@ class Job:
     source: SequenceOptions = field(default_factory=SequenceOptions)
     own: tuple[FormatOptions, ...] = ()
     run: RunOptions = field(default_factory=RunOptions)
-    embed: bool = False
     evaluate: bool = False
     retries: int = 2
 
@@ -96,7 +94,6 @@ class Job:
             "engine": (self.model.engine, _fact(self.model.calibrate_with)),
             "reading": reading,
             "run": {name: _fact(value) for name, value in vars(self.run).items()},
-            "embed": self.embed,
             "evaluate": self.evaluate,
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -30,7 +30,6 @@ from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.workshop.batch.drives import Drive, fetch_scene
-from bevcli.workshop.batch.find_like import FramePooling
 from bevcli.workshop.batch.job import ATTEMPTS, FAILED, RECORD, RESULTS, SCORE_BINS, Job, Record, read_record
 from bevcli.workshop.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
 from bevcli.workshop.vad.joint_scores import DriveMatches
@@ -98,15 +97,12 @@ class Worker:
             try:
                 sequence = CheckedDrive(job.open(path, drive.scene), shlex.quote(drive.source))
                 histogram = np.zeros(SCORE_BINS, dtype=np.int64)  # of the boxes that are shown
-                pooling = FramePooling(f"{self._model.name}, {self._model.weights_hash}") if job.embed else None
 
                 def after_frame(frame: Frame, prediction: Prediction) -> None:
                     scores = prediction.boxes.scores
                     if scores is not None:
                         shown = scores[scores >= job.run.recording.score]
                         np.add(histogram, np.histogram(shown, SCORE_BINS, (0, 1))[0], out=histogram)
-                    if pooling is not None:
-                        pooling.add(frame, prediction)
 
                 summary = run_into_folder(
                     self._model, sequence, aside, job.run, after_frame=after_frame, should_stop=should_stop
@@ -116,8 +112,6 @@ class Worker:
             if not summary.is_complete:
                 raise StoppedError
             seconds = time.perf_counter() - fetched
-            if pooling is not None:
-                pooling.write(aside)
             scores, why_not = self._score(drive, path, aside)
             record = {
                 **_about(drive, result),
