@@ -21,7 +21,7 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
-from bevcli.workshop.batch.drives import find_drives
+from bevcli.workshop.batch.job import find_drives
 from bevcli.workshop.batch.run_batch import run_batch
 from bevcli.workshop.batch.worker import Worker
 from bevcli.workshop.formats.ros.format import BagOptions

@@ -5,8 +5,9 @@ from command_line import MINI_TOML, command
 from small_fleet import make_job, write_fleet
 
 from bevcli.errors import BevcliError
-from bevcli.workshop.batch import ray_workers
-from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
+from bevcli.workshop.batch import worker
+from bevcli.workshop.batch.options import Workers
+from bevcli.workshop.batch.worker import run_on_ray
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +42,13 @@ def test_mistakes_are_one_line(place):
 
 
 def test_a_cluster_needs_a_process_that_ran_no_local_batch(place, monkeypatch):
-    monkeypatch.setattr(ray_workers, "ray_is_installed", lambda: True)
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: True)
     monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # what a batch on this machine leaves
     with pytest.raises(BevcliError, match="use a new process for `address`"):
         next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(address="10.0.0.1:6379")))
 
 
 def test_several_workers_without_ray_name_what_to_install(place, monkeypatch):
-    monkeypatch.setattr(ray_workers, "ray_is_installed", lambda: False)
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: False)
     with pytest.raises(BevcliError, match=r"run pip install 'bevcli\[ray\]', or pass `count=1`"):
         next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(2)))

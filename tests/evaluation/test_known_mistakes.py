@@ -10,7 +10,7 @@ from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.scores_report import FrameScores
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.workshop.batch.reproduce import known_mistakes
+from bevcli.workshop.batch.reproduce_command import known_mistakes
 
 # Length, width and height in metres of a usual object of each class.
 SIZES = {

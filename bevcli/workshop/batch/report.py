@@ -1,18 +1,40 @@
-"""report.html: one page about a batch that needs no other file, for light and dark browsers."""
+"""The results of a batch: its tables, the scores of all drives together, and report.html.
 
+report.html is one page that needs no other file, for light and dark browsers.
+"""
+
+import csv
+import io
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from html import escape
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
 from bevcli._version import __version__
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.evaluate import OWN_CLASSES
+from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
+from bevcli.parsing.csv_tables import cell_of
 from bevcli.printing import counted, duration
-from bevcli.workshop.batch.job import RESULTS, SCORE_BINS, Record
+from bevcli.runs.state import load_state
+from bevcli.workshop.batch.job import READING_THREADS, RESULTS, SCORE_BINS, Record
+from bevcli.workshop.batch.storage import Storage
+from bevcli.workshop.batch.worker import MATCHES
+from bevcli.workshop.vad.joint_scores import DriveMatches, score_jointly
 
+PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
+_COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
 WORST = 10  # drives in the table of the worst ones
 MOST_ERRORS = 50  # rows in the table of errors
 WIDTH, HEIGHT = 420, 180  # of a chart
@@ -49,13 +71,84 @@ _SCORE_CHARTS = {
 }
 
 
-def page(title: str, body: str) -> str:
-    """An HTML page with the style of the reports. body: HTML."""
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
-    )
+def write_results(out: Storage, records: Sequence[Record], model: Model) -> tuple[str, ...]:
+    """Write the tables, the joint scores and the report of a batch; return their paths or URLs."""
+    metrics = joint_metrics(out, records, model.config)
+    classes = model.config.classes
+    files = {PARQUET: to_parquet(records, classes), CSV: to_csv(records, classes)}
+    if metrics is not None:
+        files[METRICS] = (json.dumps(metrics, indent=1) + "\n").encode()
+    files[REPORT] = write_report(records, metrics, model).encode()
+    for name, content in files.items():
+        out.write(name, content)
+    return tuple(f"{out.where}/{name}" for name in files)
+
+
+def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
+    """The columns of the tables and their types. classes: of the model, a column each."""
+    return {
+        **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
+        **dict.fromkeys(_COUNTS, pa.int64()),
+        **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
+        "output_bytes": pa.int64(),
+        **{f"boxes_{name}": pa.int64() for name in classes},
+        **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
+        "ground_truth_boxes": pa.int64(),
+        **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
+    }
+
+
+def row(record: Record, names: Iterable[str]) -> dict[str, Any]:
+    """The columns of a drive; None for what is not known, such as metrics without ground truth."""
+    boxes = record.get("boxes_by_class")
+    flat = {**(record.get("scores") or {}), **record}
+    counts = {} if boxes is None else {name: boxes.get(name.removeprefix("boxes_"), 0) for name in names}
+    return {name: counts.get(name) if name.startswith("boxes_") else flat.get(name) for name in names}
+
+
+def to_parquet(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.parquet: one row per drive, in the order of the records. classes: of the model."""
+    schema = columns(classes)
+    table = pa.Table.from_pylist([row(record, schema) for record in records], schema=pa.schema(list(schema.items())))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.csv: the same columns; an empty field for what is not known."""
+    names = columns(classes)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for record in records:
+        cells = row(record, names).items()
+        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in cells})
+    return text.getvalue().encode()
+
+
+def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
+    """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
+
+    Boxes of all drives are scored together: the result is not a mean of the drives' scores. Nothing was scored beyond
+    the model's BEV grid. Raises InputError where the matches of a drive cannot be read.
+    """
+    scored = [record for record in records if record.get("scores")]
+    if not scored:
+        return None
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+    range_m = model.bev_grid.nearest_side_m
+    config = DetectionConfig.of(model.object_classes).cut_at(range_m)
+    notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
+    if not are_nuscenes(model.object_classes):
+        notes.append(OWN_CLASSES)
+    return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
+
+
+def _read_matches(out: Storage, record: Record) -> DriveMatches:
+    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+        return load_state(path, DriveMatches)
 
 
 def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:
@@ -63,8 +156,9 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
     done = [record for record in records if not record.get("error")]
     failed = [record for record in records if record.get("error")]
     untrained = '<p class="bad">UNTRAINED: random weights, the boxes are meaningless</p>' if model.untrained else ""
+    title = f"Batch of {counted(len(records), 'drives')}"
     body = [
-        f"<h1>Batch of {counted(len(records), 'drives')}</h1>",
+        f"<h1>{title}</h1>",
         f'<p class="soft">model {escape(model.name)}, bevcli {__version__}</p>{untrained}',
         _cards(done, failed, metrics),
         _distributions(done),
@@ -72,7 +166,11 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
         _worst(done),
         _errors(failed),
     ]
-    return page(f"Batch of {counted(len(records), 'drives')}", "\n".join(body))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(body) + "\n</body></html>\n"
+    )
 
 
 def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, Any] | None) -> str:
