@@ -2,10 +2,9 @@
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -36,14 +35,6 @@ SCORES = {
     "mAVE": ("vel_err", "m/s"),
     "mAAE": ("attr_err", ""),
 }
-# A class with less is found by chance, and its errors say nothing.
-SMALLEST_AP = 0.05
-# With length and width exchanged, a car of 4.6 x 1.9 m has an IoU of 0.26 with itself, and its heading is off by 90
-# degrees. Public evaluations with this mistake have mASE 0.71 to 0.75 and mAOE 1.3 to 1.6 (issues 24 and 140 of
-# BEVFormer, 72 of BEVDet); good models have about 0.27 and 0.4.
-EXCHANGED_ASE, EXCHANGED_AOE = 0.55, 1.0
-# The published models have 0.3 to 0.7 m/s with history, and 0.8 to 1.1 m/s without it.
-NO_HISTORY_AVE = (0.8, 1.5)
 
 
 def reproduce(
@@ -57,8 +48,7 @@ def reproduce(
     """Score a published model on a nuScenes split, next to its published scores.
 
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
-    question, or with --fetch. Notes tell what makes the numbers differ, and known mistakes that they show. Exit code
-    3: some scenes failed.
+    question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
     from bevcli.weights.cache import named_weights
     from bevcli.workshop.batch.job import Job, all_own_options, find_drives, with_absolute_paths
@@ -92,7 +82,7 @@ def reproduce(
         )
         raise InputError(f"{options.data}: no scene could be scored: {why}")
     metrics = json.loads((out / METRICS).read_text())
-    comparison = compare_with_published(metrics, named.source.published, temporal=run_options.temporal)
+    comparison = compare_with_published(metrics, named.source.published)
     say(json.dumps(comparison.to_dict(), indent=1) if as_json else comparison.table())
     for note in comparison.notes:
         say(f"note: {note}", err=True)
@@ -126,7 +116,7 @@ class Comparison:
     Attributes:
         frames: number of frames that were scored.
         scores: by name: "name", "ours", "published" and "difference", each None if not measured or not published.
-        notes: why the numbers may differ, and known mistakes whose pattern they have.
+        notes: why the numbers may differ.
     """
 
     frames: int
@@ -154,15 +144,12 @@ def _number(value: float | None, unit: str, sign: str) -> str:
     return "–" if value is None else f"{scale * value:{sign}.{digits}f}"
 
 
-def compare_with_published(
-    metrics: Mapping[str, Any], published: Mapping[str, float], *, temporal: bool = True
-) -> Comparison:
+def compare_with_published(metrics: Mapping[str, Any], published: Mapping[str, float]) -> Comparison:
     """Scores of a split next to the published ones.
 
     Args:
         metrics: of `joint_metrics`; all ten classes count, as in the published scores.
         published: by the names of SCORES; further names cannot be measured here.
-        temporal: whether the model was run with history.
     """
     ours = {**metrics["tp_errors"], **{key: metrics[key] for key in ("nd_score", "mean_ap")}}
     others = [name for name in published if name not in SCORES]
@@ -176,41 +163,9 @@ def compare_with_published(
         )
     if others:
         notes.append(f"{', '.join(others)}: not measured here; `bevcli eval --tracking` scores tracks")
-    notes += known_mistakes(metrics, temporal=temporal)
     return Comparison(metrics["frames"], scores, tuple(notes))
 
 
 def _pair(name: str, ours: float | None, published: float | None) -> dict[str, Any]:
     difference = None if ours is None or published is None else ours - published
     return {"name": name, "ours": ours, "published": published, "difference": difference}
-
-
-def known_mistakes(metrics: Mapping[str, Any], *, temporal: bool = True) -> list[str]:
-    """One line for each mistake whose pattern the scores have.
-
-    Args:
-        metrics: of `FrameScores.to_dict`. Only classes with ground truth that are found count.
-        temporal: whether the model was run with history.
-    """
-    aps: Mapping[str, float | None] = metrics["mean_dist_aps"]
-    present = [name for name in metrics["classes_with_ground_truth"]["classes"] if (aps[name] or 0.0) >= SMALLEST_AP]
-    errors = metrics["label_tp_errors"]
-    scale, heading, velocity = (_mean(errors, present, name) for name in ("scale_err", "orient_err", "vel_err"))
-    found = []
-    if scale >= EXCHANGED_ASE and heading >= EXCHANGED_AOE:
-        found.append(
-            f"mASE {scale:.2f} with mAOE {heading:.2f} is the pattern of boxes whose width and length are exchanged "
-            "(known values: 0.71 to 0.75 with 1.3 to 1.6): check the order of the sizes and the heading"
-        )
-    if NO_HISTORY_AVE[0] <= velocity <= NO_HISTORY_AVE[1]:
-        why = "expected here, as the model ran without history"
-        if temporal:
-            why = "check that the frames are in order, at 2 per second, and that the poses of the vehicle are right"
-        found.append(f"mAVE {velocity:.2f} m/s is the pattern of a model without history (about 1): {why}")
-    return found
-
-
-def _mean(errors: Mapping[str, Mapping[str, float | None]], classes: Sequence[str], error: str) -> float:
-    """The mean over the classes that have the error; 0 without any."""
-    known = [value for name in classes if (value := errors[name][error]) is not None]
-    return fmean(known) if known else 0.0
