@@ -13,6 +13,7 @@ Group = Literal[
     "bevcli.box_formats",
     "bevcli.label_formats",
     "bevcli.engines",
+    "bevcli.training_heads",
     "bevcli.commands",
 ]
 

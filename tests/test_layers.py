@@ -48,7 +48,7 @@ WINGS: dict[str, set[str]] = {
     "robustness": {"calibration", "engines", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
     "tracking_scores": set(),
-    "training": {"synth", "tracking_scores", "vad"},
+    "training": {"synth", "tracking_scores"},
     "uniad": set(),
     "vad": {"engines", "training"},
 }

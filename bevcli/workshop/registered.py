@@ -28,6 +28,9 @@ OWN: dict[Group, dict[str, str]] = {
         "kitti-raw": "bevcli.workshop.formats.labels.kitti_raw:FORMAT",
         "openlabel": "bevcli.workshop.formats.labels.openlabel:FORMAT",
     },
+    "bevcli.training_heads": {
+        "VAD": "bevcli.workshop.vad.losses:HEADS",
+    },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
         "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",

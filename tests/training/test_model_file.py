@@ -18,8 +18,15 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, cla
 from bevcli.model.config import BevFrameConfig
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig
-from bevcli.workshop.training.model_file import Cost, _toml, fitting_batch, write_model_file
-from bevcli.workshop.training.presets import PRESETS, look_at, model_table
+from bevcli.workshop.training.model_file import (
+    PRESETS,
+    Cost,
+    _toml,
+    fitting_batch,
+    look_at,
+    model_table,
+    write_model_file,
+)
 from bevcli.workshop.training.samples import ClipConfig
 
 CPU = torch.device("cpu")
