@@ -150,7 +150,7 @@ class OwnHeads:
             queries that the detection loss matches to boxes, with the indices of these.
     """
 
-    missing: Callable[[Frame, ModelConfig], tuple[str, str] | None]
+    missing: Callable[[Frame, Any], tuple[str, str] | None]
     truth: Callable[[Frame, Sequence, int, Any], Any]
     losses: Callable[[Any, Items[Any], Items[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
 
