@@ -67,14 +67,6 @@ def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:
             assert torch.equal(own.detection[0].labels, of_batch.detection[place].labels)
 
 
-def test_unchanged_clips_are_prepared_once_for_the_teacher() -> None:
-    unchanged, changed = maker(NOTHING).clip(0, 0, 0), maker().clip(0, 0, 0)
-    assert unchanged.plain is not None
-    assert changed.plain is not None
-    assert unchanged.plain.inputs is unchanged.inputs
-    assert not torch.equal(changed.plain.inputs[0].images, changed.inputs[0].images)
-
-
 @pytest.mark.parametrize(
     ("size", "changes"),
     [
