@@ -17,6 +17,7 @@ Group = Literal[
     "bevcli.scores",
     "bevcli.plots",
     "bevcli.engines",
+    "bevcli.training_heads",
     "bevcli.commands",
 ]
 

@@ -47,7 +47,7 @@ WINGS: dict[str, set[str]] = {
     "robustness": {"calibration", "engines", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
     "scores": set(),
-    "training": {"synth", "vad"},
+    "training": {"synth"},
     "uniad": set(),
     "vad": {"engines", "training"},
 }

@@ -44,6 +44,9 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.plots": {
         "scores": "bevcli.workshop.scores.plots:write_plots",
     },
+    "bevcli.training_heads": {
+        "VAD": "bevcli.workshop.vad.losses:HEADS",
+    },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
         "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",
@@ -55,7 +58,6 @@ OWN: dict[Group, dict[str, str]] = {
         "convert": "bevcli.workshop.formats.convert_command:convert",
         "demo": "bevcli.workshop.synth.demo_command:demo",
         "export-onnx": "bevcli.workshop.engines.export_command:export_onnx",
-        "find-like": "bevcli.workshop.batch.find_like_command:find_like",
         "quantize": "bevcli.workshop.engines.quantize_command:quantize",
         "render": "bevcli.workshop.synth.command:render",
         "reproduce": "bevcli.workshop.batch.reproduce_command:reproduce",

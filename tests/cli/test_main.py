@@ -66,7 +66,6 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
         ("eval", SAMPLE, "nope"),
         ("export", "nope", "--format", "csv"),
         ("export-onnx", "nope.toml"),
-        ("find-like", "0", "--frame", "0", "--in", "nope"),
         ("batch", "--list", "nope", "--out", "out"),
         ("bench", "--model", "nope.onnx"),
         ("convert", "nope", "out"),

@@ -1,51 +1,69 @@
-"""The ground truth beyond boxes of a frame to train on, for models with heads of their own."""
+"""The ground truth beyond boxes of a frame to train on: lines, futures and the driven path."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import apply, inverse
-from bevcli.model.config import ModelConfig
-from bevcli.model.step import FrameTruth
+from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.workshop.training.detection_loss import boxes_inside
+from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.driving_scores import LATE_S, Drives, followed, with_true_futures
 from bevcli.workshop.vad.map_lines import TRUE_LINES, MapLines
-from bevcli.workshop.vad.plan import Plan
-
-NO_LINES = MapLines((), np.zeros(0, dtype=np.str_))
 
 
-def frame_truth(frame: Frame, sequence: Sequence, place: int, config: ModelConfig) -> FrameTruth:
+@dataclass(frozen=True)
+class FrameTruth:
+    """The ground truth of one frame, bev frame.
+
+    Attributes:
+        boxes: the G boxes to be found, each with one future of T steps; NaN from the step on in which the object is
+            not there.
+        lines: of the map.
+        driven: (T, 2) places where the vehicle was at the same times, metres; NaN after the end of the scene.
+        command: the driver's command that the driven path follows; "" where no place is known.
+    """
+
+    boxes: Boxes3D
+    lines: MapLines
+    driven: Array
+    command: str
+
+
+def missing_truth(frame: Frame, config: VADConfig) -> tuple[str, str] | None:
+    """The truth beyond boxes that a frame lacks, in words, and its file; None where nothing is missing."""
+    return ("lines", TRUE_LINES) if result_of(MapLines, frame.ground_truth_results) is None else None
+
+
+def frame_truth(frame: Frame, sequence: Sequence, place: int, config: VADConfig) -> FrameTruth:
     """The truth of a frame that a model trains on.
 
     frame: with ground truth boxes, and the rig that the model sees; at `place` of its drive, `sequence`.
-    Raises InputError where the frame has no true lines but the model finds lines, or its objects have no identities.
+    Raises InputError where the frame has no true lines, or its objects have no identities.
     """
     assert frame.ground_truth is not None
     times, boxes = config.future_times_s, frame.ground_truth
     lines = result_of(MapLines, frame.ground_truth_results)
-    if MapLines in config.results and lines is None:
+    if lines is None:
         raise InputError(
             f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no true lines of the map: training "
             f"{config.name} needs {TRUE_LINES} (bevcli render writes it)"
         )
-    later = Drives(_frames_until(sequence, place, max(times, default=0.0)))
+    later = Drives(_frames_until(sequence, place, max(times)))
     bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
-    if times:
-        boxes = with_true_futures(boxes, frame.stamp, later, times)
+    boxes = with_true_futures(boxes, frame.stamp, later, times)
     driven = np.full((len(times), 2), np.nan)
     for step, seconds in enumerate(times):
         there = later.after(frame.stamp, seconds)
         if there is not None and there.world_from_ego is not None:
             driven[step] = apply(bev_from_world, (there.world_from_ego.matrix @ frame.rig.ego_from_bev)[:3, 3])[:2]
     boxes = boxes_inside(boxes.transformed(bev_from_world), config)
-    known, commands = driven[np.isfinite(driven).all(-1)], config.results.get(Plan, ())
-    command = followed(known, commands) if len(known) and commands else ""
-    return FrameTruth(boxes, NO_LINES if lines is None else lines, driven, command)
+    known = driven[np.isfinite(driven).all(-1)]
+    return FrameTruth(boxes, lines, driven, followed(known, config.commands) if len(known) else "")
 
 
 def _frames_until(sequence: Sequence, place: int, seconds: float) -> Iterator[FrameBoxes]:
