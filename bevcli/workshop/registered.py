@@ -18,15 +18,12 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.box_formats": {
         "kitti": "bevcli.workshop.formats.boxes.kitti:FORMAT",
-        "kitti-raw": "bevcli.workshop.formats.boxes.kitti_raw:FORMAT",
-        "openlabel": "bevcli.workshop.formats.boxes.openlabel:FORMAT",
     },
     "bevcli.label_formats": {
         "csv": "bevcli.workshop.formats.labels.csv_table:FORMAT",
         "cvat": "bevcli.workshop.formats.labels.cvat:FORMAT",
         "kitti": "bevcli.workshop.formats.labels.kitti:FORMAT",
         "kitti-raw": "bevcli.workshop.formats.labels.kitti_raw:FORMAT",
-        "openlabel": "bevcli.workshop.formats.labels.openlabel:FORMAT",
     },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",

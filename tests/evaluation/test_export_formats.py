@@ -192,3 +192,9 @@ def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_unknown_format_names_the_known_ones() -> None:
+    sample = Path(__file__).parents[2] / "samples/street/ground_truth.json"
+    answer = CliRunner().invoke(app, ["export", str(sample), "--format", "dxf"])
+    assert "--format dxf: unknown format (expected csv, json, kitti, " in str(answer.exception)
