@@ -12,8 +12,7 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.recording import entities
 from bevcli.recording.box_lines import labels_in_scene
 from bevcli.recording.colors import (

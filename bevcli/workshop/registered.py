@@ -8,22 +8,24 @@ OWN: dict[Group, dict[str, str]] = {
         "VAD": "bevcli.workshop.vad.vad:VAD",
     },
     "bevcli.sequences": {
-        "argoverse2": "bevcli.workshop.formats.argoverse2.format:FORMAT",
-        "dgp": "bevcli.workshop.formats.dgp.format:FORMAT",
+        "argoverse2": "bevcli.workshop.formats.argoverse2:FORMAT",
+        "dgp": "bevcli.workshop.formats.dgp:FORMAT",
         "ros": "bevcli.workshop.formats.ros.format:FORMAT",
-        "t4": "bevcli.workshop.formats.t4.format:FORMAT",
+        "t4": "bevcli.workshop.formats.t4:FORMAT",
     },
     "bevcli.drive_writers": {
-        "mcap": "bevcli.workshop.formats.foxglove.format:OUTPUT",
+        "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
+        "native": "bevcli.workshop.formats.native_writer:OUTPUT",
+        "nuscenes": "bevcli.workshop.formats.nuscenes_writer:OUTPUT",
     },
     "bevcli.box_formats": {
-        "kitti": "bevcli.workshop.formats.boxes.kitti:FORMAT",
+        "kitti": "bevcli.workshop.formats.kitti:BOXES",
     },
     "bevcli.label_formats": {
-        "csv": "bevcli.workshop.formats.labels.csv_table:FORMAT",
-        "cvat": "bevcli.workshop.formats.labels.cvat:FORMAT",
-        "kitti": "bevcli.workshop.formats.labels.kitti:FORMAT",
-        "kitti-raw": "bevcli.workshop.formats.labels.kitti_raw:FORMAT",
+        "csv": "bevcli.workshop.formats.csv_labels:FORMAT",
+        "cvat": "bevcli.workshop.formats.cuboids:CVAT",
+        "kitti": "bevcli.workshop.formats.kitti:LABELS",
+        "kitti-raw": "bevcli.workshop.formats.cuboids:TRACKLETS",
     },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",

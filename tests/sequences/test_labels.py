@@ -13,14 +13,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
-from bevcli.workshop.formats.boxes.kitti import write_kitti
-from bevcli.workshop.formats.labels import label_format
-from bevcli.workshop.formats.labels.sequence import WithLabels, _labelled_places
+from bevcli.workshop.formats.kitti import write_kitti
+from bevcli.workshop.formats.labels import WithLabels, _labelled_places, read_labels
 from bevcli.workshop.formats.native_writer import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
@@ -242,14 +241,14 @@ CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
 def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
     path = tmp_path / "tracklet_labels.xml"
     path.write_text(CVAT_TRACKLETS)
-    labels = label_format.read_labels(path, Drive().rig, LabelOptions())
+    labels = read_labels(path, Drive().rig, LabelOptions())
     assert [frame.index for frame in labels.frames] == [1, 3]
     box = labels.frames[1].boxes
     np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [12, 2, 1, 4, 2, 1.5, 0.7])
     assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["0"])
     assert any("CVAT's version" in note for note in labels.notes)
     path.write_text(CVAT_TRACKLETS.replace("<item_version>0", "<item_version>2").replace('"yes"', '"true"'))
-    as_kitti = label_format.read_labels(path, Drive().rig, LabelOptions())
+    as_kitti = read_labels(path, Drive().rig, LabelOptions())
     assert [frame.index for frame in as_kitti.frames] == [1, 2, 3]
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.centers[0]], [8, 2, 2])  # 1 m is the bottom
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.sizes_lwh[0]], [1.5, 4, 2])
@@ -268,7 +267,7 @@ def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list,
     height, width, length = hwl
     text = CVAT_TRACKLETS.replace("<h>2.0</h><w>4.0</w><l>1.5</l>", f"<h>{height}</h><w>{width}</w><l>{length}</l>")
     (tmp_path / "tracklet_labels.xml").write_text(text)
-    labels = label_format.read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
+    labels = read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
     assert labels.frames[0].boxes.sizes_lwh[0].tolist() == sizes
 
 

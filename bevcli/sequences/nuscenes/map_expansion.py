@@ -14,7 +14,7 @@ from bevcli.errors import InputError
 from bevcli.frame import LINE_CLASSES, MapLines
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json
-from bevcli.sequences.nuscenes.json_tables import read_rows
+from bevcli.sequences.nuscenes.tables import read_rows
 from bevcli.workshop.vad.true_lines import AREA, lines_in_area
 
 DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES

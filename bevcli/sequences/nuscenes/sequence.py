@@ -17,12 +17,22 @@ from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.native.folder import rig_notes
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples, Sensors
-from bevcli.sequences.nuscenes.json_tables import read_rows
+from bevcli.sequences.nuscenes.index import (
+    NUSCENES,
+    Dialect,
+    Images,
+    Ints,
+    NuScenesIndex,
+    Samples,
+    Sensors,
+    chosen_scenes,
+    keyframes,
+    sweep_frames,
+    tables_of,
+)
 from bevcli.sequences.nuscenes.map_expansion import MapExpansion
+from bevcli.sequences.nuscenes.tables import open_index, read_rows
 from bevcli.sequences.options import SequenceOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
@@ -80,6 +90,7 @@ class TableSequence(Sequence):
         self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
     ) -> None:
         common.refuse_static(root)
+        self.name = root.resolve().name
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)

@@ -18,9 +18,9 @@ from pathlib import Path
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_text
 from bevcli.sequences.format import drives_in, is_drive
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.user_folders import user_cache
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 

@@ -20,7 +20,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, SceneAttention
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.sequences.selection import scenes_of
+from bevcli.sequences.open import scenes_of
 
 RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
 DEFAULT_DISTANCE_M = 10.0  # of the default cell, ahead of the vehicle, where no box is

@@ -21,7 +21,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, class_of_size
 from bevcli.geometry.transforms import Array
 from bevcli.inference.training_rigs import rigs_of
 from bevcli.model.config import BevFrameConfig
-from bevcli.sequences.selection import scenes_of, select_rate
+from bevcli.sequences.open import scenes_of, select_rate
 from bevcli.workshop.training.drive_checks import longest_scene
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.options import Preset

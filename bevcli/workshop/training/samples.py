@@ -22,7 +22,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, joined_inputs, model_inputs
 from bevcli.model.upload import pinned, upload
-from bevcli.sequences.selection import scenes_of
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.workshop.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.frame import FrameStamp, Ground, Plan
-from bevcli.parsing.csv_tables import CsvRow, cell_of, read_csv
+from bevcli.parsing.documents import CsvRow, cell_of, read_csv
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 COLUMNS = (

@@ -19,7 +19,7 @@ from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse, SequenceOptions
-from bevcli.workshop.formats.ros.bag import Bag
+from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.ego_motion import (
     TransformTree,
     capture_times,
@@ -32,7 +32,6 @@ from bevcli.workshop.formats.ros.ego_motion import (
 from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.images import BagVideo, bag_image
 from bevcli.workshop.formats.ros.messages import camera_of, frame_of, pose_of
-from bevcli.workshop.formats.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
 # Usual names of the frame of the vehicle, and of the world.
 EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")

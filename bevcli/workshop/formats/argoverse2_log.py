@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, with_track_velocities
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
@@ -24,8 +24,7 @@ from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.tracks import with_track_velocities
-from bevcli.workshop.formats.argoverse2.format import Argoverse2Options
+from bevcli.workshop.formats.argoverse2 import CLASS_OF_CATEGORY, Argoverse2Options
 
 LARGEST_BYTES = 256 * MIB
 LARGEST_NUMBER = 1e12  # metres or pixels
@@ -41,27 +40,6 @@ SPACING_NS = 100_000_000  # time between the poses that kinematics are derived f
 NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
 SIZE = ("length_m", "width_m", "height_m")
 ANNOTATIONS = "annotations.feather"
-# Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
-# and STROLLER, stay as they are, and are not scored.
-CLASS_OF_CATEGORY = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "VEHICULAR_TRAILER": "trailer",
-    "MESSAGE_BOARD_TRAILER": "trailer",
-    "TRAFFIC_LIGHT_TRAILER": "trailer",
-    "MOTORCYCLE": "motorcycle",
-    "BICYCLE": "bicycle",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "traffic_cone",
-}
 Times = NDArray[np.int64]
 
 
