@@ -4,9 +4,9 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -16,10 +16,11 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import GRAVITY, Kinematics
+from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, open_regular, plain_name, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.waiting import result_within
 
@@ -305,23 +306,11 @@ class FrameEntry:
     origin: str
 
 
-class Motion(Protocol):
-    """The vehicle's poses over time, such as `EgoMotion`."""
-
-    def pose_at(self, timestamp_ns: int) -> Pose:
-        """world_from_ego at a time."""
-        ...
-
-    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """Acceleration, angular rate and velocity at a time."""
-        ...
-
-
 def read_frame(
     entry: FrameEntry,
     rig: CameraRig,
     reader: ImageReader,
-    motion: Motion | None,
+    motion: EgoMotion | None,
     ground_truth: Boxes3D | None = None,
     ground_truth_map: BevMap | None = None,
 ) -> Frame:
@@ -356,23 +345,57 @@ def leads_out(path: Path, folder: Path) -> bool:
     return not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
 
 
-class ListedSequence(Sequence):
-    """Base of a `Sequence` of a folder whose frames are entries: a subclass calls `_list`, and has `_frame`."""
+def bev_frame_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ...]:
+    """Tells the user that the bev frame is the default, if it is. source: what does not state it."""
+    if not rig.ego_from_bev_assumed:
+        return ()
+    return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
 
-    def _list(self, entries: tuple[FrameEntry, ...], folder: Path, common: SequenceOptions) -> None:
-        self._entries, self.stamps = entries, tuple(entry.stamp for entry in entries)
-        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else folder)
+
+class ListedSequence(Sequence):
+    """A drive whose frames are listed, and whose images are read when a frame is loaded.
+
+    Args:
+        path: the drive, below which the images lie.
+        common: the options of every format.
+        rigs: the rig of all frames, or of each.
+        entries: the frames.
+        motion: the vehicle's poses; None if they are not known.
+        truth: the boxes of frames in the world frame, by their places in the drive.
+        notes: for the user.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        common: SequenceOptions,
+        rigs: CameraRig | tuple[CameraRig, ...],
+        entries: tuple[FrameEntry, ...],
+        motion: EgoMotion | None,
+        truth: Mapping[int, Boxes3D] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.path, self.name, self.notes = path, path.resolve().name, notes
+        self._rigs = (rigs,) * len(entries) if isinstance(rigs, CameraRig) else rigs
+        self.rig, self.stamps, self._entries = self._rigs[0], tuple(entry.stamp for entry in entries), entries
+        self.ego_motion, self.has_ego_motion, self._truth = motion, motion is not None, truth or {}
+        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        return count_classes(self._truth.values())
 
     def image_files(self, place: int) -> tuple[Path, ...]:
         sources = self._entries[place].sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def ground_truth_frame(self, place: int) -> Frame:
-        return self._frame(place, replace(self._entries[place], sources={}))
+        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
+        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
 
     def load(self, place: int) -> Frame:
         return self._frame(place, self._entries[place])
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
         """The frame at a place, of its entry or of one without images."""
-        raise NotImplementedError
+        return read_frame(entry, self._rigs[place], self._images, self.ego_motion, self._truth.get(place))

@@ -64,38 +64,36 @@ class FolderSequence(ListedSequence):
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        self.path, self.name = path, path.resolve().name
-        rig = own.rig() if rig is None else rig
-        calibration = path / "calibration.json"
-        self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
-        entries, notes = _read_entries(path, self.rig)
-        self._list(entries, path, common)
+        rig, facts = own.rig() if rig is None else rig, DriveFacts()
+        if rig is None:
+            rig, facts = read_rig_and_facts(path / CALIBRATION)
+        entries, notes = _read_entries(path, rig)
         if not common.allow_outside:
             _check_paths(path, entries)
         file = own.ego_motion_file or path / "ego_motion.csv"
-        self.ego_motion, motion_notes = _read_motion(file, common.ego_motion)
-        if self.ego_motion is not None:
+        motion, motion_notes = _read_motion(file, common.ego_motion)
+        if motion is not None:
             advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-            _check_coverage(file, self.ego_motion, entries, advice)
-        self.has_ego_motion = self.ego_motion is not None
-        self._read_truth(is_read=common.ground_truth)
-        sources = [one for entry in entries for one in entry.sources.values() if isinstance(one, ImageSource)]
-        turned = rotation_notes(sorted({one.path for one in sources if one.video_index is not None}))
-        self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *turned)
+            _check_coverage(file, motion, entries, advice)
+        self._read_truth(path, is_read=common.ground_truth)
+        sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
+        turned = rotation_notes(sorted({source.path for source in sources if source.video_index is not None}))
+        notes = (*bev_frame_notes(rig), *notes, *motion_notes, *turned)
+        super().__init__(path, common, rig, entries, motion, notes=notes)
+        self.facts = facts
 
-    def _read_truth(self, *, is_read: bool) -> None:
+    def _read_truth(self, path: Path, *, is_read: bool) -> None:
         """Read ground_truth.json and ground_truth_lines.json; maps are read frame by frame. Each may be missing."""
-        boxes, lines, maps = (self.path / name for name in (BOXES_FILE, TRUE_LINES, MAPS_FOLDER))
+        boxes, lines, maps = (path / name for name in (BOXES_FILE, TRUE_LINES, MAPS_FOLDER))
         self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._lines = read_lines(lines) if is_read and is_there(existing(lines)) else LinesFile("ego", (), ())
         self._maps = open_maps(maps) if is_read and maps.is_dir() else None
-        self._class_counts = count_classes(frame.boxes for frame in self._boxes.frames)
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
         self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames}
 
     @property
     def class_counts(self) -> Mapping[str, int]:
-        return self._class_counts
+        return count_classes(frame.boxes for frame in self._boxes.frames)
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -183,13 +181,6 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
                 )
-
-
-def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ...]:
-    """Tells the user that the bev frame is the default, if it is. source: what does not state it."""
-    if not rig.ego_from_bev_assumed:
-        return ()
-    return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
 
 
 FILE_NAME = "timing.toml"
