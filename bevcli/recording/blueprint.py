@@ -7,12 +7,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevcli.frame import FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.ground_lines import KINDS
-from bevcli.recording.log_static import legend_entries, legend_size
-from bevcli.recording.recorded import Recorded, frame_rate_hz
+from bevcli.recording.log_static import Recorded, legend_entries, legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
 
@@ -108,6 +107,13 @@ def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:
     )
 
 
+def frame_rate_hz(stamps: tuple[FrameStamp, ...]) -> float:
+    """Frames per second: 1 / the median time between frames; 2 where there are less than two frames."""
+    steps = np.diff([stamp.timestamp_ns for stamp in stamps])
+    steps = steps[steps > 0]
+    return float(1e9 / np.median(steps)) if len(steps) else 2.0
+
+
 def camera_row_shares(rig: CameraRig) -> list[float]:
     """The share of the window's height of each row of cameras: images are as wide in all rows as in the longest one."""
     rows = camera_rows(rig)
@@ -118,13 +124,13 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
 
 
 def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
-    drawn_in_images, names = ("boxes", "ground_truth", "pillars", "probes", *KINDS), recorded.drive.rig.names
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in names for kind in drawn_in_images]
+    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", *entities.line_kinds())
+    overlays = [entities.overlay(name, kind) for name in recorded.drive.rig.names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
-        contents=[f"/{entities.WORLD}/**", *excluded],
+        contents=[f"/{entities.WORLD}/**", *(f"- /{overlay}/**" for overlay in overlays)],
         name=f"3D scene{titled}",
         background=list(BACKGROUND),
         line_grid=False,

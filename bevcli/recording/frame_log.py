@@ -9,19 +9,17 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
-from bevcli.recording.box_lines import box_labels
-from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.components import any_values, components, packed
-from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
-from bevcli.recording.log_bev import BevColors, BevImages
-from bevcli.recording.log_cameras import CameraImages, PosedCamera
-from bevcli.recording.log_tracks import TrackHistory, log_tracks
-from bevcli.recording.recorded import WARNINGS, Recorded
+from bevcli.recording.log_bev import BevColors, BevImages, future_lines, log_ground_lines
+from bevcli.recording.log_boxes import TrackHistory, log_tracks
+from bevcli.recording.log_cameras import CameraImages, PosedCamera, box_labels
+from bevcli.recording.log_static import WARNINGS, Recorded
+from bevcli.recording.meshes import log_class_meshes
 
 PosedCameras = tuple[PosedCamera, ...]
 
@@ -175,7 +173,7 @@ class FrameLog:
         stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
     def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
-        """Writes lines of the map, futures and planned paths of a model that has further results."""
+        """Writes the results and futures of a model that has further results."""
         kinds = self._recorded.model.config.results
         if not kinds:
             return
@@ -183,9 +181,12 @@ class FrameLog:
         moved = Pose.from_matrix(self._moved_to_origin(prediction.world_from_ego.matrix))
         ground = replace(prediction.ground, world_from_ego=moved)
         shown = prediction.boxes.scored(score).transformed(world_from_bev)
-        of_results = result_lines(prediction.results, ground, kinds, score)
-        for lines in (*of_results, future_lines(shown, self._recorded.classes)):
-            log_ground_lines(self._stream, lines, world_from_bev, cameras)
+        for kind, names in kinds.items():
+            result = result_of(kind, prediction.results)
+            lines = GroundLines() if result is None else result.drawn(ground, names, score)
+            log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+        futures = future_lines(shown, self._recorded.classes)
+        log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
     def _log_ground_truth(
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras

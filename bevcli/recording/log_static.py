@@ -1,13 +1,17 @@
-"""Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
+"""What is recorded, and the static parts: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
+
+from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
 
 from bevcli._version import __version__
-from bevcli.frame import MapLines, Plan
+from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import hex_of_color
@@ -15,7 +19,6 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
 from bevcli.recording import entities
-from bevcli.recording.box_lines import UNSEEN, labels_2d
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,
     EGO_COLOR,
@@ -24,14 +27,83 @@ from bevcli.recording.colors import (
     RING_COLOR,
     STAGE_COLORS,
     Color,
+    class_colors,
     colormap,
-    line_colors,
     map_colors,
 )
 from bevcli.recording.components import components
+from bevcli.recording.log_cameras import UNSEEN, labels_2d
 from bevcli.recording.mesh_file import Mesh
-from bevcli.recording.recorded import Recorded
-from bevcli.recording.vehicle import VehicleMesh, default_vehicle
+from bevcli.recording.meshes import VehicleMesh, default_vehicle
+from bevcli.recording.options import RecordingOptions
+
+UNTRAINED = "untrained weights"
+FROM_RENDERED = "trained on renderings"
+WARNINGS = {
+    UNTRAINED: "The weights are UNTRAINED: boxes and maps are meaningless.",
+    FROM_RENDERED: "The weights were trained on rendered streets; these images are not rendered.",
+}
+
+
+class RecordedModel(Protocol):
+    """The facts about a model that go into a recording."""
+
+    @property
+    def config(self) -> ModelConfig:
+        """The model's configuration; its name and its classes are written."""
+
+    @property
+    def untrained(self) -> bool:
+        """True for random weights. Then titles, events and the page "About" say so."""
+
+    @property
+    def bundled(self) -> bool:
+        """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
+
+
+class RecordedDrive(Protocol):
+    """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
+
+    name: str
+    rig: CameraRig
+    has_ego_motion: bool
+    facts: DriveFacts
+
+    @property
+    def stamps(self) -> tuple[FrameStamp, ...]:
+        """The frames that are known in advance; their rate is written."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A drive, the model that runs on it, and how much of both a recording holds."""
+
+    drive: RecordedDrive
+    model: RecordedModel
+    options: RecordingOptions
+
+    @property
+    def title(self) -> str:
+        """The names of the drive and of the model."""
+        return f"{self.drive.name} · {self.model.config.name}"
+
+    @property
+    def note(self) -> str:
+        """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
+        if self.model.untrained:
+            return UNTRAINED
+        return FROM_RENDERED if self.model.bundled and not self.drive.facts.rendered else ""
+
+    @cached_property
+    def classes(self) -> Mapping[str, Color]:
+        """The model's classes and their colours."""
+        return class_colors(self.model.config.object_classes.values())
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that is written; none without a map."""
+        return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
+
 
 RING_STEP_M = 10
 DEFAULT_RANGE_M = 50.0  # of the range rings without a model
@@ -220,10 +292,8 @@ def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
 
 def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds."""
-    of_map = line_colors(config.results.get(MapLines, ()))
-    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in of_map.items()]
-    plans = [("planned path", EGO_COLOR)] if Plan in config.results else []
-    return [*lines, *plans, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
+    of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
+    return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:

@@ -14,12 +14,9 @@ from recorded_drive import record
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from bevcli.recording import entities
-from bevcli.viewer.export import export_boxes
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.summary import summarise
-from bevcli.viewer.video import frame_rate
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader, export_boxes, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, frame_rate, tiles
 
 READ = (entities.WORLD, entities.EGO, entities.BOXES, entities.RUN, entities.SPEED, "world/cameras", "bev")
 

@@ -13,11 +13,9 @@ from rerun.chunk import LazyChunkStream, RrdReader
 from bevcli.errors import InputError
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
-from bevcli.viewer.export import export_boxes, read_recording, recorded_boxes
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.summary import summarise
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader, export_boxes, read_recording, recorded_boxes, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, tiles
 
 
 @pytest.fixture(scope="module")

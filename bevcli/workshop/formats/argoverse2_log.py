@@ -21,8 +21,7 @@ from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
-from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, read_frame
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats.argoverse2 import CLASS_OF_CATEGORY, Argoverse2Options
 
@@ -137,7 +136,7 @@ class Argoverse2Sequence(ListedSequence):
         entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
         self._list(entries, path, common)
         self._truth = truth if common.ground_truth else {}
-        self.notes = (*rig_notes(self.rig, "an Argoverse 2 log"), *notes)
+        self.notes = (*bev_frame_notes(self.rig, "an Argoverse 2 log"), *notes)
 
     @property
     def input_files(self) -> tuple[Path, ...]:

@@ -19,8 +19,7 @@ from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, leads_out, read_frame
-from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out, read_frame
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.workshop.formats.dgp import CLASS_OF_CATEGORY
 
@@ -291,7 +290,7 @@ class DgpSequence(ListedSequence):
         self._list(tuple(self._entry(index, sample) for index, sample in enumerate(samples)), path, common)
         self.ego_motion = motion_of_keyframes(poses(samples, keys=True), poses(samples, keys=False))
         self._truth = self._read_truth(scene, samples, common.class_map) if common.ground_truth else {}
-        self.notes = (*rig_notes(self.rig, "a DGP scene"), *((TENFOLD,) if tenfold else ()))
+        self.notes = (*bev_frame_notes(self.rig, "a DGP scene"), *((TENFOLD,) if tenfold else ()))
 
     @property
     def input_files(self) -> tuple[Path, ...]:

@@ -15,8 +15,7 @@ from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
-from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.images import FrameEntry, ImageReader, Source, bev_frame_notes, read_frame
 from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, read_topics_file
@@ -74,7 +73,7 @@ class RosSequence(Sequence):
             *beside,
             *reader.notes,
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
-            *rig_notes(self.rig, "the calibration" if rig else "a bag"),
+            *bev_frame_notes(self.rig, "the calibration" if rig else "a bag"),
             *motion_notes,
             *gaps,
         )
