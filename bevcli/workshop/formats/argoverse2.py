@@ -48,7 +48,7 @@ FORMAT = Format(
     name="an Argoverse 2 log",
     expected="city_SE3_egovehicle.feather",
     recognises=lambda path: any((path / marker).exists() for marker in MARKERS),
-    opener="bevcli.workshop.formats.argoverse2_log:Argoverse2Sequence",
+    opener="bevcli.workshop.formats.argoverse2_log:open_log",
     options=Argoverse2Options,
     annotated=True,
 )

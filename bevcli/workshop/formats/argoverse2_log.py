@@ -11,7 +11,7 @@ import pyarrow as pa  # which rerun brings, so that it is installed anyway
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp
+from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, with_track_velocities
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
@@ -20,8 +20,8 @@ from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, read_frame
+from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats.argoverse2 import CLASS_OF_CATEGORY, Argoverse2Options
 
@@ -113,46 +113,25 @@ class FeatherTable:
         return InputError(f'{self.path}: column "{name}": expected {expected}, found {found:.80}')
 
 
-class Argoverse2Sequence(ListedSequence):
+def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> ListedSequence:
     """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
 
     A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
     The ego frame is below Argoverse's, on the ground. The world frame is that of the city. Raises InputError.
     """
-
-    has_ego_motion = True
-
-    def __init__(
-        self, path: Path, common: SequenceOptions = SequenceOptions(), own: Argoverse2Options = Argoverse2Options()
-    ) -> None:
-        common.refuse_static(path)
-        self.path, self.name = path, path.resolve().name
-        self.rig = _read_rig(path / "calibration", own)
-        self.ego_motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
-        images = {name: _image_times(path / "sensors/cameras" / name) for name in self.rig.names}
-        annotated = (path / ANNOTATIONS).exists()
-        names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
-        truth = _read_annotations(path / ANNOTATIONS, self.ego_motion, own, names) if annotated else {}
-        entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
-        self._list(entries, path, common)
-        self._truth = truth if common.ground_truth else {}
-        self.notes = (*bev_frame_notes(self.rig, "an Argoverse 2 log"), *notes)
-
-    @property
-    def input_files(self) -> tuple[Path, ...]:
-        return tuple(sorted((*self.path.glob("*.feather"), *self.path.glob("calibration/*.feather"))))
-
-    @property
-    def class_counts(self) -> Mapping[str, int]:
-        return count_classes(self._truth.values())
-
-    def ground_truth_frame(self, place: int) -> Frame:
-        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
-        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
-
-    def _frame(self, place: int, entry: FrameEntry) -> Frame:
-        truth = self._truth.get(entry.stamp.timestamp_ns)
-        return read_frame(entry, self.rig, self._images, self.ego_motion, truth)
+    common.refuse_static(path)
+    rig = _read_rig(path / "calibration", own)
+    motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+    images = {name: _image_times(path / "sensors/cameras" / name) for name in rig.names}
+    annotated = (path / ANNOTATIONS).exists()
+    names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+    boxes = _read_annotations(path / ANNOTATIONS, motion, own, names) if annotated else {}
+    entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
+    times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
+    truth = {place: boxes[time] for place, time in enumerate(times) if time in boxes}
+    notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
+    files = ("*.feather", "calibration/*.feather")
+    return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
 
 
 def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:

@@ -18,6 +18,6 @@ FORMAT = Format(
     name="a DGP scene",
     expected="scene_*.json",
     recognises=lambda path: any(path.glob("scene_*.json")) or all((path / name).is_dir() for name in FOLDERS),
-    opener="bevcli.workshop.formats.dgp_scene:DgpSequence",
+    opener="bevcli.workshop.formats.dgp_scene:open_scene",
     annotated=True,
 )
