@@ -56,8 +56,7 @@ LEFT = {
     "bevcli.cli.progress", "bevcli.cli.project_debug", "bevcli.cli.run", "bevcli.cli.weights",
     "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
-    "bevcli.rig.check_calibration", "bevcli.runs.run_into_folder",
-    "bevcli.sequences.native.format", "bevcli.sequences.nuscenes.format",
+    "bevcli.runs.run_into_folder",
 }  # fmt: skip
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

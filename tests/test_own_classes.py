@@ -16,7 +16,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, are_
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.recording.colors import class_colors
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.workshop.formats.boxes.kitti import kitti_labels
+from bevcli.workshop.formats.kitti import kitti_labels
 from bevcli.workshop.scores.tracking import TrackingConfig
 
 NAMES = ("PKW", "Lorry", "person", "deer")

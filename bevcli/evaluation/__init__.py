@@ -13,5 +13,6 @@ Metrics; they read no files:
     segmentation        IoU of BEV maps
 
 Output:
-    formats             boxes in the formats of other tools; nuScenes submissions are read too
+    box_format          formats that boxes are exported in
+    submission          nuScenes submissions, which are read too
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.nuscenes import is_submission, read_submission
+from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import FrameStamp, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
@@ -18,9 +18,9 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
+from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 

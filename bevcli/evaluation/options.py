@@ -35,9 +35,7 @@ class ExportOptions:
 
     form: str = option(
         help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
-        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. openlabel: ASAM OpenLABEL, with tracks. "
-        "kitti-raw: tracklet_labels.xml, with tracks. Or "
-        "the format of an installed package.",
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
         complete=lambda incomplete: list(entries("bevcli.box_formats")),

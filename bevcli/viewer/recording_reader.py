@@ -15,7 +15,7 @@ import pyarrow as pa
 from rerun.chunk import Chunk, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array, Pose

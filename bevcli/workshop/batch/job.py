@@ -29,9 +29,9 @@ from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, read_text
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.user_folders import user_cache

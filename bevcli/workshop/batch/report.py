@@ -24,7 +24,7 @@ from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
-from bevcli.parsing.csv_tables import cell_of
+from bevcli.parsing.documents import cell_of
 from bevcli.printing import counted, duration
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.job import READING_THREADS, RESULTS, Record

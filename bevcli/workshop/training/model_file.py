@@ -22,9 +22,8 @@ from bevcli.geometry.transforms import Array
 from bevcli.inference.training_rigs import rigs_of
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.selection import scenes_of, select_rate
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.splits import read_split
 from bevcli.workshop.training.job import TrainingConfig

@@ -25,7 +25,7 @@ from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_i
 from bevcli.model.upload import pinned, upload
 from bevcli.printing import counted
 from bevcli.registry import entries, load
-from bevcli.sequences.selection import scenes_of
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.workshop.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded

@@ -28,7 +28,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.native.folder import BOXES_FILE
-from bevcli.sequences.selection import scenes_of
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig, own_heads

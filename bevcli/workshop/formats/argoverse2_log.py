@@ -11,8 +11,8 @@ import pyarrow as pa  # which rerun brings, so that it is installed anyway
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D, with_track_velocities
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
@@ -20,12 +20,10 @@ from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
-from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.tracks import with_track_velocities
-from bevcli.workshop.formats.argoverse2.format import Argoverse2Options
+from bevcli.workshop.formats.argoverse2 import CLASS_OF_CATEGORY, Argoverse2Options
 
 LARGEST_BYTES = 256 * MIB
 LARGEST_NUMBER = 1e12  # metres or pixels
@@ -41,27 +39,6 @@ SPACING_NS = 100_000_000  # time between the poses that kinematics are derived f
 NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
 SIZE = ("length_m", "width_m", "height_m")
 ANNOTATIONS = "annotations.feather"
-# Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
-# and STROLLER, stay as they are, and are not scored.
-CLASS_OF_CATEGORY = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "VEHICULAR_TRAILER": "trailer",
-    "MESSAGE_BOARD_TRAILER": "trailer",
-    "TRAFFIC_LIGHT_TRAILER": "trailer",
-    "MOTORCYCLE": "motorcycle",
-    "BICYCLE": "bicycle",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "traffic_cone",
-}
 Times = NDArray[np.int64]
 
 
@@ -136,46 +113,25 @@ class FeatherTable:
         return InputError(f'{self.path}: column "{name}": expected {expected}, found {found:.80}')
 
 
-class Argoverse2Sequence(ListedSequence):
+def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> ListedSequence:
     """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
 
     A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
     The ego frame is below Argoverse's, on the ground. The world frame is that of the city. Raises InputError.
     """
-
-    has_ego_motion = True
-
-    def __init__(
-        self, path: Path, common: SequenceOptions = SequenceOptions(), own: Argoverse2Options = Argoverse2Options()
-    ) -> None:
-        common.refuse_static(path)
-        self.path, self.name = path, path.resolve().name
-        self.rig = _read_rig(path / "calibration", own)
-        self.ego_motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
-        images = {name: _image_times(path / "sensors/cameras" / name) for name in self.rig.names}
-        annotated = (path / ANNOTATIONS).exists()
-        names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
-        truth = _read_annotations(path / ANNOTATIONS, self.ego_motion, own, names) if annotated else {}
-        entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
-        self._list(entries, path, common)
-        self._truth = truth if common.ground_truth else {}
-        self.notes = (*rig_notes(self.rig, "an Argoverse 2 log"), *notes)
-
-    @property
-    def input_files(self) -> tuple[Path, ...]:
-        return tuple(sorted((*self.path.glob("*.feather"), *self.path.glob("calibration/*.feather"))))
-
-    @property
-    def class_counts(self) -> Mapping[str, int]:
-        return count_classes(self._truth.values())
-
-    def ground_truth_frame(self, place: int) -> Frame:
-        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
-        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
-
-    def _frame(self, place: int, entry: FrameEntry) -> Frame:
-        truth = self._truth.get(entry.stamp.timestamp_ns)
-        return read_frame(entry, self.rig, self._images, self.ego_motion, truth)
+    common.refuse_static(path)
+    rig = _read_rig(path / "calibration", own)
+    motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+    images = {name: _image_times(path / "sensors/cameras" / name) for name in rig.names}
+    annotated = (path / ANNOTATIONS).exists()
+    names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+    boxes = _read_annotations(path / ANNOTATIONS, motion, own, names) if annotated else {}
+    entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
+    times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
+    truth = {place: boxes[time] for place, time in enumerate(times) if time in boxes}
+    notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
+    files = ("*.feather", "calibration/*.feather")
+    return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
 
 
 def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:

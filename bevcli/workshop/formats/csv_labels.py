@@ -12,9 +12,9 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.csv_tables import CsvRow, name_of
+from bevcli.parsing.documents import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.workshop.formats.labels.label_format import LabelFormat, LabelledFrame, Labels, Moment
+from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels, Moment
 
 LARGEST_BYTES = 512 * MIB
 NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw")

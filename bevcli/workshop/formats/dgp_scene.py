@@ -1,21 +1,27 @@
-"""The JSON files of a DGP scene: its samples with images and point clouds, each with a pose, and calibrations."""
+"""A DGP scene as a Sequence: its samples with images and point clouds, each with a pose, calibrations, 3D boxes."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D, with_track_velocities
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import PoseTable
-from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
+from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.calibration_file import checked_camera
+from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
+from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.workshop.formats.dgp import CLASS_OF_CATEGORY
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
@@ -23,6 +29,10 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 PINHOLE = ("fx", "fy", "cx", "cy")
 BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 OTHER_LENSES = ("fisheye", "s1", "s2", "s3", "s4", "taux", "tauy", "alpha", "beta", "w", "xi", "equirectangular")
+TENFOLD = "the times of the scene are after the year 2116: they are taken as ten times too large, as in DDAD"
+BOXES_3D = "1"  # the number of 3D boxes among DGP's kinds of annotations
+SIZE = ("length", "width", "height")
+FileOf = Callable[["Record", str], Path]  # the file that a member of an object names
 
 
 class Record:
@@ -105,7 +115,7 @@ def read_record(path: Path) -> Record:
     return Record(read_json(path), str(path))
 
 
-def nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
+def _nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
     """The times since 1970 in ns, and whether they were divided by ten. Raises InputError beyond any year.
 
     DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
@@ -144,7 +154,7 @@ class Calibration:
         return checked_camera(Camera(name, *size, intrinsics, self.ego_from[name].matrix, distortion), lens.where)
 
 
-def read_calibration(path: Path) -> Calibration:
+def _read_calibration(path: Path) -> Calibration:
     """A file of the folder calibration. Raises InputError."""
     record = read_record(path)
     names, lenses, poses = record.texts("names"), record.records("intrinsics"), record.records("extrinsics")
@@ -195,8 +205,8 @@ class Sample:
         return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
 
 
-def read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
-    """The samples in order of time, and whether the times were divided by ten, see `nanoseconds`. Raises InputError.
+def _read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
+    """The samples in order of time, and whether the times were divided by ten, see `_nanoseconds`. Raises InputError.
 
     path: the folder of the scene. scene: the contents of its file.
     """
@@ -205,9 +215,9 @@ def read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
     if not samples:
         raise InputError(f"{scene.where}: has no samples (expected at least one)")
     owners = [*records.values(), *samples]
-    times, tenfold = nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
+    times, tenfold = _nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
     data = {key: _datum(record, time) for (key, record), time in zip(records.items(), times, strict=False)}
-    calibration_of = cache(lambda key: read_calibration(path / "calibration" / f"{key}.json"))
+    calibration_of = cache(lambda key: _read_calibration(path / "calibration" / f"{key}.json"))
     found = []
     for sample, time in zip(samples, times[len(records) :], strict=True):
         calibration = calibration_of(sample.text("calibration_key"))
@@ -245,7 +255,7 @@ def _datum(record: Record, time_ns: int) -> Datum | None:
     return Datum(record.record("id").text("name"), kind == "image", content, time_ns, pose)
 
 
-def poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
+def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
     """The poses at the times of all data; or only the one of each sample that is nearest to its time, at that time."""
     rows = []
     for sample in samples:
@@ -254,3 +264,97 @@ def poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
         rows += [(time, sample.ego_pose(datum)) for time, datum in data]
     times = np.array([time for time, _ in rows], dtype=np.int64)
     return times, np.stack([pose.translation for _, pose in rows]), np.stack([pose.quaternion for _, pose in rows])
+
+
+def open_scene(path: Path, common: SequenceOptions, own: FormatOptions) -> ListedSequence:
+    """The samples of a DGP scene. Point clouds are not read, only the boxes that are annotated in them.
+
+    The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.
+    """
+    common.refuse_static(path)
+    scene = read_record(_scene_file(path))
+    samples, tenfold = _read_samples(path, scene)
+    images = {name: image for sample in samples for name, image in sample.images().items()}
+    if not images:
+        raise InputError(f"{scene.where}: no sample has an image (expected at least one)")
+    rigs = tuple(sample.rig(images) for sample in samples)
+    file_of = partial(_file, path, allow_outside=common.allow_outside)
+    entries = tuple(_entry(path, index, sample, rigs[0], file_of) for index, sample in enumerate(samples))
+    motion = motion_of_keyframes(_poses(samples, keys=True), _poses(samples, keys=False))
+    truth = _read_truth(path, scene, samples, common.class_map, file_of) if common.ground_truth else {}
+    notes = (*bev_frame_notes(rigs[0], "a DGP scene"), *((TENFOLD,) if tenfold else ()))
+    files = ("scene_*.json", "calibration/*.json")
+    return ListedSequence(path, common, rigs, entries, motion, truth, notes, files)
+
+
+def _entry(path: Path, index: int, sample: Sample, rig: CameraRig, file_of: FileOf) -> FrameEntry:
+    sources = {
+        datum.sensor: ImageSource(file_of(datum.content, "filename"), datum.time_ns)
+        for datum in sample.data
+        if datum.is_image
+    }
+    dropped = {name: "no image in the sample" for name in rig.names if name not in sources}
+    return FrameEntry(FrameStamp(index, "", sample.time_ns), sources, dropped, str(path))
+
+
+def _file(path: Path, record: Record, member: str, *, allow_outside: bool) -> Path:
+    """The file that a member names. Raises InputError if it leads out of the scene."""
+    name = record.text(member)
+    file = path / PurePosixPath(name)
+    if not allow_outside and leads_out(file, path):
+        where = f"{record.where}: {name:.100}"
+        raise InputError(f"{where}: leads out of the folder: pass `allow_outside=True` to read it")
+    return file
+
+
+def _read_truth(
+    path: Path, scene: Record, samples: Iterable[Sample], class_map: Mapping[str, str], file_of: FileOf
+) -> dict[int, Boxes3D]:
+    """The boxes in the world frame of each sample that has a point cloud with boxes."""
+    found, times = {}, []
+    classes: dict[int, str] | None = None
+    for place, sample in enumerate(samples):
+        for cloud in (datum for datum in sample.data if not datum.is_image):
+            annotations = cloud.content.record("annotations")
+            if BOXES_3D in annotations.value:
+                classes = _read_ontology(path, scene, class_map) if classes is None else classes
+                boxes_file = file_of(annotations, BOXES_3D)
+                found[place] = _read_boxes(boxes_file, cloud.world_from_sensor.matrix, classes)
+                times.append(sample.time_ns)
+                break
+    return dict(zip(found, with_track_velocities(list(found.values()), times), strict=True))
+
+
+def _scene_file(path: Path) -> Path:
+    files = sorted(path.glob("scene_*.json"))
+    if len(files) == 1:
+        return files[0]
+    found = ", ".join(file.name for file in files[:4]) or "none"
+    raise InputError(f"{path}: expected one file scene_*.json, found {found}")
+
+
+def _read_ontology(folder: Path, scene: Record, class_map: Mapping[str, str]) -> dict[int, str]:
+    """The class of each `class_id` of 3D boxes. Raises InputError. folder: of the scene."""
+    names = ClassNames.of_format(CLASS_OF_CATEGORY, class_map)
+    items = read_record(folder / "ontology" / f"{scene.record('ontologies').text(BOXES_3D)}.json").records("items")
+    return {item.integer("id", 0): names[item.text("name")] for item in items}
+
+
+def _read_boxes(path: Path, world_from_sensor: Array, classes: Mapping[int, str]) -> Boxes3D:
+    """The boxes of a sensor in the world frame, without velocities. Raises InputError."""
+    records = read_record(path).records("annotations")
+    if not records:
+        return Boxes3D.empty()
+    boxes = [record.record("box") for record in records]
+    world_from_box = [world_from_sensor @ box.record("pose").pose().matrix for box in boxes]
+    ids = [record.integer("class_id", 0) for record in records]
+    things = [record.integer("instance_id", 0) for record in records]  # 0 is that of a box without one
+    return Boxes3D(
+        np.stack([pose[:3, 3] for pose in world_from_box]),
+        np.stack([box.numbers(SIZE) for box in boxes]),
+        np.array([yaw_of_rotation(pose[:3, :3]) for pose in world_from_box]),
+        np.full((len(boxes), 2), np.nan),
+        np.array([classes.get(number, f"class {number}") for number in ids], dtype=np.str_),
+        instances=np.array([str(one or "") for one in things], dtype=np.str_),
+        num_points=np.array([record.integer("num_points", 0) for record in records], dtype=np.int64),
+    )

@@ -1,24 +1,89 @@
-"""A drive with the ground truth of a file of labels."""
+"""LabelFormat: a format of labels, registered under `bevcli.label_formats`; a drive with the boxes of such a file."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence as Items
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence as Items
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, with_track_velocities
+from bevcli.geometry.cameras import CameraRig
 from bevcli.printing import counted
+from bevcli.registry import entries, load
 from bevcli.sequences.files.class_names import count_classes
+from bevcli.sequences.open import scenes_of
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
-from bevcli.sequences.selection import scenes_of
-from bevcli.sequences.tracks import with_track_velocities
-from bevcli.workshop.formats.labels.label_format import LabelledFrame, Labels, read_labels
 
+GROUP = "bevcli.label_formats"
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
+FrameOfReference = Literal["world", "ego", "bev"]
+Moment = tuple[int | None, int | None]  # index and time of a frame, ns, as in LabelledFrame
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """The boxes of one frame.
+
+    Attributes:
+        index: of the frame; None if the file has times only.
+        timestamp_ns: of the frame; None if the file has indices only.
+        boxes: in the frame of reference of the file.
+    """
+
+    index: int | None
+    timestamp_ns: int | None
+    boxes: Boxes3D
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The contents of a file of labels.
+
+    Attributes:
+        frame_of_reference: of all boxes.
+        frames: in the order of the file.
+        lists_empty: frames without boxes are in the file, too. If not, a frame of the drive that the file does not
+            have may be empty or not labelled.
+        notes: what was assumed, for the user.
+    """
+
+    frame_of_reference: FrameOfReference
+    frames: tuple[LabelledFrame, ...]
+    lists_empty: bool
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LabelFormat:
+    """A format of labels.
+
+    Attributes:
+        name: with an article, for messages.
+        recognises: whether a file has this format; looks at its name, or at a few bytes.
+        read: reads a file of a drive with this rig. Raises InputError.
+    """
+
+    name: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, CameraRig, LabelOptions], Labels]
+
+
+def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
+    """The labels of a file of any known format. rig: of the drive. Raises InputError."""
+    known: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
+    found = next((one for one in known if one.recognises(path)), None)
+    if found is None:
+        raise InputError(f"{path}: is no file of labels (expected {' or '.join(one.name for one in known)})")
+    labels = found.read(path, rig, options)
+    frames = tuple(replace(each, boxes=each.boxes.possible()) for each in labels.frames)
+    left_out = sum(len(each.boxes) for each in labels.frames) - sum(len(each.boxes) for each in frames)
+    note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
+    return replace(labels, frames=frames, notes=(*labels.notes, *note))
 
 
 class WithLabels(DerivedSequence):
