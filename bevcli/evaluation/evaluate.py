@@ -135,22 +135,22 @@ def evaluate(
         ConfigError: max_range is not positive.
         TypeError: `results` has an option that no scorer has.
     """
-    found = open_predictions(Path(predictions), class_map)
-    classes = found.boxes.classes or NUSCENES_CLASSES
+    predicted = open_predictions(Path(predictions), class_map)
+    classes = predicted.boxes.classes or NUSCENES_CLASSES
     truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
-    pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
+    pairs = pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    model_range = _model_range_m(found, pairs, classes) if max_range is None else None
+    model_range = _model_range_m(predicted, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    predicted, true = pairs.boxes
-    detection = evaluate_detections(_with_attributes(predicted, classes), true, config, pairs.ego_xy)
-    segmentation, map_notes = _score_maps(found, truth, pairs)
-    others = score_results(results, Compared(pairs, classes, limit, found, truth))
+    predicted_boxes, true_boxes = pairs.boxes
+    detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
+    segmentation, map_notes = _score_maps(predicted, truth, pairs)
+    others = score_results(results, Compared(pairs, classes, limit, predicted, truth))
     notes = (
         *pairs.notes,
         *map_notes,
-        *_class_notes(predicted, true, classes),
+        *_class_notes(predicted_boxes, true_boxes, classes),
         *_range_notes(max_range, model_range, pairs),
         *_detection_notes(detection),
         *(note for scores in others.values() for note in scores.notes),
@@ -180,32 +180,32 @@ def _score_maps(
     predictions: ScoredInput, ground_truth: ScoredInput, pairs: FramePairs
 ) -> tuple[SegmentationScores | None, list[str]]:
     """The scores of the maps, and notes about frames that were left out."""
-    found, true = predictions.maps, ground_truth.maps
-    if found is None or true is None:
-        missing = "predictions" if found is None else "ground truth"
-        return None, [f"maps are not scored: the {missing} have none"] if found or true else []
+    predicted, true = predictions.maps, ground_truth.maps
+    if predicted is None or true is None:
+        missing = "predictions" if predicted is None else "ground truth"
+        return None, [f"maps are not scored: the {missing} have none"] if predicted or true else []
     indices = [
-        (one.stamp.index, other.stamp.index)
-        for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)
-        if found.has(one.stamp.index) and true.has(other.stamp.index)
+        (prediction.stamp.index, truth.stamp.index)
+        for prediction, truth in zip(pairs.predictions, pairs.ground_truth, strict=True)
+        if predicted.has(prediction.stamp.index) and true.has(truth.stamp.index)
     ]
     left_out = len(pairs.predictions) - len(indices)
     notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
-    classes = [name for name in true.classes if name in found.classes]
+    classes = [name for name in true.classes if name in predicted.classes]
     if not classes:
-        kinds = f"predictions {', '.join(found.classes)}; ground truth {', '.join(true.classes)}"
+        kinds = f"predictions {', '.join(predicted.classes)}; ground truth {', '.join(true.classes)}"
         return None, [f"maps are not scored: they have no class in common ({kinds})"]
-    unscored = [name for name in (*found.classes, *true.classes) if name not in classes]
+    unscored = [name for name in (*predicted.classes, *true.classes) if name not in classes]
     if unscored:
         notes.append(f"map classes on one side only, not scored: {', '.join(unscored)}")
-    maps = ((found.load(one), true.load(other)) for one, other in indices)
+    maps = ((predicted.load(prediction), true.load(truth)) for prediction, truth in indices)
     return evaluate_segmentation(maps, classes), notes
 
 
 def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
     stated = predictions.boxes.extras.get("range_m")
-    farthest = max(one.range_m for one in classes.values())
+    farthest = max(kind.range_m for kind in classes.values())
     if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
         return None
     return float(stated)
@@ -260,7 +260,7 @@ def _content(scores: FrameScores) -> dict[str, Any]:
                 "recall": table.mean_recall,
                 "ground_truth_boxes": table.ground_truth_count,
                 "found_boxes": table.prediction_count,
-                "label_recalls": {name: one.recall for name, one in table.classes.items()},
+                "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
             }
             for (low, high), table in detection.by_visibility.items()
         ],
@@ -323,8 +323,8 @@ def _ranges(detection: DetectionScores) -> str:
     bins = detection.by_range
     rows = [("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins))]
     for name in detection.overall.classes:
-        found = [table.classes.get(name) for table in bins.values()]
-        rows.append((name, *(number(scores.mean_ap) if scores else "-" for scores in found)))
+        of_bins = [table.classes.get(name) for table in bins.values()]
+        rows.append((name, *(number(scores.mean_ap) if scores else "-" for scores in of_bins)))
     rows.append(("mAP", *(number(table.mean_ap) for table in bins.values())))
     rows.append(("NDS", *(number(table.nd_score) for table in bins.values())))
     return aligned(rows)

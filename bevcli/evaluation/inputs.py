@@ -78,7 +78,7 @@ def open_ground_truth(
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
-    if path.is_dir() and any(one.annotated and one.recognises(path) for one in formats()):
+    if path.is_dir() and any(kind.annotated and kind.recognises(path) for kind in formats()):
         return _open_drive(path, SequenceOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, class_map, classes)
@@ -115,15 +115,15 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     drive = open_sequence(path, options)
-    found, impossible = [], 0
+    frames, impossible = [], 0
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if frame.ground_truth is not None:
             token = {"sample_token": frame.sample_token} if frame.sample_token else {}
-            found.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
+            frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
             impossible += frame.impossible_boxes
-    if not found:
+    if not frames:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
-    return ScoredInput(BoxesFile("world", tuple(found)), path, None, lambda: drive, impossible_boxes=impossible)
+    return ScoredInput(BoxesFile("world", tuple(frames)), path, None, lambda: drive, impossible_boxes=impossible)
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,9 @@ def _common_frames(
         if _ambiguous(of_truth) or _ambiguous(of_predictions):
             continue
         truth = dict(zip(of_truth, ground_truth, strict=True))
-        pairs = [(one, truth[k]) for one, k in zip(predictions, of_predictions, strict=True) if k in truth]
+        pairs = [
+            (prediction, truth[k]) for prediction, k in zip(predictions, of_predictions, strict=True) if k in truth
+        ]
         if pairs:
             return name, pairs
     raise InputError(
@@ -233,11 +235,11 @@ def _described(frame: FrameBoxes) -> str:
     return f'scene "{frame.stamp.scene}" frame {frame.stamp.index} at {frame.stamp.timestamp_ns} ns'
 
 
-def _common_frame_of_reference(one: BoxesFile, other: BoxesFile) -> str:
-    references = {one.frame_of_reference, other.frame_of_reference}
+def _common_frame_of_reference(predictions: BoxesFile, ground_truth: BoxesFile) -> str:
+    references = {predictions.frame_of_reference, ground_truth.frame_of_reference}
     if "world" in references:
         return "world"
-    return "bev" if references == {"bev"} and not (one.ego_from_bev and other.ego_from_bev) else "ego"
+    return "bev" if references == {"bev"} and not (predictions.ego_from_bev and ground_truth.ego_from_bev) else "ego"
 
 
 def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> FrameBoxes:
@@ -293,8 +295,8 @@ def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes
     assert pairs.frame_of_reference == "world"
     tokens = [frame.extras.get("sample_token", "") for frame in pairs.ground_truth]
     racks = [bicycle_racks.get(token, Boxes3D.empty()) for token in tokens]
-    found, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
-    return replace(pairs, predictions=found, ground_truth=true)
+    predicted, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
+    return replace(pairs, predictions=predicted, ground_truth=true)
 
 
 def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:

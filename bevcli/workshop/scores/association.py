@@ -63,14 +63,14 @@ def scored_tracks(
     Returns boxes whose `frames` are places in the order of `time_order`. Raises InputError if a frame has one identity
     twice.
     """
-    places = time_order(stamps)
-    given = gather([frames[place] for place in places], ego_xy[places])
+    order = time_order(stamps)
+    given = gather([frames[index] for index in order], ego_xy[order])
     instances = given.column("instances")
     limits = np.array([ranges_m.get(name, -1.0) for name in given.boxes.classes.tolist()])
     kept = (given.ranges_m < limits) & (given.boxes.num_points != 0) & (instances != "")
     rows, names = given.frames[kept], instances[kept]
-    scores = np.concatenate([_scores(frames[place]) for place in places])[kept]
-    ordered = [stamps[place] for place in places]
+    scores = np.concatenate([_scores(frames[index]) for index in order])[kept]
+    ordered = [stamps[index] for index in order]
     _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)
     _, name_numbers = np.unique(names, return_inverse=True)
     keys = scenes[rows] * (len(names) + 1) + name_numbers
@@ -96,7 +96,7 @@ def _means_of_tracks(tracks: Indices, scores: Array) -> Array:
 def time_order(stamps: Sequence[FrameStamp]) -> list[int]:
     """The places of frames ordered by scene (in the order of first appearance), then by time."""
     order = {scene: number for number, scene in enumerate(dict.fromkeys(stamp.scene for stamp in stamps))}
-    return sorted(range(len(stamps)), key=lambda place: (order[stamps[place].scene], stamps[place].timestamp_ns))
+    return sorted(range(len(stamps)), key=lambda index: (order[stamps[index].scene], stamps[index].timestamp_ns))
 
 
 def _scores(boxes: Boxes3D) -> Array:
@@ -192,15 +192,15 @@ def associate(truth: TrackedBoxes, predictions: TrackedBoxes, pairs: Pairs, thre
     rows = list(zip(truths.tolist(), candidates.tolist(), distances.tolist(), strict=True))
     objects, tracks = truth.tracks.tolist(), predictions.tracks.tolist()
     kinds, partners = np.zeros(len(truth), np.int8), np.full(len(truth), -1)
-    found = np.full(len(truth), np.nan)
+    matched_m = np.full(len(truth), np.nan)
     memory: dict[int, int] = {}  # object -> the track that it was matched to last; objects differ between scenes
     for start, end in pairwise([*starts.tolist(), len(truths)]):
         for g, p, distance in _matches(rows[start:end], objects, tracks, memory):
             known = memory.get(objects[g], tracks[p])
             kinds[g] = MATCH if known == tracks[p] else SWITCH
-            partners[g], found[g] = p, distance
+            partners[g], matched_m[g] = p, distance
             memory[objects[g]] = tracks[p]
-    return Association(kinds, partners, found)
+    return Association(kinds, partners, matched_m)
 
 
 def _matches(pairs: list[Pair], objects: list[int], tracks: list[int], memory: dict[int, int]) -> list[Pair]:
@@ -223,7 +223,7 @@ def _assignment(pairs: list[Pair]) -> list[Pair]:
     most = sum(pair[2] for pair in pairs) + 1.0  # one more pair is always worth more than shorter distances
     cost = np.full((len(rows), len(columns)), most)
     chosen = {(rows[pair[0]], columns[pair[1]]): pair for pair in pairs}
-    for place, (_, _, distance) in chosen.items():
-        cost[place] = distance
-    found = zip(*(indices.tolist() for indices in linear_sum_assignment(cost)), strict=True)
-    return [chosen[place] for place in found if place in chosen]
+    for cell, (_, _, distance) in chosen.items():
+        cost[cell] = distance
+    cells = zip(*(indices.tolist() for indices in linear_sum_assignment(cost)), strict=True)
+    return [chosen[cell] for cell in cells if cell in chosen]

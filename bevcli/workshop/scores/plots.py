@@ -158,11 +158,11 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     radius = _radius(detection)
     missed = {name: outcome.missed for name, outcome in outcomes.items()}
     false = {name: outcome.false for name, outcome in outcomes.items()}
-    for place, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
-        axes = figure.add_subplot(grid[0, place * WORST_FRAMES : (place + 1) * WORST_FRAMES])
+    for column, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
+        axes = figure.add_subplot(grid[0, column * WORST_FRAMES : (column + 1) * WORST_FRAMES])
         _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
-    for place, frame in enumerate(_worst_frames(outcomes.values())):
-        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes.values(), pairs, radius)
+    for column, frame in enumerate(_worst_frames(outcomes.values())):
+        _draw_frame(figure.add_subplot(grid[1, 2 * column : 2 * column + 2]), frame, outcomes.values(), pairs, radius)
     heading = {"title": "class: missed / false positives", "title_fontsize": 9}
     handles = _legend(missed, false)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
@@ -174,10 +174,10 @@ def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
     is_match = matches.matched[row] >= 0
     f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
     kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
-    found = np.zeros(len(matches.ground_truth), dtype=bool)
-    found[matches.matched[row][kept & is_match]] = True
+    is_found = np.zeros(len(matches.ground_truth), dtype=bool)
+    is_found[matches.matched[row][kept & is_match]] = True
     truth = matches.ground_truth
-    return _Outcome(truth[found], truth[~found], matches.predictions[kept & ~is_match])
+    return _Outcome(truth[is_found], truth[~is_found], matches.predictions[kept & ~is_match])
 
 
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
@@ -215,7 +215,7 @@ def _draw_dots(
     # A random subset in random order, so that no class hides another.
     shown = np.random.default_rng(0).permutation(len(points))[:MAX_DOTS]
     x, y = points[shown].T
-    axes.scatter(x, y, s=16, c=[colors[place] for place in shown], alpha=0.8, linewidths=0, zorder=3)
+    axes.scatter(x, y, s=16, c=[colors[index] for index in shown], alpha=0.8, linewidths=0, zorder=3)
     _draw_ground(axes, radius)
     thinned = f", {MAX_DOTS} shown" if len(points) > MAX_DOTS else ""
     axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)

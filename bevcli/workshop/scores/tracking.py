@@ -117,8 +117,8 @@ def score_class(truth: TrackedBoxes, predictions: TrackedBoxes, config: Tracking
     thresholds = np.interp(recalls, np.arange(1, len(scores) + 1) / len(truth), scores, right=np.nan)[::-1]
     levels["confidence"], levels["recall_hypo"] = thresholds, recalls[::-1]
     for threshold in np.unique(thresholds[~np.isnan(thresholds)]):
-        found = metrics_at(truth, predictions, associate(truth, predictions, pairs, threshold), threshold, config)
-        for name, value in found.items():
+        metrics = metrics_at(truth, predictions, associate(truth, predictions, pairs, threshold), threshold, config)
+        for name, value in metrics.items():
             levels[name][thresholds == threshold] = value
     return ClassTracking(_overall(truth, levels), levels)
 
@@ -168,15 +168,15 @@ def _over_objects(
     hit, frames = matched[order], np.searchsorted(counted, truth.frames[order])
     hits = np.add.reduceat(hit, starts, dtype=np.int64)
     share = hits / lengths
-    places = np.flatnonzero(hit)
-    owners = np.repeat(np.arange(len(starts)), lengths)[places]  # the object of each match
+    matches = np.flatnonzero(hit)
+    owners = np.repeat(np.arange(len(starts)), lengths)[matches]  # the object of each match
     seen = hits > 0
     after = np.cumsum(hits)  # of the places of each object's matches, the one after the last
-    first_hit, last_hit = places[(after - hits)[seen]], places[after[seen] - 1]
+    first_hit, last_hit = matches[(after - hits)[seen]], matches[after[seen] - 1]
     waits = frames[first_hit] - frames[starts[seen]]
     gaps = np.maximum(waits, frames[ends[seen] - 1] - frames[last_hit])
     same = owners[1:] == owners[:-1]
-    between = (frames[places[1:]] - frames[places[:-1]] - 1)[same]
+    between = (frames[matches[1:]] - frames[matches[:-1]] - 1)[same]
     longest = np.zeros(len(starts), dtype=np.int64)
     np.maximum.at(longest, owners[1:][same], between)
     gaps = np.maximum(gaps, longest[seen])
@@ -184,7 +184,7 @@ def _over_objects(
     return {
         "mt": int((share >= config.mostly_tracked).sum()),
         "ml": int((share < config.mostly_lost).sum()),
-        "frag": int((np.diff(places)[same] > 1).sum()),
+        "frag": int((np.diff(matches)[same] > 1).sum()),
         "tid": period * float(waits.mean()) if seen.any() else np.nan,
         "lgd": period * float(gaps.mean()) if seen.any() else np.nan,
     }
@@ -316,10 +316,10 @@ def evaluate_tracking(
     config = TrackingConfig() if config is None else config
     _require_identities(predictions, ground_truth, stamps, tuple(config.class_ranges_m))
     ego_xy = np.zeros((len(stamps), 2)) if ego_xy is None else ego_xy
-    found = scored_tracks(predictions, stamps, ego_xy, config.class_ranges_m, "predictions")
+    predicted = scored_tracks(predictions, stamps, ego_xy, config.class_ranges_m, "predictions")
     true = scored_tracks(ground_truth, stamps, ego_xy, config.class_ranges_m, "ground truth")
     classes = {
-        name: score_class(true[true.classes == name], found[found.classes == name], config)
+        name: score_class(true[true.classes == name], predicted[predicted.classes == name], config)
         for name in config.class_ranges_m
     }
     return TrackingScores(classes, config, len({stamp.scene for stamp in stamps}), len(stamps))

@@ -75,20 +75,22 @@ def evaluate_lines(pairs: Sequence[tuple[MapLines, MapLines]], classes: Sequence
     """Score pairs of lines (predictions with scores, truth), one pair a frame, both in the same frame of reference."""
     ap, counts = {}, {}
     for name in classes:
-        frames = [(_curves(found, name), _scores(found, name), _curves(true, name)) for found, true in pairs]
+        frames = [
+            (_curves(predicted, name), _scores(predicted, name), _curves(true, name)) for predicted, true in pairs
+        ]
         counts[name] = sum(len(true) for _, _, true in frames)
-        scored = [(scores, similarity(found, true)) for found, scores, true in frames]
+        scored = [(scores, similarity(predicted, true)) for predicted, scores, true in frames]
         ap[name] = {limit: _average_precision(scored, limit, counts[name]) for limit in THRESHOLDS_M}
     return LineScores(ap, counts, len(pairs))
 
 
-def similarity(found: Sequence[_Curve], true: Sequence[_Curve]) -> Array:
+def similarity(predicted: Sequence[_Curve], true: Sequence[_Curve]) -> Array:
     """(F, T) minus the Chamfer distance of each pair, metres; NO_MATCH where their surroundings do not meet."""
-    result = np.full((len(found), len(true)), NO_MATCH)
-    for row, one in enumerate(found):
+    result = np.full((len(predicted), len(true)), NO_MATCH)
+    for row, curve in enumerate(predicted):
         for column, other in enumerate(true):
-            if one.surroundings.intersects(other.surroundings):
-                distance = np.linalg.norm(one.samples[:, None] - other.samples, axis=-1)
+            if curve.surroundings.intersects(other.surroundings):
+                distance = np.linalg.norm(curve.samples[:, None] - other.samples, axis=-1)
                 result[row, column] = -(distance.min(1).mean() + distance.min(0).mean()) / 2
     return result
 
@@ -113,10 +115,10 @@ def true_positives(scores: Array, similarities: Array, limit: float) -> NDArray[
     hits, taken = np.zeros(len(scores), dtype=bool), set[int]()
     if not similarities.shape[1]:
         return hits
-    for place in np.argsort(-scores, kind="stable"):
-        best = int(similarities[place].argmax())
-        hits[place] = similarities[place, best] >= -limit and best not in taken
-        if hits[place]:
+    for index in np.argsort(-scores, kind="stable"):
+        best = int(similarities[index].argmax())
+        hits[index] = similarities[index, best] >= -limit and best not in taken
+        if hits[index]:
             taken.add(best)
     return hits
 
@@ -185,15 +187,15 @@ def evaluate_motion(pairs: Iterable[tuple[Boxes3D, Boxes3D]]) -> dict[str, Motio
     """
     sums = {name: MotionSums() for name in CLASSES}
     for predictions, truth in pairs:
-        found = predictions.scored(MIN_SCORE)
-        _count(found, truth, match(found, truth), sums)
+        predicted = predictions.scored(MIN_SCORE)
+        _count(predicted, truth, match(predicted, truth), sums)
     return sums
 
 
-def match(found: Boxes3D, truth: Boxes3D) -> NDArray[np.int64]:
+def match(predicted: Boxes3D, truth: Boxes3D) -> NDArray[np.int64]:
     """(T,) index of the detection of each true object, -1 for none: the smallest sum of distances, in x and y."""
-    distance = np.linalg.norm(found.centers[:, None, :2] - truth.centers[:, :2], axis=-1)
-    distance[~_moves(found)] = UNMATCHABLE
+    distance = np.linalg.norm(predicted.centers[:, None, :2] - truth.centers[:, :2], axis=-1)
+    distance[~_moves(predicted)] = UNMATCHABLE
     distance[:, ~_moves(truth)] = UNMATCHABLE
     distance[distance > MATCH_M] = UNMATCHABLE
     result = np.full(len(truth), -1)
@@ -207,22 +209,22 @@ def _moves(boxes: Boxes3D) -> NDArray[np.bool_]:
     return np.isin(boxes.classes, list(SCORED_AS))
 
 
-def _count(found: Boxes3D, truth: Boxes3D, matches: NDArray[np.int64], sums: Mapping[str, MotionSums]) -> None:
-    for place, name in enumerate(found.classes):
+def _count(predicted: Boxes3D, truth: Boxes3D, matches: NDArray[np.int64], sums: Mapping[str, MotionSums]) -> None:
+    for index, name in enumerate(predicted.classes):
         of_class = sums.get(SCORED_AS.get(str(name), ""))
-        if of_class is not None and place not in matches:
+        if of_class is not None and index not in matches:
             of_class.false_positives += 1
-    for place, name in enumerate(truth.classes):
+    for index, name in enumerate(truth.classes):
         of_class = sums.get(SCORED_AS.get(str(name), ""))
         if of_class is None:
             continue
         assert truth.futures is not None
-        way = truth.futures[place, 0, :, 1:]  # (T, 2)
+        way = truth.futures[index, 0, :, 1:]  # (T, 2)
         known = int(np.isfinite(way).all(-1).sum())
         of_class.truths += known == len(way)
-        if matches[place] >= 0 and known:
-            assert found.futures is not None
-            _add(of_class, found.futures[matches[place], ..., 1:], way, known)
+        if matches[index] >= 0 and known:
+            assert predicted.futures is not None
+            _add(of_class, predicted.futures[matches[index], ..., 1:], way, known)
 
 
 def _add(sums: MotionSums, modes: np.ndarray, way: np.ndarray, known: int) -> None:

@@ -71,11 +71,11 @@ def with_true_futures(boxes: Boxes3D, stamp: FrameStamp, drives: Drives, times_s
         frame = drives.after(stamp, seconds)
         later = Boxes3D.empty() if frame is None else frame.boxes
         names = () if later.instances is None else later.instances
-        row_of = {name: row for row, name in enumerate(names) if name}
-        for place, name in enumerate(() if boxes.instances is None else boxes.instances):
-            alive[place] &= name in row_of
-            if alive[place]:
-                places[place, 0, step] = later.centers[row_of[name], :2]
+        row_of = {name: index for index, name in enumerate(names) if name}
+        for row, name in enumerate(() if boxes.instances is None else boxes.instances):
+            alive[row] &= name in row_of
+            if alive[row]:
+                places[row, 0, step] = later.centers[row_of[name], :2]
     seconds = np.broadcast_to(np.asarray(times_s)[:, None], (*places.shape[:3], 1))
     return replace(boxes, futures=np.concatenate([seconds, places], axis=-1))
 
@@ -145,12 +145,12 @@ def _horizons(plan: PlanScores, of: Callable[[Any, float], float], collisions: A
 
 def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> DrivingScores:
     """Score what the options ask for: the function of a `Scorer`. Raises InputError where a side lacks it."""
-    found, truth, pairs = compared.predictions, compared.truth, compared.pairs
-    assert found is not None
+    predicted, truth, pairs = compared.predictions, compared.truth, compared.pairs
+    assert predicted is not None
     assert truth is not None
-    lines = _lines(found.path.with_name(MapLines.file_name), truth, pairs) if options.map else None
-    motion = _motion(found, truth, pairs) if options.motion else None
-    plan, notes = _plan(found.path.with_name(Plan.file_name), truth, pairs) if options.plan else (None, ())
+    lines = _lines(predicted.path.with_name(MapLines.file_name), truth, pairs) if options.map else None
+    motion = _motion(predicted, truth, pairs) if options.motion else None
+    plan, notes = _plan(predicted.path.with_name(Plan.file_name), truth, pairs) if options.plan else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 
@@ -167,15 +167,15 @@ def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
 
 
 def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
-    found, true = read_lines(file), _true_lines(truth)
-    if found.frame_of_reference != true.frame_of_reference:
+    predicted, true = read_lines(file), _true_lines(truth)
+    if predicted.frame_of_reference != true.frame_of_reference:
         raise InputError(
-            f"`map`: predicted lines are in the {found.frame_of_reference} frame, true ones in the "
+            f"`map`: predicted lines are in the {predicted.frame_of_reference} frame, true ones in the "
             f"{true.frame_of_reference} frame (expected the same)"
         )
-    found_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (found, true))
+    predicted_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (predicted, true))
     stamps = [(one.stamp, other.stamp) for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)]
-    lines = [(found_of[one], true_of[other]) for one, other in stamps if one in found_of and other in true_of]
+    lines = [(predicted_of[one], true_of[other]) for one, other in stamps if one in predicted_of and other in true_of]
     if not lines:
         raise InputError("`map`: no frame has both predicted and true lines")
     return evaluate_lines(lines, true.classes)
@@ -202,10 +202,10 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
     return LinesFile("world", LINE_CLASSES, tuple(frames))
 
 
-def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
+def _motion(predicted: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
     """The scores of forecasts of the objects whose centre is in the area that the model sees."""
     drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
-    ranges = [found.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
+    ranges = [predicted.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
     low, high = np.array(ranges, dtype=np.float64).T
 
     def inside(boxes: Boxes3D, bev_from_world: Array) -> Boxes3D:
