@@ -54,8 +54,7 @@ WINGS: dict[str, set[str]] = {
 # What in the core still imports the workshop.
 LEFT = {
     "bevcli.cli.progress", "bevcli.cli.project_debug", "bevcli.cli.run", "bevcli.cli.weights",
-    "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
-    "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
+    "bevcli.inference.load", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.runs.run_into_folder",
 }  # fmt: skip
 WORKSHOP = "bevcli.workshop."

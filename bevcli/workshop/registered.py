@@ -16,6 +16,23 @@ OWN: dict[Group, dict[str, str]] = {
         "native/ground_truth_lines.json": "bevcli.workshop.vad.map_lines:TrueLines",
         "nuscenes/maps/expansion": "bevcli.workshop.vad.true_lines:MapExpansion",
     },
+    "bevcli.model_uses": {
+        "clip_steps BEVFormer": "bevcli.workshop.training.clip_steps:RecurrentSteps",
+        "clip_steps BEVFormerV2": "bevcli.workshop.training.clip_steps:WindowSteps",
+        "constant_parts UniAD": "bevcli.workshop.uniad.uniad:fix_nothing",
+        "constant_parts VAD": "bevcli.workshop.vad.vad:fix_first_attentions",
+        "export_form BEVFormer": "bevcli.workshop.engines.export_form:RecurrentForm",
+        "export_form BEVFormerV2": "bevcli.workshop.engines.window_export:window_form",
+        "export_form UniAD": "bevcli.workshop.uniad.uniad:refuse_export",
+        "export_form VAD": "bevcli.workshop.vad.export_form:VADForm",
+        "training_heads VAD": "bevcli.workshop.vad.losses:HEADS",
+        "operations BEVFormer": "bevcli.workshop.benchmark.limits:run_recurrent_frame",
+        "operations BEVFormerV2": "bevcli.workshop.benchmark.window_frames:run_window",
+        "operations UniAD": "bevcli.workshop.uniad.uniad:run_map_head",
+        "part_names UniAD": "bevcli.workshop.uniad.uniad:PART_NAMES",
+        "part_names VAD": "bevcli.workshop.vad.vad:PART_NAMES",
+        "past BEVFormerV2": "bevcli.workshop.benchmark.window_frames:with_past",
+    },
     "bevcli.sequences": {
         "argoverse2": "bevcli.workshop.formats.argoverse2:FORMAT",
         "dgp": "bevcli.workshop.formats.dgp:FORMAT",
@@ -42,9 +59,6 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.plots": {
         "scores": "bevcli.workshop.scores.plots:write_plots",
-    },
-    "bevcli.training_heads": {
-        "VAD": "bevcli.workshop.vad.losses:HEADS",
     },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -83,8 +83,8 @@ def reproduce(
         raise InputError(f"{options.data}: no scene could be scored: {why}")
     metrics = json.loads((out / METRICS).read_text())
     comparison = compare_with_published(metrics, named.source.published)
-    say(json.dumps(comparison.to_dict(), indent=1) if as_json else comparison.table())
-    for note in comparison.notes:
+    say(json.dumps(comparison, indent=1) if as_json else table_of(comparison["scores"]))
+    for note in comparison["notes"]:
         say(f"note: {note}", err=True)
     if summary.failed:
         say(f"{summary.failed} scenes failed and are not in the scores; `--resume` runs them again", err=True)
@@ -109,47 +109,15 @@ def _get(named: "NamedWeights", model: ModelOptions) -> None:
     fetch_with_bar(named)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Scores next to the published ones.
-
-    Attributes:
-        frames: number of frames that were scored.
-        scores: by name: "name", "ours", "published" and "difference", each None if not measured or not published.
-        notes: why the numbers may differ.
-    """
-
-    frames: int
-    scores: Mapping[str, Mapping[str, Any]]
-    notes: tuple[str, ...]
-
-    def table(self) -> str:
-        """The scores as text for a terminal."""
-        rows = [f"{'score':9} {'ours':>7} {'published':>10} {'difference':>11}"]
-        for name, score in self.scores.items():
-            unit = SCORES[name][1] if name in SCORES else "%"
-            ours, published, difference = (
-                _number(score[key], unit, sign) for key, sign in (("ours", ""), ("published", ""), ("difference", "+"))
-            )
-            rows.append(f"{f'{name} {unit}'.strip():9} {ours:>7} {published:>10} {difference:>11}")
-        return "\n".join(rows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"frames": self.frames, "scores": self.scores, "notes": list(self.notes)}
-
-
-def _number(value: float | None, unit: str, sign: str) -> str:
-    scale, digits = (100, 1) if unit == "%" else (1, 3)
-    return "–" if value is None else f"{scale * value:{sign}.{digits}f}"
-
-
-def compare_with_published(metrics: Mapping[str, Any], published: Mapping[str, float]) -> Comparison:
-    """Scores of a split next to the published ones.
+def compare_with_published(metrics: Mapping[str, Any], published: Mapping[str, float]) -> dict[str, Any]:
+    """Scores of a split next to the published ones, for JSON.
 
     Args:
         metrics: of `joint_metrics`; all ten classes count, as in the published scores.
         published: by the names of SCORES; further names cannot be measured here.
+
+    Returns "frames", the number of frames that were scored; "scores", by name: "name", "ours", "published" and
+    "difference", each None if not measured or not published; and "notes", why the numbers may differ.
     """
     ours = {**metrics["tp_errors"], **{key: metrics[key] for key in ("nd_score", "mean_ap")}}
     others = [name for name in published if name not in SCORES]
@@ -163,9 +131,26 @@ def compare_with_published(metrics: Mapping[str, Any], published: Mapping[str, f
         )
     if others:
         notes.append(f"{', '.join(others)}: not measured here; `bevcli eval --tracking` scores tracks")
-    return Comparison(metrics["frames"], scores, tuple(notes))
+    return {"frames": metrics["frames"], "scores": scores, "notes": notes}
 
 
 def _pair(name: str, ours: float | None, published: float | None) -> dict[str, Any]:
     difference = None if ours is None or published is None else ours - published
     return {"name": name, "ours": ours, "published": published, "difference": difference}
+
+
+def table_of(scores: Mapping[str, Mapping[str, Any]]) -> str:
+    """The scores of `compare_with_published` as text for a terminal."""
+    rows = [f"{'score':9} {'ours':>7} {'published':>10} {'difference':>11}"]
+    for name, score in scores.items():
+        unit = SCORES[name][1] if name in SCORES else "%"
+        ours, published, difference = (
+            _number(score[key], unit, sign) for key, sign in (("ours", ""), ("published", ""), ("difference", "+"))
+        )
+        rows.append(f"{f'{name} {unit}'.strip():9} {ours:>7} {published:>10} {difference:>11}")
+    return "\n".join(rows)
+
+
+def _number(value: float | None, unit: str, sign: str) -> str:
+    scale, digits = (100, 1) if unit == "%" else (1, 3)
+    return "–" if value is None else f"{scale * value:{sign}.{digits}f}"

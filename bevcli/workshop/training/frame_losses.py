@@ -23,6 +23,7 @@ from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.weights.fetch import weights_file
 from bevcli.workshop.training.augmentation import renormalised
+from bevcli.workshop.training.clip_steps import clip_steps
 from bevcli.workshop.training.detection_loss import (
     AnyTargets,
     DetectionLossConfig,
@@ -141,13 +142,13 @@ class Teacher:
     @torch.no_grad()
     def bev_maps(self, clip: Batch) -> Iterator[Tensor]:
         """(B, Y·X, C) float32 for each frame of clips, lazily."""
-        own, memory = self._network.config.image, None
+        own, steps, memory = self._network.config.image, clip_steps(self._network), None
         if self._image != own:
             images = [renormalised(one.images, self._image, own) for one in clip.inputs]
             inputs = (replace(one, images=each) for one, each in zip(clip.inputs, images, strict=True))
             clip = replace(clip, inputs=tuple(inputs))
         for frame in range(len(clip.inputs)):
-            outputs, memory = self._network.learn(clip, frame, memory)
+            outputs, memory = steps.outputs(clip, frame, memory)
             yield outputs.bev.float()
 
 

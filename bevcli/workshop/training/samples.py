@@ -22,9 +22,10 @@ from bevcli.geometry.transforms import inverse
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
+from bevcli.model.temporal_model import model_class
 from bevcli.model.upload import pinned, upload
 from bevcli.printing import counted
-from bevcli.registry import entries, load
+from bevcli.registry import for_model
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
@@ -141,7 +142,7 @@ def draw_frames(
 
 @dataclass(frozen=True)
 class OwnHeads:
-    """The training of a model's heads beyond boxes and maps, registered under `bevcli.training_heads`.
+    """The training of a model's heads beyond boxes and maps, registered as "training_heads CLASS".
 
     Attributes:
         missing: the truth that a frame lacks, in words, and its file; None where nothing is missing.
@@ -157,8 +158,7 @@ class OwnHeads:
 
 def own_heads(config: ModelConfig) -> OwnHeads | None:
     """The registered training of a model's own heads, if it has some."""
-    known = config.architecture in entries("bevcli.training_heads")
-    return load("bevcli.training_heads", config.architecture) if known else None
+    return next(iter(for_model("training_heads", model_class(config))), None)
 
 
 @dataclass(frozen=True)
