@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp, Sequence
+from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.images import FrameEntry, ImageReader, Source, bev_frame_notes, read_frame
+from bevcli.sequences.images import FrameEntry, ListedSequence, Source, bev_frame_notes
 from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, read_topics_file
@@ -38,53 +38,45 @@ SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the f
 CALIBRATION_FILE, EGO_MOTION_FILE = "calibration.json", "ego_motion.csv"
 
 
-class RosSequence(Sequence):
+def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> ListedSequence:
     """A bag as a `Sequence`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
 
     Raises InputError if the bag is broken, or cameras, extrinsics or poses are not found.
     """
-
-    def __init__(self, path: Path, common: SequenceOptions = SequenceOptions(), own: BagOptions = BagOptions()) -> None:
-        if path.suffix == ".bag" and not is_ros_bag(path):
-            raise InputError(
-                f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
-            )
-        if path.is_file() and is_packed_bag(path):
-            raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
-        stated = read_topics_file(own.topics_file, own.topics)
-        rig = own.rig()
-        self.path = path
-        self.name = path.resolve().stem if path.is_file() else path.resolve().name
-        self._bag = Bag(path)
-        rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
-        finder = TopicFinder(self._bag, stated, rig.names if rig else None)
-        reader = _VehicleReader(self._bag, finder, stated)
-        self.rig = reader.rig() if rig is None else rig
-        self._motion, source, motion_notes = reader.motion(common.ego_motion, file)
-        self.has_ego_motion = self._motion is not None
-        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, self._motion))
-        self._entries, gaps = _covered(_entries(self._bag, finder.cameras), self._motion, path)
-        self.stamps = tuple(entry.stamp for entry in self._entries)
-        self.notes = (
-            finder.table(source),
-            *self._bag.notes,
-            *beside,
-            *reader.notes,
-            *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
-            *bev_frame_notes(self.rig, "the calibration" if rig else "a bag"),
-            *motion_notes,
-            *gaps,
+    if path.suffix == ".bag" and not is_ros_bag(path):
+        raise InputError(
+            f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
         )
-        self._images = ImageReader(strict=common.strict)
-
-    @property
-    def input_files(self) -> tuple[Path, ...]:
-        return self._bag.file_paths
-
-    def load(self, place: int) -> Frame:
-        return read_frame(self._entries[place], self.rig, self._images, self._motion)
+    if path.is_file() and is_packed_bag(path):
+        raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
+    stated = read_topics_file(own.topics_file, own.topics)
+    rig = own.rig()
+    bag = Bag(path)
+    rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
+    finder = TopicFinder(bag, stated, rig.names if rig else None)
+    reader = _VehicleReader(bag, finder, stated)
+    used_rig = reader.rig() if rig is None else rig
+    motion, source, motion_notes = reader.motion(common.ego_motion, file)
+    geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
+    entries, gaps = _covered(_entries(bag, finder.cameras), motion, path)
+    notes = (
+        finder.table(source),
+        *bag.notes,
+        *beside,
+        *reader.notes,
+        *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
+        *bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
+        *motion_notes,
+        *gaps,
+    )
+    anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
+    sequence = ListedSequence(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
+    sequence.facts = replace(facts, geo_origin=geo_origin)
+    if path.is_file():
+        sequence.name = path.resolve().stem
+    return sequence
 
 
 def _files_beside(
