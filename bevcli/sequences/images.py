@@ -363,7 +363,7 @@ class ListedSequence(Sequence):
         motion: the vehicle's poses; None if they are not known.
         truth: the boxes of frames in the world frame, by their places in the drive.
         notes: for the user.
-        files: patterns of `input_files` below the path.
+        input_files: see `Sequence`.
     """
 
     def __init__(
@@ -375,17 +375,18 @@ class ListedSequence(Sequence):
         motion: EgoMotion | None,
         truth: Mapping[int, Boxes3D] | None = None,
         notes: tuple[str, ...] = (),
-        files: tuple[str, ...] = (),
+        input_files: tuple[Path, ...] = (),
     ) -> None:
-        self.path, self.name, self.notes, self._files = path, path.resolve().name, notes, files
+        self.path, self.name, self.notes = path, path.resolve().name, notes
         self._rigs = (rigs,) * len(entries) if isinstance(rigs, CameraRig) else rigs
         self.rig, self.stamps, self._entries = self._rigs[0], tuple(entry.stamp for entry in entries), entries
         self.ego_motion, self.has_ego_motion, self._truth = motion, motion is not None, truth or {}
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
+        self._input_files = input_files
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        return tuple(sorted(file for pattern in self._files for file in self.path.glob(pattern)))
+        return self._input_files
 
     @property
     def class_counts(self) -> Mapping[str, int]:

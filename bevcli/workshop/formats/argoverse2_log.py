@@ -130,7 +130,7 @@ def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> Lis
     times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
     truth = {place: boxes[time] for place, time in enumerate(times) if time in boxes}
     notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
-    files = ("*.feather", "calibration/*.feather")
+    files = tuple(sorted((*path.glob("*.feather"), *path.glob("calibration/*.feather"))))
     return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
 
 

@@ -283,7 +283,7 @@ def open_scene(path: Path, common: SequenceOptions, own: FormatOptions) -> Liste
     motion = motion_of_keyframes(_poses(samples, keys=True), _poses(samples, keys=False))
     truth = _read_truth(path, scene, samples, common.class_map, file_of) if common.ground_truth else {}
     notes = (*bev_frame_notes(rigs[0], "a DGP scene"), *((TENFOLD,) if tenfold else ()))
-    files = ("scene_*.json", "calibration/*.json")
+    files = tuple(sorted((*path.glob("scene_*.json"), *path.glob("calibration/*.json"))))
     return ListedSequence(path, common, rigs, entries, motion, truth, notes, files)
 
 

@@ -1,19 +1,23 @@
-"""The vehicle's poses in a bag, from a topic with poses or from transforms, and the times of its images."""
+"""The vehicle of a bag: its rig, its poses from a topic or from transforms, its place on Earth; the times of images."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
-from bevcli.workshop.formats.ros.bag import Bag, spread
-from bevcli.workshop.formats.ros.messages import Transform, timestamp_ns, transforms_of
+from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.options import EgoMotionUse
+from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, spread
+from bevcli.workshop.formats.ros.messages import Transform, camera_of, frame_of, pose_of, timestamp_ns, transforms_of
 
 SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
 MOST_MESSAGES = 8192  # of a topic, while a frame has had no valid transform
@@ -24,6 +28,8 @@ LARGEST_SPREAD_NS = 50_000_000  # of the delay between capture and recording, am
 FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
 FIXES_TRIED = 50
 MAX_OFFSET_M = 10_000.0  # from the world's origin; GeoOrigin counts the Earth as flat around it
+# Usual names of the frame of the vehicle, and of the world.
+EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
 
 
 class TransformTree:
@@ -235,3 +241,117 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
         latitude, longitude = GeoOrigin(*position.tolist()).latitude_longitude(-place)
         return GeoOrigin(float(latitude), float(longitude))
     return None
+
+
+class VehicleReader:
+    """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
+
+    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
+        self._bag, self._finder, self._stated = bag, finder, stated
+        static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
+        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
+        self.ego_frame = stated.ego_frame
+
+    def rig(self) -> CameraRig:
+        """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
+        cameras = self._finder.cameras
+        frames = {one.camera: self._stated.frames.get(one.camera) or self._frame_of(one) for one in cameras}
+        self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
+        found = tuple(self._camera(one, self._ego_from(frames[one.camera], one.camera)) for one in cameras)
+        return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
+
+    def _frame_of(self, topics: CameraTopics) -> str:
+        """The optical frame that the images name, or else the calibration."""
+        named = (
+            self._bag.first(topic, frame_of, "an image or a calibration")
+            for topic in (topics.images, topics.calibration)
+            if topic
+        )
+        return next(filter(None, named), "")
+
+    def _camera(self, topics: CameraTopics, ego_from_camera: Array) -> Camera:
+        assert topics.calibration is not None
+        where = f"{self._bag.path}: {topics.calibration}"
+        parse = partial(
+            camera_of, name=topics.camera, ego_from_camera=ego_from_camera, rectified=topics.is_rectified, where=where
+        )
+        return self._bag.first(topics.calibration, parse, "a calibration")
+
+    def _find_ego_frame(self, camera_frames: list[str]) -> str:
+        """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
+        above = [self._tree.up(frame) for frame in camera_frames]
+        pose = self._finder.pose_topic()
+        named = self._child_of(pose) if pose else ""
+        for name in (named, *EGO_FRAMES):
+            if name and name in self._tree.frames:
+                return name
+        common = [frame for frame in above[0] if all(frame in path for path in above)]
+        if not common or common[0] in camera_frames:
+            return EGO_FRAMES[0]
+        self.notes.append(
+            f'no frame is named {" or ".join(EGO_FRAMES[:2])}: "{common[0]}" is taken as the frame of the vehicle '
+            "(ego_frame in `topics_file=FILE.toml` states another)"
+        )
+        return common[0]
+
+    def _child_of(self, topic: str) -> str:
+        """The frame whose poses a topic has, "" if it names none."""
+        return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
+
+    def _ego_from(self, frame: str, camera: str) -> Array:
+        found = self._tree.between(self.ego_frame, frame)
+        if found is None:
+            frames = ", ".join(self._tree.frames[:12]) or "none"
+            raise InputError(
+                f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
+                f"(frames: {frames}; {self._finder.seen()}): pass `calibration=FILE`, or name the frames "
+                "with `topics_file=FILE.toml`"
+            )
+        if abs(found[2, 2]) > 0.7:
+            self.notes.append(
+                f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
+                "not, name the optical frame with `topics_file=FILE.toml`"
+            )
+        return found
+
+    def motion(self, use: EgoMotionUse, file: Path | None) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
+        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
+
+        Raises InputError if poses are required and not found.
+        """
+        if use == "static":
+            return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
+        if file is not None:
+            return read_ego_motion(file), "", ()
+        ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
+        topic = self._finder.pose_topic()
+        if topic is not None:
+            child = self._child_of(topic)
+            is_other = child not in ("", ego_frame)
+            child_from_ego = self._tree.between(child, ego_frame) if is_other else None
+            note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
+            motion, notes = motion_from_poses(self._bag, topic, child_from_ego)
+            return motion, topic, (*([note] if is_other and child_from_ego is None else ()), *notes)
+        path = self._moving_path(ego_frame)
+        if len(path) > 1:
+            changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
+            child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
+            motion, notes = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
+            return motion, changing[0], tuple(notes)
+        if use == "required":
+            raise InputError(
+                f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
+                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
+                "the vehicle stands, or `temporal=False` to run without history"
+            )
+        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
+
+    def _moving_path(self, ego_frame: str) -> list[str]:
+        """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
+        path = list(self._tree.up(ego_frame))
+        if self._stated.world_frame in path:
+            path = path[: path.index(self._stated.world_frame) + 1]
+        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
+        # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
+        path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
+        return path if len(path) == len(moving) + 1 else path[:1]
