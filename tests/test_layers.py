@@ -56,7 +56,7 @@ WINGS: dict[str, set[str]] = {
 LEFT = {
     "bevcli.cli.eval", "bevcli.cli.progress", "bevcli.cli.weights",
     "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
-    "bevcli.inference.load", "bevcli.inference.run", "bevcli.inference.session",
+    "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
     "bevcli.rig.check_calibration", "bevcli.runs.files", "bevcli.runs.run_into_folder",
     "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",

@@ -22,6 +22,7 @@ from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
+from bevcli.workshop.engines.export_form import pad_value_bgr
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
@@ -185,12 +186,6 @@ def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: 
         out,
         reverse_channels=image.color_order == "rgb",
     )
-
-
-def pad_value_bgr(config: ModelConfig) -> tuple[float, ...]:
-    """The pixels outside the resized image: the mean, which normalisation turns into zero."""
-    mean = config.image.mean
-    return mean[::-1] if config.image.color_order == "rgb" else mean
 
 
 def image_from_bev(frame: Frame, camera_name: str) -> Array:

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bevcli.inference.preprocess import pad_value_bgr
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
@@ -189,3 +188,9 @@ def _pixel(config: ModelConfig) -> str:
     corner = zip("uv", image.crop_box, strict=False)
     moved = ", ".join(f"{axis} = scale * {axis} of the camera{shift}{f' - {at}' if at else ''}" for axis, at in corner)
     return f"pixel (u, v) of the {'resized' if image.crop is None else 'cropped'} image, {moved},"
+
+
+def pad_value_bgr(config: ModelConfig) -> tuple[float, ...]:
+    """The pixels outside the resized image: the mean, which normalisation turns into zero."""
+    mean = config.image.mean
+    return mean[::-1] if config.image.color_order == "rgb" else mean

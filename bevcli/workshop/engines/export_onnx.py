@@ -14,11 +14,10 @@ import torch
 from bevcli._version import __version__
 from bevcli.config import as_table
 from bevcli.errors import BevcliError
-from bevcli.inference.preprocess import pad_value_bgr
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.workshop.engines.engine import errors_only, require
-from bevcli.workshop.engines.export_form import ExportForm, Port
+from bevcli.workshop.engines.export_form import ExportForm, Port, pad_value_bgr
 from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import whole_file
 
