@@ -22,7 +22,8 @@ from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, prepare_output, reason_of, say
 from bevcli.registry import entries, load
 
-# The order of the commands' panels. A command states its own as `PANEL` in its file; those that state none come last.
+# The order of the commands' panels. A file of commands states theirs as `PANEL`, a text or a dict by the name of the
+# command; those without one come last.
 PANELS = ("Start", "Run", "Look", "Score", "Train", "Deploy", "Other commands")
 GROUP = "bevcli.commands"
 # Each library words it otherwise.
@@ -116,6 +117,7 @@ class _Group(TyperGroup):
             text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
             summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
             panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
+            panel = panel if isinstance(panel, str) else panel[name]
             panels.setdefault(panel, []).append((name, summary))
         write_panels(panels, formatter)
 

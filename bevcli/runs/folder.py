@@ -118,22 +118,16 @@ def folder_lock(out: Path) -> Iterator[None]:
             held = stack.enter_context(_locked(out / OWN / "lock", out))
             stack.callback(_remove, held.name)
             if sys.platform != "win32":
-                stack.callback(os.close, _locked_folder(out))
+                folder = os.open(out, os.O_RDONLY)
+                stack.callback(os.close, folder)
+                if not lock(folder):
+                    raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
         yield
 
 
 def _remove(path: str) -> None:
     with contextlib.suppress(OSError):
         os.unlink(path)
-
-
-def _locked_folder(out: Path) -> int:
-    """The descriptor of the locked folder. Raises OutputError where another run has locked it."""
-    folder = os.open(out, os.O_RDONLY)
-    if not lock(folder):
-        os.close(folder)
-        raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
-    return folder
 
 
 def _locked(path: Path, out: Path) -> IO[str]:
