@@ -15,12 +15,11 @@ import pyarrow as pa
 from rerun.chunk import Chunk, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 Row = dict[str, pa.Scalar]
 
@@ -208,18 +207,6 @@ def read_recording(recording: Path) -> BoxesFile:
     if not frames:
         raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
     return BoxesFile("world", frames)
-
-
-def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
-    """Write the shown boxes, in the world frame, metres and radians; return the number of frames and of boxes.
-
-    Raises InputError if the path does not end in .csv or .json, OutputError if the file cannot be written.
-    """
-    writers = {".csv": write_csv, ".json": write_boxes}
-    if path.suffix.lower() not in writers:
-        raise InputError(f"{path}: the file must end in .csv or .json")
-    boxes = read_recording(recording)
-    return len(boxes.frames), writers[path.suffix.lower()](boxes, path)
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
