@@ -34,6 +34,14 @@ from bevcli.recording.components import Components, any_values, components, line
 from bevcli.recording.log_cameras import labels_in_scene
 
 MATCH_DISTANCE_M = DetectionConfig().error_distance_m
+MOVING_M_S = 0.5  # slower objects get no velocity arrow
+THIN, THICK = ui_points(0.8), ui_points(1.6)
+PAST_S = 5.0  # length of a trail
+AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
+LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
+PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
+ABOVE_GROUND_M = 0.05
+TRAIL_WIDTH = ui_points(1.2)
 
 
 def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
@@ -93,10 +101,6 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     is_true[order[matched >= 0]] = True
     is_found[matched[matched >= 0]] = True
     return is_true, is_found
-
-
-MOVING_M_S = 0.5  # slower objects get no velocity arrow
-THIN, THICK = ui_points(0.8), ui_points(1.6)
 
 
 def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
@@ -245,14 +249,6 @@ def log_boxes_on_map(
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))
 
 
-PAST_S = 5.0  # length of a trail
-AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
-LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
-PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
-ABOVE_GROUND_M = 0.05
-WIDTH = ui_points(1.2)
-
-
 @dataclass
 class TrackHistory:
     """The positions of each track on the ground, kept for PAST_S, and the entities that an interrupted recording needs.
@@ -321,7 +317,7 @@ def log_tracks(
         own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
         style: Components = []
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
-            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=WIDTH)
+            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
             style = of_lines + any_values(track=name)
         strips = line_strips([ahead[i], outlines[i], *trail], 3)
         stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)

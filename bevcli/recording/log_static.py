@@ -43,6 +43,30 @@ WARNINGS = {
     UNTRAINED: "The weights are UNTRAINED: boxes and maps are meaningless.",
     FROM_RENDERED: "The weights were trained on rendered streets; these images are not rendered.",
 }
+RING_STEP_M = 10
+DEFAULT_RANGE_M = 50.0  # of the range rings without a model
+FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
+SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
+PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
+HOW_TO_READ = """\
+- **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
+  grey.
+- **False positives** are crossed out in red: no ground truth of their class is within 2 m.
+- **Duplicates**, a second box on an object, have one grey diagonal.
+- **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
+  velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
+- **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
+  box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
+  ribbon.
+- **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
+  `segmentation`, below `ego` in the left panel.
+- **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
+  first: click the eye next to `pillars` in the left panel.
+"""
+LEGEND_COLUMNS = 2
+COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
+TEXT_COLOR: Color = (225, 228, 235)
 
 
 class RecordedModel(Protocol):
@@ -103,29 +127,6 @@ class Recorded:
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that is written; none without a map."""
         return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
-
-
-RING_STEP_M = 10
-DEFAULT_RANGE_M = 50.0  # of the range rings without a model
-FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
-SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
-PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
-HOW_TO_READ = """\
-- **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
-  grey.
-- **False positives** are crossed out in red: no ground truth of their class is within 2 m.
-- **Duplicates**, a second box on an object, have one grey diagonal.
-- **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
-  velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
-- **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
-  box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
-  ribbon.
-- **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
-  `segmentation`, below `ego` in the left panel.
-- **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
-  first: click the eye next to `pillars` in the left panel.
-"""
 
 
 def log_scene(
@@ -277,11 +278,6 @@ def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     return points[:, :2] * (1, -1)
 
 
-COLUMNS = 2
-COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
-TEXT_COLOR: Color = (225, 228, 235)
-
-
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
@@ -298,12 +294,12 @@ def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
 
 def legend_size(entries: int) -> tuple[float, float]:
     """Width and height of the legend with this number of entries, in the units of its view."""
-    return COLUMNS * COLUMN_WIDTH, -(-entries // COLUMNS) * ROW_HEIGHT
+    return LEGEND_COLUMNS * COLUMN_WIDTH, -(-entries // LEGEND_COLUMNS) * ROW_HEIGHT
 
 
 def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
     """Writes the legend: a filled circle and a text for each entry, in columns."""
-    rows = -(-len(entries) // COLUMNS)
+    rows = -(-len(entries) // LEGEND_COLUMNS)
     places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
     texts, colors = [text for text, _ in entries], [color for _, color in entries]
     circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))

@@ -27,6 +27,8 @@ Row = dict[str, pa.Scalar]
 Logged = tuple[bytes, str, Row]  # the row's identity, which grows with the time of logging; its entity; its components
 OF_EACH_FRAME = (entities.EGO, entities.BOXES)  # never those of an earlier frame
 NO_FRAME = np.inf  # after all frames
+MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
+SHOWN_ENTITIES = 15
 
 
 @dataclass(frozen=True)
@@ -198,9 +200,6 @@ def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
     return state
 
 
-MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
-
-
 def read_recording(recording: Path) -> BoxesFile:
     """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
     frames = tuple(recorded_boxes(frame) for frame in RecordingReader(recording).frames())
@@ -243,9 +242,6 @@ def _column(frame: RecordedFrame, column: Column, count: int) -> Any:
         return np.array(frame.texts(entities.BOXES, column.recorded, count), dtype=np.str_)
     values = frame.array(entities.BOXES, column.recorded, 1, count)[:, 0]
     return values.astype({"flag": bool, "count": np.int64}.get(column.values, np.float64))
-
-
-SHOWN_ENTITIES = 15
 
 
 @dataclass(frozen=True)
