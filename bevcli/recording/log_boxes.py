@@ -155,17 +155,6 @@ def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
-def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the recording's world) into the scene; found and missed ones are two entities.
-
-    found: (M,) bool. colors: (M, 3) uint8.
-    """
-    pale = _with_alpha(colors[found], 150)
-    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
-        row = components(rr.Boxes3D, **_shape(truth[chosen]), colors=color, radii=THIN)
-        stream.log(entity, row, any_values(name=_texts(truth.classes[chosen])))
-
-
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, classes)
@@ -184,11 +173,20 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, clas
         stream.log(entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
-def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
+def log_ground_truth(
+    stream: rr.RecordingStream, in_world: Boxes3D, in_bev: Boxes3D, found: np.ndarray, colors: np.ndarray
+) -> None:
+    """Writes ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
+
+    in_world, in_bev: in the recording's world, and in the bev frame. found: (M,) bool. colors: (M, 3) uint8.
+    """
+    pale = _with_alpha(colors[found], 150)
+    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
+        row = components(rr.Boxes3D, **_shape(in_world[chosen]), colors=color, radii=THIN)
+        stream.log(entity, row, any_values(name=_texts(in_world.classes[chosen])))
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = footprints(truth[chosen])
+        strips = footprints(in_bev[chosen])
         stream.log(entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 

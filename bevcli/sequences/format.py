@@ -14,7 +14,6 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.options import defaults, gather
 from bevcli.parsing.files import is_there
 from bevcli.registry import entries, load
-from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 
 if TYPE_CHECKING:
@@ -109,6 +108,8 @@ def true_results(form: str, folder: Path, **facts: Any) -> tuple[TrueResult, ...
 
     facts: of the drive, which those of this format take beside the path. Raises InputError.
     """
+    from bevcli.sequences.files.incremental_json import existing  # imports OpenCV, which `--help` must not
+
     names = [name for name in entries(TRUE_RESULTS) if name.startswith(f"{form}/")]
     paths = {name: folder / name.removeprefix(f"{form}/") for name in names}
     return tuple(load(TRUE_RESULTS, name)(path, **facts) for name, path in paths.items() if is_there(existing(path)))
