@@ -8,7 +8,9 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.results",
     "bevcli.sequences",
+    "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
@@ -23,6 +25,7 @@ OWN: dict[Group, dict[str, str]] = {
         "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
         "BEVFormerV2": "bevcli.model.bevformer_v2.bevformer_v2:BEVFormerV2",
     },
+    "bevcli.results": {},
     "bevcli.sequences": {
         "native": "bevcli.sequences.native.format:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes.format:FORMAT",

@@ -58,9 +58,8 @@ LEFT = {
     "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
     "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
-    "bevcli.rig.check_calibration", "bevcli.runs.files", "bevcli.runs.run_into_folder",
-    "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",
-    "bevcli.sequences.nuscenes.format", "bevcli.sequences.nuscenes.map_expansion",
+    "bevcli.rig.check_calibration", "bevcli.runs.run_into_folder",
+    "bevcli.sequences.native.format", "bevcli.sequences.nuscenes.format",
 }  # fmt: skip
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -44,8 +44,8 @@ def _read(file: Path) -> "BoxesFile":
 
     if file.suffix.lower() != ".rrd":
         return read_boxes(file)
-    from bevcli.viewer.export import read_recording
     from bevcli.viewer.recording_file import open_recording
+    from bevcli.viewer.recording_reader import read_recording
 
     with open_recording(file) as whole:
         if whole != file:

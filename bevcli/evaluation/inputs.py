@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.formats.nuscenes import is_submission, read_submission
 from bevcli.evaluation.pairing import FramePairs
-from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Sequence
+from bevcli.frame import FrameStamp, Ground, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
@@ -23,7 +23,7 @@ from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.vad.lines_file import TRUE_LINES, FrameLines, LinesFile, read_lines
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
     """The true lines of a drive in the world frame. expected: what would have them."""
     drive, frames = open_drive(), []
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
-        if (lines := frame.ground_truth_lines) is None:
+        if (lines := result_of(MapLines, frame.ground_truth_results)) is None:
             where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
             raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
         ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)

@@ -10,16 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.transforms import Array
-
-# Value of an optional column in frames that do not have it. Futures are scored on their own.
-_UNKNOWN: dict[str, Any] = {
-    **dict.fromkeys(("scores", "track_scores", "visibilities"), np.nan),
-    **dict.fromkeys(("attributes", "instances"), ""),
-    "duplicates": False,
-    "num_points": -1,
-}
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,9 @@ def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
 def with_all_columns(boxes: Boxes3D) -> Boxes3D:
     """The boxes with all optional columns but futures."""
     missing: dict[str, Any] = {
-        name: np.full(len(boxes), value) for name, value in _UNKNOWN.items() if getattr(boxes, name) is None
+        name: np.full(len(boxes), column.unknown)
+        for name, column in OPTIONAL_COLUMNS.items()
+        if getattr(boxes, name) is None
     }
     return replace(boxes, futures=None, future_scores=None, **missing)
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from math import nan
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,27 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
 IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes3D.possible` leaves out
+
+
+@dataclass(frozen=True)
+class Column:
+    """An optional column of boxes with one value a box. Files, tables, scores and recordings take it from here.
+
+    Attributes:
+        key: its name in JSON, CSV and tables.
+        values: "score": 0 to 1, of all boxes or of none; "share": 0 to 1, or NaN; "text"; "flag": true or false;
+            "count": an integer, 0 or more.
+        recorded: its name in recordings; "" where they do not have it.
+    """
+
+    key: str
+    values: Literal["score", "share", "text", "flag", "count"]
+    recorded: str = ""
+
+    @property
+    def unknown(self) -> Any:
+        """The value of a box where it is unknown."""
+        return {"score": nan, "share": nan, "text": "", "flag": False, "count": -1}[self.values]
 
 
 @dataclass(frozen=True)
@@ -42,13 +64,13 @@ class Boxes3D:
     yaws: Array
     velocities: Array
     classes: NDArray[np.str_]
-    scores: Array | None = None
-    attributes: NDArray[np.str_] | None = None
-    instances: NDArray[np.str_] | None = None
-    track_scores: Array | None = None
-    duplicates: NDArray[np.bool_] | None = None
-    visibilities: Array | None = None
-    num_points: NDArray[np.int64] | None = None
+    scores: Annotated[Array | None, Column("score", "score", recorded="score")] = None
+    attributes: Annotated[NDArray[np.str_] | None, Column("attribute", "text")] = None
+    instances: Annotated[NDArray[np.str_] | None, Column("instance", "text", recorded="track")] = None
+    track_scores: Annotated[Array | None, Column("track_score", "share")] = None
+    duplicates: Annotated[NDArray[np.bool_] | None, Column("duplicate", "flag")] = None
+    visibilities: Annotated[Array | None, Column("visibility", "share")] = None
+    num_points: Annotated[NDArray[np.int64] | None, Column("num_points", "count")] = None
     futures: Array | None = None
     future_scores: Array | None = None
 
@@ -127,24 +149,19 @@ class Boxes3D:
     def to_dict(self) -> dict[str, list[Any]]:
         """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
 
-        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
-        duplicate, visibility and num_points, without the optional ones that are None.
-        Futures are left out.
+        The columns are TABLE_COLUMNS, without the optional ones that are None. Futures are left out.
         """
-        numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
-        columns = {
-            "class": self.classes,
-            "score": self.scores,
-            **dict(zip(numbers, self.to_numpy().T, strict=True)),
-            "attribute": self.attributes,
-            "instance": self.instances,
-            "track_score": self.track_scores,
-            "duplicate": self.duplicates,
-            "visibility": self.visibilities,
-            "num_points": self.num_points,
-        }
-        return {name: column.tolist() for name, column in columns.items() if column is not None}
+        values = {"class": self.classes, **dict(zip(NUMBERS, self.to_numpy().T, strict=True))}
+        values |= {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
+        return {key: values[key].tolist() for key in TABLE_COLUMNS if values[key] is not None}
 
+
+OPTIONAL_COLUMNS: dict[str, Column] = {
+    field.name: column for field in fields(Boxes3D) for column in getattr(field.type, "__metadata__", ())
+}
+NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")  # of `Boxes3D.to_numpy`
+_KEYS = [column.key for column in OPTIONAL_COLUMNS.values()]
+TABLE_COLUMNS = ("class", _KEYS[0], *NUMBERS, *_KEYS[1:])  # class, score, x, …, vy, attribute, …
 
 # The twelve edges of `Boxes3D.corners`, as pairs of corner indices.
 BOX_EDGES = (

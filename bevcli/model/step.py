@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, MapLines
+from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.model.camera_assignment import CameraAssignment
@@ -140,7 +140,7 @@ class FrameTruth:
     """
 
     boxes: Boxes3D
-    lines: MapLines
+    lines: Any  # MapLines of VAD
     driven: Array
     command: str
 
@@ -162,7 +162,7 @@ class SceneAttention:
 
     objects: Boxes3D
     object_weights: Array
-    lines: MapLines
+    lines: Any  # MapLines of VAD
     line_weights: Array
     paths: Array
     best: int | None = None

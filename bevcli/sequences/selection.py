@@ -41,7 +41,7 @@ class WithoutGroundTruth(DerivedSequence):
     """A sequence without its ground truth."""
 
     def load(self, place: int) -> Frame:
-        return replace(super().load(place), ground_truth=None, ground_truth_map=None, ground_truth_lines=None)
+        return replace(super().load(place), ground_truth=None, ground_truth_map=None, ground_truth_results=())
 
 
 class WithClassNames(DerivedSequence):

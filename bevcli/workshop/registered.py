@@ -7,6 +7,15 @@ OWN: dict[Group, dict[str, str]] = {
         "UniAD": "bevcli.workshop.uniad.uniad:UniAD",
         "VAD": "bevcli.workshop.vad.vad:VAD",
     },
+    "bevcli.results": {
+        "map_lines": "bevcli.workshop.vad.map_lines:MapLines",
+        "plan": "bevcli.workshop.vad.plan:Plan",
+    },
+    # By the format of a drive, and the file or folder that has them: `bevcli.sequences.format.true_results`.
+    "bevcli.true_results": {
+        "native/ground_truth_lines.json": "bevcli.workshop.vad.map_lines:TrueLines",
+        "nuscenes/maps/expansion": "bevcli.workshop.vad.true_lines:MapExpansion",
+    },
     "bevcli.sequences": {
         "argoverse2": "bevcli.workshop.formats.argoverse2.format:FORMAT",
         "dgp": "bevcli.workshop.formats.dgp.format:FORMAT",

@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.frame import FrameStamp, Ground, MapLines, Plan
+from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, apply, rigid
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.workshop.vad.line_scores import evaluate_lines
-from bevcli.workshop.vad.lines_file import LinesWriter
-from bevcli.workshop.vad.plan_file import PlanWriter
+from bevcli.workshop.vad.map_lines import LinesWriter, MapLines
+from bevcli.workshop.vad.plan import Plan, PlanWriter
 from bevcli.workshop.vad.planning_scores import PlannedFrame, evaluate_plans
 
 FRAMES, TIMES = 10, 0.5 * np.arange(1, 7)

@@ -13,8 +13,7 @@ from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.evaluation.inputs import open_ground_truth
-from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
-from bevcli.sequences.files.boxes_file import BoxesFile, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
 from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of

@@ -14,11 +14,9 @@ from bevcli.errors import InputError
 from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
-from bevcli.viewer.export import read_recording, recorded_boxes
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.summary import summarise
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, tiles
 
 
 @pytest.fixture(scope="module")

@@ -8,18 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.evaluation.box_format import BoxFormat
+from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS
 from bevcli.parsing.csv_tables import cell_of
 from bevcli.printing import counted
-from bevcli.sequences.files.box_json import boxes_to_json
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file
 
-COLUMNS = (
-    "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",
-    "height", "yaw", "vx", "vy", "attribute", "instance", "track_score", "duplicate", "visibility", "num_points",
-)  # fmt: skip
-NAMES = ("scene", "class", "attribute", "instance")
+COLUMNS = ("frame", "scene", "timestamp_ns", "frame_of_reference", *TABLE_COLUMNS)
+NAMES = ("scene", "class", *(column.key for column in OPTIONAL_COLUMNS.values() if column.values == "text"))
 
 
 class CsvWriter(GrowingFile):
@@ -63,8 +60,7 @@ def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]
             "timestamp_ns": stamp.timestamp_ns,
             "frame_of_reference": frame_of_reference,
             **box,
-            **dict(zip(COLUMNS[6:12], (*center, *size), strict=True)),
-            **dict(zip(("vx", "vy"), velocity, strict=True)),
+            **dict(zip(NUMBERS, (*center, *size, box["yaw"], *velocity), strict=True)),
         }
 
 

@@ -16,8 +16,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
 from bevcli.printing import counted
-from bevcli.sequences.files.box_json import boxes_from_json
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_from_json
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept

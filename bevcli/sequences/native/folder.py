@@ -4,26 +4,24 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, MapLines
+from bevcli.frame import DriveFacts, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.geometry.transforms import Pose, apply, inverse
+from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
+from bevcli.sequences.format import true_results
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, leads_out, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
 from bevcli.sequences.video import rotation_notes
-from bevcli.workshop.vad.lines_file import TRUE_LINES, LinesFile, read_lines
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -65,14 +63,13 @@ class FolderSequence(ListedSequence):
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *turned)
 
     def _read_truth(self, *, is_read: bool) -> None:
-        """Read ground_truth.json and ground_truth_lines.json; maps are read frame by frame. Each may be missing."""
-        boxes, lines, maps = (self.path / name for name in (BOXES_FILE, TRUE_LINES, MAPS_FOLDER))
+        """Read ground_truth.json and files of further results; maps are read frame by frame. Each may be missing."""
+        boxes, maps = self.path / BOXES_FILE, self.path / MAPS_FOLDER
         self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
-        self._lines = read_lines(lines) if is_read and is_there(existing(lines)) else LinesFile("ego", (), ())
+        self._true_results = true_results("native", self.path) if is_read else ()
         self._maps = open_maps(maps) if is_read and maps.is_dir() else None
         self._class_counts = count_classes(frame.boxes for frame in self._boxes.frames)
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
-        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames}
 
     @property
     def class_counts(self) -> Mapping[str, int]:
@@ -88,7 +85,10 @@ class FolderSequence(ListedSequence):
         boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
         bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
         frame = read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
-        return replace(frame, ground_truth_lines=self._true_lines(frame) if self.has_ego_motion else None)
+        if not self.has_ego_motion:
+            return frame
+        results = (result for of_frame in self._true_results if (result := of_frame(frame)) is not None)
+        return replace(frame, ground_truth_results=tuple(results))
 
     def _true_boxes(self, index: int, world_from_ego: Pose | None) -> Boxes3D | None:
         """A frame's boxes in the world frame, or without pose in the ego frame; None if the file lacks the frame.
@@ -105,15 +105,6 @@ class FolderSequence(ListedSequence):
         else:
             boxes = self._boxes.in_ego(truth)
         return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
-
-    def _true_lines(self, frame: Frame) -> MapLines | None:
-        """The true lines of a frame in its bev frame, None if there are none. The frame's pose is known."""
-        lines = self._lines_of.get(frame.stamp.index)
-        if lines is None:
-            return None
-        reference_from_ego = frame.world_from_ego.matrix if self._lines.frame_of_reference == "world" else np.eye(4)
-        bev_from_reference = inverse(reference_from_ego @ frame.rig.ego_from_bev)
-        return replace(lines, points=tuple(apply(bev_from_reference, points)[:, :2] for points in lines.points))
 
 
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:

@@ -21,7 +21,7 @@ from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.csv_tables import cell_of
-from bevcli.recording.class_meshes import read_class_meshes
+from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.drives import Drive

@@ -1,12 +1,13 @@
 """Figures of a model that plans: the objects and the lines of the map that its plan, and one object's motion, used."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_hex
 from matplotlib.figure import Figure
 
-from bevcli.frame import Plan
 from bevcli.geometry.transforms import Array
 from bevcli.model.step import SceneAttention
 from bevcli.workshop.explain import drawing
@@ -25,7 +26,7 @@ def plan_attention(trace: Trace) -> Figure | str:
     attention = _attention("plan", trace)
     if attention is None:
         return "the frame has no plan"
-    plan = next(result for result in trace.prediction.results if isinstance(result, Plan))
+    plan: Any = next(result for result in trace.prediction.results if result.takes_command)
     chosen = plan.commands.index(plan.command) if plan.command else None
     told = f"command {plan.command} (thick path)" if plan.command else f"paths of {', '.join(plan.commands)}"
     return _figure(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.frame import DriveFacts, Frame, Ground, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
@@ -21,7 +21,7 @@ from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequen
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.options import SequenceOptions, WriteOptions
 from bevcli.workshop.formats.output import FolderWriter
-from bevcli.workshop.vad.lines_file import TRUE_LINES, LinesWriter
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, LinesWriter, MapLines
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
@@ -77,8 +77,8 @@ class NativeWriter(FolderWriter):
             self._write_boxes(frame, frame.ground_truth, pose)
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
-        if frame.ground_truth_lines is not None:
-            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), frame.ground_truth_lines)
+        if (lines := result_of(MapLines, frame.ground_truth_results)) is not None:
+            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), lines)
 
     def _finish(self) -> None:
         if self._rig is None:

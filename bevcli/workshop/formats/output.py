@@ -103,7 +103,7 @@ class OutputFormat:
 
     def left_out(self, frame: Frame) -> set[str]:
         """What the format cannot hold of a frame, in words."""
-        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_lines}
+        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_results or None}
         return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 

@@ -13,7 +13,7 @@ from bevcli.evaluation.plots import BLUES, GRID_COLOR, titled_figure
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
 from bevcli.printing import aligned
-from bevcli.recording.box_lines import lines_in_image
+from bevcli.recording.log_cameras import lines_in_image
 from bevcli.workshop.robustness.conditions import Condition, Corruption, Group, Shown
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from bevcli.errors import InputError
-from bevcli.frame import MapLines, Sequence
+from bevcli.frame import Sequence, result_of
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
 from bevcli.sequences.files.class_names import ClassNames, count_classes
@@ -13,7 +13,7 @@ from bevcli.sequences.selection import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.vad.lines_file import TRUE_LINES
+from bevcli.workshop.vad.map_lines import TRUE_LINES, MapLines
 
 
 def check_training_drives(
@@ -90,7 +90,7 @@ def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) 
         for frame in map(drive.ground_truth_frame, places):
             if frame.ground_truth is None:
                 without["boxes", BOXES_FILE].append(frame.stamp.index)
-            if frame.ground_truth_lines is None and MapLines in config.results:
+            if MapLines in config.results and result_of(MapLines, frame.ground_truth_results) is None:
                 without["lines", TRUE_LINES].append(frame.stamp.index)
         for (truth, file), missing in without.items():
             if missing:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, MapLines, Plan, Sequence
+from bevcli.frame import Frame, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.config import ModelConfig
@@ -13,7 +13,8 @@ from bevcli.model.step import FrameTruth
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.workshop.training.detection_loss import boxes_inside
 from bevcli.workshop.vad.driving_scores import LATE_S, Drives, followed, with_true_futures
-from bevcli.workshop.vad.lines_file import TRUE_LINES
+from bevcli.workshop.vad.map_lines import TRUE_LINES, MapLines
+from bevcli.workshop.vad.plan import Plan
 
 NO_LINES = MapLines((), np.zeros(0, dtype=np.str_))
 
@@ -25,7 +26,8 @@ def frame_truth(frame: Frame, sequence: Sequence, place: int, config: ModelConfi
     Raises InputError where the frame has no true lines but the model finds lines, or its objects have no identities.
     """
     assert frame.ground_truth is not None
-    times, boxes, lines = config.future_times_s, frame.ground_truth, frame.ground_truth_lines
+    times, boxes = config.future_times_s, frame.ground_truth
+    lines = result_of(MapLines, frame.ground_truth_results)
     if MapLines in config.results and lines is None:
         raise InputError(
             f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no true lines of the map: training "

@@ -13,16 +13,16 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.inputs import ScoredInput
 from bevcli.evaluation.pairing import FramePairs
-from bevcli.frame import FrameStamp, Plan
+from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.workshop.vad.line_scores import LineScores, evaluate_lines
-from bevcli.workshop.vad.lines_file import LinesWriter, read_lines
+from bevcli.workshop.vad.map_lines import MapLines, read_lines
 from bevcli.workshop.vad.motion_scores import MotionSums, evaluate_motion
-from bevcli.workshop.vad.plan_file import PlanWriter, read_plans
+from bevcli.workshop.vad.plan import Plan, read_plans
 from bevcli.workshop.vad.planning_scores import PlannedFrame, PlanScores, evaluate_plans
 
 Scored = Literal["map", "motion", "plan"]
@@ -90,9 +90,9 @@ def evaluate_driving(
     predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
     """
     folder = predictions if predictions.is_dir() else predictions.parent
-    lines = _lines(folder / LinesWriter.file_name, truth, pairs) if "map" in asked else None
+    lines = _lines(folder / MapLines.file_name, truth, pairs) if "map" in asked else None
     motion = _motion(found, truth, pairs) if "motion" in asked else None
-    plan, notes = _plan(folder / PlanWriter.file_name, truth, pairs) if "plan" in asked else (None, ())
+    plan, notes = _plan(folder / Plan.file_name, truth, pairs) if "plan" in asked else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely import LineString
 
-from bevcli.frame import MapLines
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.vad.map_lines import MapLines
 
 THRESHOLDS_M = (0.5, 1.0, 1.5)
 SAMPLES = 100  # points of a line that are compared

@@ -10,13 +10,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from bevcli.frame import LINE_CLASSES
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.step import FrameTruth
 from bevcli.workshop.training.matching import focal_loss
 from bevcli.workshop.vad.config import LossWeights, VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs
 from bevcli.workshop.vad.line_loss import line_losses, line_targets
+from bevcli.workshop.vad.map_lines import LINE_CLASSES
 from bevcli.workshop.vad.motion_head import MotionOutputs
 
 DIVIDER, _, BOUNDARY = LINE_CLASSES

@@ -1,37 +1,33 @@
-"""plan.csv: planned paths, one row a frame, command and step."""
+"""Planned paths of the vehicle, plan.csv (one row a frame, command and step), and their drawing."""
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bevcli.frame import FrameStamp, Ground, Plan
+from bevcli.frame import FrameResult, FrameStamp, Ground, GroundLines
+from bevcli.geometry.object_classes import Color
+from bevcli.geometry.transforms import Array
 from bevcli.parsing.csv_tables import CsvRow, cell_of, read_csv
+from bevcli.recording.colors import EGO_COLOR
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "command", "given", "seconds", "x", "y", "z",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class FramePlan:
-    """The planned paths of one frame. Their points are in frame_of_reference, "world" or "ego"."""
-
-    stamp: FrameStamp
-    frame_of_reference: str
-    plan: Plan
+OPAQUE, HALF, FAINT = 230, 90, 45  # of 255: the path of the command, the other paths, the rungs of the ribbon
+WIDTH = 1.2  # points of the user interface
+HALF_VEHICLE_M = 0.925
+RUNG_M = 0.4  # of a ribbon
 
 
 class PlanWriter(GrowingFile):
     """Writes plan.csv frame by frame; the file is complete after every frame. Raises OutputError."""
-
-    file_name = "plan.csv"
 
     def __init__(
         self, path: Path, frame_of_reference: str, extras: Mapping[str, Any], resume_at: int | None = None
@@ -42,7 +38,7 @@ class PlanWriter(GrowingFile):
         if resume_at is None:
             self._append([COLUMNS])
 
-    def write(self, ground: Ground, plan: Plan | None) -> None:
+    def write(self, ground: Ground, plan: "Plan | None") -> None:
         """Append a frame. plan: in the bev frame; None where the model was not run."""
         if plan is None:
             return
@@ -58,6 +54,71 @@ class PlanWriter(GrowingFile):
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(rows)
         self.append(text.getvalue().encode())
+
+
+@dataclass(frozen=True)
+class Plan(FrameResult):
+    """Planned paths of the vehicle, one for each command of the driver.
+
+    Attributes:
+        commands: names of the C commands.
+        paths: (C, T, 2) x and y in the bev frame, or (C, T, 3) points on the ground in the ego or world frame, metres:
+            future places of the origin of the bev frame.
+        times_s: (T,) seconds from the frame's time.
+        command: the one that was given, "" for none.
+    """
+
+    kind = "plan"
+    file_name = "plan.csv"
+    writer = PlanWriter
+    takes_command = True
+
+    commands: tuple[str, ...]
+    paths: Array
+    times_s: Array
+    command: str = ""
+
+    @classmethod
+    def legend(cls, names: tuple[str, ...]) -> dict[str, Color]:
+        return {"planned path": EGO_COLOR}
+
+    def drawn(self, ground: Ground, names: tuple[str, ...], score: float) -> GroundLines:
+        """Each path as a line, and the one of the command as a ribbon as wide as the vehicle."""
+        strips, colors = [], []
+        for command, path in zip(self.commands, self.paths, strict=True):
+            whole = np.concatenate([np.zeros((1, 2)), path])
+            ribbon = list(_ribbon(whole)) if command == self.command else []
+            strips += [ground.points(line) for line in (*ribbon, whole)]
+            colors += [(*EGO_COLOR, FAINT if len(line) == 2 else OPAQUE) for line in ribbon]
+            colors.append((*EGO_COLOR, OPAQUE if ribbon else HALF))
+        return GroundLines(strips, colors, WIDTH)
+
+    def with_command(self, command: str) -> "Plan":
+        return replace(self, command=command)
+
+
+def _ribbon(path: Array) -> Iterator[Array]:
+    """The two sides of a ribbon along a path (K, 2), and its rungs."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if along[-1] < RUNG_M:
+        return
+    at = np.linspace(0, along[-1], int(along[-1] / RUNG_M) + 2)
+    middle = np.stack([np.interp(at, along, axis) for axis in path.T], axis=-1)
+    ahead = np.gradient(middle, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    across = HALF_VEHICLE_M * np.stack([ahead[:, 1], -ahead[:, 0]], axis=-1)
+    yield from (middle - across, middle + across)
+    yield from np.stack([middle - across, middle + across], axis=1)
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """The planned paths of one frame. Their points are in frame_of_reference, "world" or "ego"."""
+
+    stamp: FrameStamp
+    frame_of_reference: str
+    plan: Plan
 
 
 def read_plans(path: Path) -> tuple[FramePlan, ...]:
