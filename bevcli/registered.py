@@ -19,6 +19,7 @@ Group = Literal[
     "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",
+    "bevcli.extensions",
 ]
 
 # Group -> name -> "module:attribute".

@@ -53,7 +53,7 @@ WINGS: dict[str, set[str]] = {
 }
 # What in the core still imports the workshop.
 LEFT = {
-    "bevcli.cli.progress", "bevcli.cli.project_debug", "bevcli.cli.run", "bevcli.cli.weights",
+    "bevcli.cli.progress", "bevcli.cli.weights",
     "bevcli.inference.load", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.runs.run_into_folder",
 }  # fmt: skip

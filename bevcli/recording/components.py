@@ -50,10 +50,8 @@ def components(archetype: Any, **fields: Any) -> Components:
 
 def any_values(**values: Any) -> Components:
     """As `rr.AnyValues`, with the same type in every row: arrays of numbers, Arrow arrays, or single values."""
-    return [
-        _Component(value if isinstance(value, pa.Array) else pa.array(np.atleast_1d(value)), _plain(name))
-        for name, value in values.items()
-    ]
+    arrays = {name: v if isinstance(v, pa.Array) else pa.array(np.atleast_1d(v)) for name, v in values.items()}
+    return [_Component(array, rr.ComponentDescriptor(name)) for name, array in arrays.items()]
 
 
 @lru_cache(maxsize=64)
@@ -86,11 +84,6 @@ def rgb_format(width: int, height: int) -> pa.Array:
 def _field(archetype: Any, name: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     (batch,) = archetype.from_fields(**{name: []}).as_component_batches()
     return batch.component_descriptor(), batch.as_arrow_array().type
-
-
-@cache
-def _plain(name: str) -> rr.ComponentDescriptor:
-    return rr.ComponentDescriptor(name)
 
 
 def _converted(archetype: Any, name: str, kind: pa.DataType, value: Any) -> pa.Array:

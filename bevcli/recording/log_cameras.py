@@ -24,6 +24,16 @@ NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project fa
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
+LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
+LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
+# Of the image's width and height, for a view that is a third of the screen wide.
+LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
+UNSEEN = ui_points(0.01)  # of a point that shows only its label
+JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
+POINT = ui_points(2.0)
+AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
+AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
+KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
 
 
 @dataclass(frozen=True)
@@ -113,13 +123,6 @@ def _cut(ends: Array) -> Array:
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
-LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
-# Of the image's width and height, for a view that is a third of the screen wide.
-LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
-UNSEEN = ui_points(0.01)  # of a point that shows only its label
-
-
 def labels_2d(positions: ArrayLike, texts: list[str], **options: Any) -> Components:
     """Texts at positions (L, 2), in the units of their view. options: of `rr.Points2D`."""
     return components(
@@ -179,10 +182,6 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
-POINT = ui_points(2.0)
-
-
 @dataclass(frozen=True)
 class PosedCamera:
     """A camera with its pose at the time of its image.
@@ -210,11 +209,6 @@ def transform(parent_from_entity: Array) -> Components:
     """The pose (4, 4) of an entity in its parent, for a recording."""
     columns = parent_from_entity[:3, :3].T
     return components(rr.Transform3D, translation=parent_from_entity[:3, 3], mat3x3=columns)
-
-
-AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
-AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
-KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
 
 
 class Av1Encoder:

@@ -31,6 +31,8 @@ RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
 LONGEST_M = 50.0  # a longer mesh is not in metres
+MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
+FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 
 
 @dataclass(frozen=True)
@@ -129,10 +131,6 @@ def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
     return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
-
-
-MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
-FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 
 
 def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:

@@ -108,7 +108,7 @@ def true_results(form: str, folder: Path, **facts: Any) -> tuple[TrueResult, ...
 
     facts: of the drive, which those of this format take beside the path. Raises InputError.
     """
-    from bevcli.sequences.files.incremental_json import existing
+    from bevcli.sequences.files.incremental_json import existing  # imports OpenCV, which `--help` must not
 
     names = [name for name in entries(TRUE_RESULTS) if name.startswith(f"{form}/")]
     paths = {name: folder / name.removeprefix(f"{form}/") for name in names}

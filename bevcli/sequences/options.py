@@ -160,7 +160,7 @@ class WriteOptions:
         "Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
-        complete=lambda start: [name for name in entries("bevcli.drive_writers") if name.startswith(start)],
+        complete=lambda incomplete: list(entries("bevcli.drive_writers")),
     )
     force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
     boxes: Path | None = option(

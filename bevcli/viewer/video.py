@@ -30,6 +30,27 @@ from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
 
 MOST_PIXELS = 64 << 20
+Canvas = NDArray[np.uint8]
+ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUBPIXEL_BITS = 3
+STRIPS = "LineStrips2D:strips"
+FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
+OPACITIES = 10  # steps of opacity, faint to opaque
+WIDTH, HEIGHT = 1920, 640
+BEV_SIDE = 640
+CAMERAS_WIDTH = WIDTH - BEV_SIDE
+CAMERAS_HEIGHT = 500
+BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
+BEV_MARGIN = 1.02  # of the range rings and the border of the grid
+BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
+BELOW_BOXES = (
+    entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
+)  # fmt: skip
+TEXT, WARNING = (225, 220, 215), (85, 70, 255)
+FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
+H264_QUALITY = 21  # x264's crf
+SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
 class Av1Decoder:
@@ -71,15 +92,6 @@ class CameraImages:
         encoded = frame.blob(entity, "EncodedImage:blob")
         image = decode_image(encoded, cv2.IMREAD_COLOR, MOST_PIXELS) if encoded else None
         return None if image is None else image.astype(np.uint8, copy=False)
-
-
-Canvas = NDArray[np.uint8]
-ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-SUBPIXEL_BITS = 3
-STRIPS = "LineStrips2D:strips"
-FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
-OPACITIES = 10  # steps of opacity, faint to opaque
 
 
 def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
@@ -159,19 +171,6 @@ def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
     if pixels.size != math.prod(shape) or not pixels.size:
         raise frame.wrong(entity, "Image:buffer", f"{shape[1]} x {shape[0]} pixels RGB", f"{pixels.size} bytes")
     return pixels.reshape(shape)[..., ::-1]
-
-
-WIDTH, HEIGHT = 1920, 640
-BEV_SIDE = 640
-CAMERAS_WIDTH = WIDTH - BEV_SIDE
-CAMERAS_HEIGHT = 500
-BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
-BEV_MARGIN = 1.02  # of the range rings and the border of the grid
-BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
-BELOW_BOXES = (
-    entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
-)  # fmt: skip
-TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 
 
 @dataclass(frozen=True)
@@ -337,11 +336,6 @@ def _draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: s
 def _rotation(frame: RecordedFrame, entity: str) -> Array:
     columns = frame.array(entity, "Transform3D:mat3x3", 9)
     return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns
-
-
-FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
-H264_QUALITY = 21  # x264's crf
-SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
 def write_video(recording: Path, video: Path, count: int, rate: float, on_frame: Callable[[], None]) -> None:

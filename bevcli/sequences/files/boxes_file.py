@@ -36,6 +36,10 @@ _TYPES: dict[str, Any] = {
     "flag": Annotated[bool, Meta(description="true or false")] | UnsetType,
     "count": Annotated[int, Meta(ge=0, description="an integer, 0 or more")] | UnsetType,
 }
+FORMAT = "bevcli-boxes/1"
+FRAMES_OF_REFERENCE = ("world", "ego", "bev")
+_FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
+_FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
 
 class _FixedMembers(Struct, forbid_unknown_fields=True):
@@ -201,12 +205,6 @@ def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
         futures[index, ..., 1:] = [[point or (np.nan, np.nan) for point in mode] for mode in row.futures or ()]
         scores[index] = row.future_scores or np.nan
     return {"futures": futures, **({"future_scores": scores} if any(row.future_scores for row in rows) else {})}
-
-
-FORMAT = "bevcli-boxes/1"
-FRAMES_OF_REFERENCE = ("world", "ego", "bev")
-_FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
-_FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
 
 @dataclass(frozen=True)
