@@ -94,14 +94,14 @@ def forward_clip(
     steps, memory = clip_steps(model), None
     model.eval()
     with torch.no_grad():
-        for place in range(first_learned):
-            memory = steps.history(batch, place, memory)
+        for frame in range(first_learned):
+            memory = steps.history(batch, frame, memory)
     model.train()
     for module in model.modules():
         if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
-    for place in range(first_learned, frames):
-        outputs, memory = steps.outputs(batch, place, memory)
+    for frame in range(first_learned, frames):
+        outputs, memory = steps.outputs(batch, frame, memory)
         yield outputs
 
 
@@ -321,12 +321,12 @@ class Trainer:
         return scores
 
 
-def delayed(items: Iterable[T], places: int) -> Iterator[T]:
+def delayed(items: Iterable[T], by: int) -> Iterator[T]:
     """The items, each when so many later ones have been made."""
     waiting = deque[T]()
     for item in items:
         waiting.append(item)
-        if len(waiting) > places:
+        if len(waiting) > by:
             yield waiting.popleft()
     yield from waiting
 
