@@ -13,9 +13,8 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
-from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.object_classes import Color
-from bevcli.geometry.transforms import Array, Pose, apply
+from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
 from bevcli.printing import valid_text
 
 if TYPE_CHECKING:

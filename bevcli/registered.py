@@ -14,7 +14,10 @@ Group = Literal[
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
+    "bevcli.scores",
+    "bevcli.plots",
     "bevcli.engines",
+    "bevcli.training_heads",
     "bevcli.commands",
 ]
 
@@ -29,15 +32,11 @@ OWN: dict[Group, dict[str, str]] = {
         "native": "bevcli.sequences.native.format:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes.format:FORMAT",
     },
-    "bevcli.drive_writers": {
-        "native": "bevcli.sequences.native.format:OUTPUT",
-        "nuscenes": "bevcli.sequences.nuscenes.format:OUTPUT",
-    },
     "bevcli.box_formats": {
-        "csv": "bevcli.evaluation.formats.csv_table:FORMAT",
-        "json": "bevcli.evaluation.formats.boxes_json:FORMAT",
-        "nuscenes": "bevcli.evaluation.formats.nuscenes:DETECTION",
-        "nuscenes-tracking": "bevcli.evaluation.formats.nuscenes:TRACKING",
+        "csv": "bevcli.evaluation.box_format:CSV",
+        "json": "bevcli.evaluation.box_format:JSON",
+        "nuscenes": "bevcli.evaluation.submission:DETECTION",
+        "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
     },
     "bevcli.commands": {
         "eval": "bevcli.cli.eval:evaluate",

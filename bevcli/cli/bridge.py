@@ -53,10 +53,12 @@ class Part:
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
+        classes: makes the list of the dataclasses whose options are in `FormatValues`.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    classes: Callable[[], Iterable[type[Any]]] = option_classes
 
     def __contains__(self, name: str) -> bool:
         return name not in self.without and (not self.only or name in self.only)
@@ -306,8 +308,7 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     if not own and not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
-    classes: Iterable[type[Any]] = option_classes() if own else [hint]
-    for kind in classes:
+    for kind in part.classes() if own else [hint]:
         kinds, known = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
             stated, name = option_of(field), field.name

@@ -1,6 +1,6 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from bevcli.model.fpn import FPN
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.segmentation import SegmentationHead
-from bevcli.model.step import ClipInputs, FrameTruth, ModelOutputs
+from bevcli.model.step import ClipInputs, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
@@ -87,18 +87,6 @@ class Network(TemporalModel):
     def learn(self, clip: ClipInputs, place: int, memory: Any) -> tuple[ModelOutputs, Any]:
         """The outputs for a frame of training clips, and the memory after it, which has no gradient."""
         raise NotImplementedError
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        """The weighted scalar losses, by name, of heads that make `ModelConfig.results`; by default none.
-
-        Args:
-            outputs: of B frames.
-            truths: B, with places at `ModelConfig.future_times_s`.
-            matches: of each frame the queries that the detection loss matches to boxes, and the indices of these.
-        """
-        return {}
 
     def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
         """Run the parts whose operations `bevcli bench` counts, for a frame with history; return the BEV map.

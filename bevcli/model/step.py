@@ -128,24 +128,6 @@ class ClipInputs(Protocol):
 
 
 @dataclass(frozen=True)
-class FrameTruth:
-    """The ground truth of one frame, bev frame.
-
-    Attributes:
-        boxes: the G boxes to be found, each with one future of T steps; NaN from the step on in which the object is
-            not there.
-        lines: of the map.
-        driven: (T, 2) places where the vehicle was at the same times, metres; NaN after the end of the scene.
-        command: the driver's command that the driven path follows; "" where no place is known.
-    """
-
-    boxes: Boxes3D
-    lines: Any  # MapLines of VAD
-    driven: Array
-    command: str
-
-
-@dataclass(frozen=True)
 class SceneAttention:
     """Attention to Q objects and N lines, the mean over heads. Places are in metres, bev frame.
 

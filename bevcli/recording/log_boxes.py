@@ -17,8 +17,7 @@ from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_gre
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array, apply
+from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,

@@ -139,8 +139,8 @@ class LabelOptions:
     labels: Path | None = option(
         reads="path",
         default=None,
-        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, an "
-        "OpenLABEL file, KITTI labels or tracklets, or CVAT's cuboids.",
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, "
+        "KITTI labels or tracklets, or CVAT's cuboids.",
         metavar="FILE",
     )
     unlisted_frames: UnlistedFrames | None = option(

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import rerun as rr
 
 from bevcli.errors import BevcliError, InputError, OutputError
-from bevcli.parsing.files import plain_name
-from bevcli.parsing.own_process import run_program, run_python
+from bevcli.parsing.files import plain_name, run_program, run_python
 from bevcli.viewer.native import viewer_binary, viewer_environment
 from bevcli.writing import whole_file
 

@@ -406,18 +406,3 @@ def _images(recording: Path) -> Iterator[np.ndarray]:
     for frame in RecordingReader(recording).frames():
         layout = layout or tiles(frame)
         yield draw_frame(frame, layout, images)
-
-
-def draw_frame_at(recording: Path, index: int) -> np.ndarray | None:
-    """One frame as in the video, (HEIGHT, WIDTH, 3) uint8 BGR; None if the recording does not have it.
-
-    recording: of `open_recording`. index: of the frame.
-    """
-    images = CameraImages()
-    for frame in RecordingReader(recording).frames():
-        if frame.index == index:
-            return draw_frame(frame, tiles(frame), images)
-        for name in frame.texts(entities.RUN, "camera_names"):
-            if frame.has(entities.image(name), "VideoStream:sample"):  # a video is decoded in order
-                images.image(frame, name)
-    return None

@@ -15,7 +15,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.temporal_model import build_model
 from bevcli.published import own_table
 from bevcli.workshop.batch.options import ray_is_installed
-from bevcli.workshop.batch.reproduce import compare_with_published
+from bevcli.workshop.batch.reproduce_command import compare_with_published
 
 ERRORS = {"trans_err": 0.7, "scale_err": 0.3, "orient_err": 0.4, "vel_err": 0.5, "attr_err": None}
 METRICS = {

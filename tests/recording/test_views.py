@@ -11,8 +11,8 @@ from recorded_drive import GRID, TINY, NamedModel, predict, record
 from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, frame_rate_hz

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.formats.csv_table import COLUMNS
+from bevcli.evaluation.box_format import COLUMNS
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer import video

@@ -16,13 +16,22 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframe
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import true_results
-from bevcli.sequences.images import ImageReader, ImageSource
-from bevcli.sequences.native.folder import rig_notes
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples, Sensors
-from bevcli.sequences.nuscenes.json_tables import read_rows
+from bevcli.sequences.nuscenes.index import (
+    NUSCENES,
+    Dialect,
+    Images,
+    Ints,
+    NuScenesIndex,
+    Samples,
+    Sensors,
+    chosen_scenes,
+    keyframes,
+    sweep_frames,
+    tables_of,
+)
+from bevcli.sequences.nuscenes.tables import open_index, read_rows
 from bevcli.sequences.options import SequenceOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
@@ -80,6 +89,7 @@ class TableSequence(Sequence):
         self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
     ) -> None:
         common.refuse_static(root)
+        self.name = root.resolve().name
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
@@ -88,7 +98,7 @@ class TableSequence(Sequence):
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
-        self.notes = (*((note,) if note else ()), *rig_notes(self.rig, str(tables)), *self._table_notes())
+        self.notes = (*((note,) if note else ()), *bev_frame_notes(self.rig, str(tables)), *self._table_notes())
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""

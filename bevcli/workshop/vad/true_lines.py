@@ -18,7 +18,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json
-from bevcli.sequences.nuscenes.json_tables import read_rows
+from bevcli.sequences.nuscenes.tables import read_rows
 from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
 
 DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES

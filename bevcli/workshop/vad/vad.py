@@ -3,7 +3,7 @@
 Then its exported form.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor
@@ -14,12 +14,11 @@ from bevcli.model.bevformer.bevformer import BEVFormer, RecurrentForm
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.step import FrameTruth, ModelOutputs, SceneAttention
+from bevcli.model.step import ModelOutputs, SceneAttention
 from bevcli.workshop.engines.export_form import Port
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan, scene_attentions
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
-from bevcli.workshop.vad.losses import head_losses
 from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, attention_weights, line_positions
 from bevcli.workshop.vad.official_keys import NAMES, UNUSED
 from bevcli.workshop.vad.planner import Planner
@@ -80,12 +79,6 @@ class VAD(BEVFormer):
         with attention_weights(*layers) as found:
             self.detect(outputs.bev)
         return scene_attentions(outputs, [found[layer] for layer in layers], self.config, place)
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        assert isinstance(outputs, VADOutputs)
-        return head_losses(outputs, truths, matches, self.config)
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: the queries of objects and of lines attend to each other before they see the frame."""

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
-from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array, Pose, inverse, rigid
+from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
 from bevcli.workshop.formats.ros.bag import Bag, spread
 from bevcli.workshop.formats.ros.messages import Transform, timestamp_ns, transforms_of

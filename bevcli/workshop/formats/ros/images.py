@@ -19,8 +19,7 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.printing import one_line
-from bevcli.sequences.images import MessageSource, UnreadableImage, decode
-from bevcli.sequences.video import MOST_PIXELS, VideoReader
+from bevcli.sequences.images import MOST_PIXELS, MessageSource, UnreadableImage, VideoReader, decode
 from bevcli.workshop.formats.ros.bag import Bag
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
 

@@ -15,11 +15,10 @@ from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
-from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.images import FrameEntry, ImageReader, Source, bev_frame_notes, read_frame
 from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse, SequenceOptions
-from bevcli.workshop.formats.ros.bag import Bag
+from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.ego_motion import (
     TransformTree,
     capture_times,
@@ -32,7 +31,6 @@ from bevcli.workshop.formats.ros.ego_motion import (
 from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.images import BagVideo, bag_image
 from bevcli.workshop.formats.ros.messages import camera_of, frame_of, pose_of
-from bevcli.workshop.formats.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
 # Usual names of the frame of the vehicle, and of the world.
 EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
@@ -75,7 +73,7 @@ class RosSequence(Sequence):
             *beside,
             *reader.notes,
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
-            *rig_notes(self.rig, "the calibration" if rig else "a bag"),
+            *bev_frame_notes(self.rig, "the calibration" if rig else "a bag"),
             *motion_notes,
             *gaps,
         )
