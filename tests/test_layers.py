@@ -43,7 +43,7 @@ WINGS: dict[str, set[str]] = {
     "benchmark": {"engines"},
     "calibration": set(),
     "engines": {"benchmark"},
-    "formats": {"vad"},
+    "formats": set(),
     "robustness": {"calibration", "engines", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
     "scores": set(),
