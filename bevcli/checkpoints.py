@@ -16,8 +16,7 @@ from bevcli.errors import WeightsError
 from bevcli.model.config import ModelConfig
 from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
-from bevcli.parsing.pickles import Placeholder
-from bevcli.parsing.pth import StoredTensor, read_pth, read_safetensors
+from bevcli.parsing.pth import Placeholder, StoredTensor, read_pth, read_safetensors
 from bevcli.writing import check_output, write_whole
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.

@@ -39,28 +39,23 @@ LAYERS = (
 )
 # The wings of the workshop, and which others each may import; all may import the core.
 WINGS: dict[str, set[str]] = {
-    "batch": {"vad"},
+    "batch": set(),
     "benchmark": {"engines"},
     "calibration": set(),
     "engines": {"benchmark"},
-    "explain": set(),
     "formats": {"vad"},
-    "robustness": {"calibration", "engines", "synth", "training"},
+    "robustness": {"calibration", "engines", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
-    "tracking_scores": set(),
-    "training": {"synth", "tracking_scores", "vad"},
+    "scores": set(),
+    "training": {"synth"},
     "uniad": set(),
     "vad": {"engines", "training"},
 }
 # What in the core still imports the workshop.
 LEFT = {
-    "bevcli.cli.eval", "bevcli.cli.progress", "bevcli.cli.project_debug", "bevcli.cli.run", "bevcli.cli.weights",
-    "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
-    "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
-    "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
-    "bevcli.rig.check_calibration", "bevcli.runs.files", "bevcli.runs.run_into_folder",
-    "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",
-    "bevcli.sequences.nuscenes.format", "bevcli.sequences.nuscenes.map_expansion",
+    "bevcli.cli.progress", "bevcli.cli.weights",
+    "bevcli.inference.load", "bevcli.inference.run", "bevcli.inference.session",
+    "bevcli.runs.run_into_folder",
 }  # fmt: skip
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -19,11 +19,12 @@ from bevcli.rig.coverage import Coverage
 from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_camera_times, check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
+from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.format import FORMAT as NATIVE
 from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.formats.ros.format import is_ros_bag
 from bevcli.writing import write_whole
 
 _Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
@@ -103,11 +104,11 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    if is_ros_bag(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
+    if _is_other_drive(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
         return _check_other_sequence(path, frame, options)
     file = path / CALIBRATION if path.is_dir() else path
     draft = draft_calibration(file)
-    if folder is not None and is_ros_bag(folder):
+    if folder is not None and _is_other_drive(folder):
         return _check_other_sequence(folder, frame, {**options, "calibration": file})
     if folder is None and path.is_dir():
         folder = path
@@ -116,6 +117,11 @@ def check_calibration(
         found = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
     name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
     return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), found[0]), found[1])
+
+
+def _is_other_drive(path: Path) -> bool:
+    """True for a drive that is not a native folder, such as a bag."""
+    return is_drive(path) and format_of(path) is not NATIVE
 
 
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.inference.session import Session
-from bevcli.sequences.selection import select_range
+from bevcli.sequences.open import select_range
 from bevcli.workshop.engines import in_engine as module
 from bevcli.workshop.engines.engine import installed_engines
 from bevcli.workshop.engines.engine_choice import EngineChoice, fastest_engine, remember_speeds

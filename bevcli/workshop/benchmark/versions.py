@@ -13,10 +13,11 @@ from bevcli.frame import Prediction
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
-from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
+from bevcli.registry import for_model
 from bevcli.workshop.benchmark.limits import wait_for
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
 from bevcli.workshop.benchmark.result import Comparison
@@ -57,7 +58,8 @@ class Version:
         assert self.state is not None
         assert self.state.stamp is not None
         past = [(stamp, drive.pose(stamp.index)) for stamp in drive.stamps[: self.state.stamp.index]]
-        self.state = replace(self.state, memory=model_class(self.runner.config).with_past(self.state.memory, past))
+        for with_past in for_model("past", model_class(self.runner.config))[:1]:
+            self.state = replace(self.state, memory=with_past(self.state.memory, past))
 
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: ModelOutputs) -> None:
         codes = outputs.box_codes[-1, 0]
@@ -69,7 +71,7 @@ def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
     stages = {module: stage.replace("_", " ") for module, stage in model.stages.items()}
     if "" in stages:  # of the whole model, a CUDA graph
         return stages, {}
-    if not model.has_parts:
+    if not isinstance(model, Network):
         return stages, dict.fromkeys(stages, "input")
     parts = {
         "temporal_self_attention": "temporal attention",
@@ -96,7 +98,7 @@ def textbook_version(model: Network, device: torch.device) -> Network:
     return textbook
 
 
-class PaddedSampling(nn.Module):
+class PaddedSampling(GridSampling):
     """`grid_sample` of all maps at once; the queries of every map are padded to the longest list."""
 
     def forward(

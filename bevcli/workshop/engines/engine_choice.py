@@ -17,10 +17,10 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import AUTO, TORCH, ModelOptions
 from bevcli.model.config import ModelConfig
-from bevcli.model.temporal_model import model_class
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.registry import entries, load
 from bevcli.workshop.engines.engine import Engine, installed_engines, require
+from bevcli.workshop.engines.export_form import export_form
 from bevcli.workshop.engines.file_cache import engines_folder
 from bevcli.writing import write_whole
 
@@ -58,7 +58,7 @@ class EngineChoice:
             return TORCH
         require(*EXPORTERS, QUANTIZER)
         if not known:
-            model_class(config).export_form(config, len(config.cameras))  # says why it cannot be exported
+            export_form(config, len(config.cameras))  # says why it cannot be exported
             raise BevcliError("`precision=int8`: no engine is installed: run pip install 'bevcli[openvino]'")
         return next(iter(known))
 
@@ -92,14 +92,14 @@ def engine_choice(options: ModelOptions, config: ModelConfig, device: torch.devi
         raise BevcliError(f"`device={options.device}`: `engine={engine}` runs on the CPU: leave out one of them")
     chosen.require_packages()
     require(*EXPORTERS, *((QUANTIZER,) if precision == "int8" else ()))
-    model_class(config).export_form(config, len(config.cameras))
+    export_form(config, len(config.cameras))
     return EngineChoice(engine, precision or "fp32", options.calibrate_with)
 
 
 def _can_export(config: ModelConfig) -> bool:
     try:
         require(*EXPORTERS)
-        model_class(config).export_form(config, len(config.cameras))
+        export_form(config, len(config.cameras))
     except BevcliError:
         return False
     return True

@@ -26,8 +26,7 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.registry import load
 from bevcli.sequences.images import AT_REST
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.selection import select_range
+from bevcli.sequences.open import open_sequence, select_range
 from bevcli.workshop.engines.box_differences import BoxDifferences, box_differences
 from bevcli.workshop.engines.engine import Engine
 from bevcli.workshop.engines.engine_choice import EngineChoice, fastest_engine

@@ -8,28 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.frame import DriveFacts, Frame, Ground, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_tables import cell_of
+from bevcli.parsing.documents import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.options import SequenceOptions, WriteOptions
-from bevcli.workshop.formats.output import FolderWriter
-from bevcli.workshop.vad.lines_file import TRUE_LINES, LinesWriter
+from bevcli.workshop.formats.output import FolderWriter, OutputFormat
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, LinesWriter, MapLines
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
-
-
-def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "NativeWriter":
-    """The writer of a sequence as a native folder; see `OutputFormat`."""
-    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
 
 
 class NativeWriter(FolderWriter):
@@ -77,8 +72,8 @@ class NativeWriter(FolderWriter):
             self._write_boxes(frame, frame.ground_truth, pose)
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
-        if frame.ground_truth_lines is not None:
-            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), frame.ground_truth_lines)
+        if (lines := result_of(MapLines, frame.ground_truth_results)) is not None:
+            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), lines)
 
     def _finish(self) -> None:
         if self._rig is None:
@@ -151,3 +146,10 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
         np.stack([pose.quaternion for pose in poses]),
         *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
     )
+
+
+def _writer(folder: Path, sequence: Sequence, options: WriteOptions) -> NativeWriter:
+    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
+
+
+OUTPUT = OutputFormat("a sequence folder", _writer, keeps_maps=True)

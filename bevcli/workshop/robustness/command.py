@@ -40,8 +40,7 @@ def stress(
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
     from bevcli.inference.load import load_model
-    from bevcli.sequences.open import open_sequence
-    from bevcli.sequences.selection import select_range
+    from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
     from bevcli.workshop.robustness.report import stress_table
     from bevcli.workshop.robustness.results import read_results

@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bevcli.evaluation.plots import BLUES, GRID_COLOR, titled_figure
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
 from bevcli.printing import aligned
-from bevcli.recording.box_lines import lines_in_image
+from bevcli.recording.log_cameras import lines_in_image
 from bevcli.workshop.robustness.conditions import Condition, Corruption, Group, Shown
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults
+from bevcli.workshop.scores.plots import BLUES, GRID_COLOR, titled_figure
 from bevcli.workshop.synth.corruptions import Pixels
 from bevcli.writing import write_whole
 

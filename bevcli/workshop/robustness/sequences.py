@@ -14,7 +14,7 @@ from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequen
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics, motion_during
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.sequences.selection import scenes_of, select
+from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.robustness.options import LostImage
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
 

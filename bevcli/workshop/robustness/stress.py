@@ -233,8 +233,8 @@ def _write_figures(
     folder: RunFolder, results: StressResults, against: StressResults | None, scene: Sequence, options: StressOptions
 ) -> None:
     """Writes the plot, and a contact sheet of a scene."""
-    from bevcli.evaluation.plots import save_figures  # only plots need matplotlib
     from bevcli.workshop.robustness.report import draw_stress, write_contact_sheet
+    from bevcli.workshop.scores.plots import save_figures  # only plots need matplotlib
 
     folder.add(folder.path / SHEET)
     conditions = [each for each in choose_conditions() if each.severity in results.of(each.name)]

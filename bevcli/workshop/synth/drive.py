@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import BevMap, FrameStamp, MapLines
+from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
@@ -33,6 +33,7 @@ from bevcli.workshop.synth.world.scenery import Scenery
 from bevcli.workshop.synth.world.simulation import Actor, Simulation
 from bevcli.workshop.synth.world.traffic import ActorState
 from bevcli.workshop.synth.world.weather import WEATHER_NAMES, make_weather
+from bevcli.workshop.vad.map_lines import MapLines
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance

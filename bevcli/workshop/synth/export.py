@@ -132,7 +132,7 @@ def _encoded(drive: RenderedDrive, indices: Sequence[int], quality: int) -> Iter
         yield Frame(
             rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
             motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
-            ground_truth_map=rendered.bev_map, ground_truth_lines=rendered.lines,
+            ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
         )  # fmt: skip
 
 

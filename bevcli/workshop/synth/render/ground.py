@@ -9,13 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 from shapely import LineString, Polygon, union_all
 from shapely.geometry.base import BaseGeometry
 
-from bevcli.frame import LINE_CLASSES, MAP_CLASSES, BevMap, MapLines
+from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
 from bevcli.workshop.synth.assets.paint import linear
 from bevcli.workshop.synth.world.ground_plan import ASPHALT, GroundPiece
 from bevcli.workshop.synth.world.weather import tiling_noise
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
 from bevcli.workshop.vad.true_lines import lines_in_area
 
 SUBPIXEL_BITS = 4  # fractional bits of polygon corners in OpenCV
