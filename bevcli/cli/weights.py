@@ -12,12 +12,11 @@ from bevcli.cli.help_text import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, say
-from bevcli.workshop.engines.options import FileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
-    from bevcli.weights.cache import NamedWeights
+    from bevcli.published import NamedWeights
 
 PANEL = "Train"
 weights_app = typer.Typer(
@@ -36,8 +35,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     Each has the scores that are published for it (nuScenes validation split, in per cent), its size, its licence, and
     where it lies on this machine or is published. Connects to no other machine.
     """
-    from bevcli.published import own_table
-    from bevcli.weights.cache import all_weights
+    from bevcli.published import all_weights, own_table
 
     found = list(all_weights(options.weights_dir).values())
     if as_json:
@@ -60,7 +58,7 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.weights.cache import named_weights
+    from bevcli.published import named_weights
 
     found = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
     rows = [
@@ -119,15 +117,17 @@ def inspect(
 def convert(
     source: Annotated[Path, argument("An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, argument("The .safetensors to write.", reads=None)],
-    options: Annotated[FileOptions, Part(only=("force",))],
+    force: Annotated[bool, Option("Overwrite the file if it exists.")] = False,
 ) -> None:
     """Write SOURCE as .safetensors with our key names.
 
     It must fit one of our models.
     """
     from bevcli.checkpoints import convert as convert_file
+    from bevcli.writing import check_new
 
-    say(_as_text(convert_file(source, options.target(destination))))
+    check_new(destination, force=force)
+    say(_as_text(convert_file(source, destination)))
 
 
 def _named_as_data(weights: "NamedWeights") -> dict[str, object]:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from bevcli.errors import BevcliError
-from bevcli.inference.load import Model
+from bevcli.inference.load import Model, Report, installed_engines
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
 from bevcli.model.config import ModelConfig
@@ -17,9 +17,7 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.measure import WARM_UP_FRAMES
 from bevcli.workshop.benchmark.versions import Version, difference, largest_differences
-from bevcli.workshop.engines.engine import installed_engines
-from bevcli.workshop.engines.engine_choice import EngineChoice, remember_speeds
-from bevcli.workshop.engines.in_engine import CALIBRATION_FRAMES, Report, in_engine
+from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
 
 CPU = torch.device("cpu")
 
@@ -65,7 +63,7 @@ class EngineTable:
         return {"model": self.model, "machine": self.machine, "engines": [vars(row) for row in self.rows]}
 
     def text(self) -> str:
-        """The table, and what `auto` takes."""
+        """The table."""
         first = median(self.rows[0].seconds)
         heads = ("engine", "frame, ms", "fastest to slowest", "of torch fp32", "in 0.1 m", "largest, m", "scores")
         lines = [f"{self.model}, {self.machine}, alternating frames, made-up weights", "", _line(*heads)]
@@ -76,21 +74,18 @@ class EngineTable:
             middle, span = median(row.seconds), f"{1000 * min(row.seconds):.1f} to {1000 * max(row.seconds):.1f}"
             cells = (f"{1000 * middle:.1f}", span, f"{middle / first:.2f}", f"{row.near:.1%}")
             lines.append(_line(row.name, *cells, f"{row.largest_m:.2g}", f"{row.score:.2g}"))
-        rows = sorted((row for row in self.rows if row.seconds), key=lambda row: median(row.seconds))
-        fastest = {row.precision: row.engine for row in reversed(rows)}
-        words = [f"{fastest[precision]} in {precision}" for precision in ("fp32", "int8") if precision in fastest]
-        return "\n".join([*lines, "", f"`engine=auto` takes {', '.join(words)} for {self.model} from now on"])
+        return "\n".join(lines)
 
 
 def compare_engines(config: ModelConfig, frames: int, report: Report = lambda done, total, what: None) -> EngineTable:
     """Time a step of PyTorch and of every installed engine on the same frames, in turn, and compare their boxes.
 
-    The times are kept in the user's cache, where `engine="auto"` finds them. Nothing else should run on the machine.
+    Nothing else should run on the machine.
 
     Args:
         config: of the model, which gets made-up weights.
         frames: number of timed frames.
-        report: of the export, see `in_engine`.
+        report: of the export, see `Model.in_engine`.
     """
     versions: dict[EngineRow, Version] = {}
     failed: list[EngineRow] = []
@@ -116,15 +111,14 @@ def compare_engines(config: ModelConfig, frames: int, report: Report = lambda do
         EngineRow(row.engine, row.precision, tuple(version.seconds[WARM_UP_FRAMES:]), *largest_differences(found[row]))
         for row, version in versions.items()
     ]
-    remember_speeds(config, {row.name: median(row.seconds) for row in rows})
     return EngineTable(config.name, describe_machine(CPU), (*rows, *failed))
 
 
 def _version(network: Network, engine: str, precision: Any, report: Report) -> Version:
     if engine == TORCH:
         return Version(prepare_for_inference(network, CPU, precision), CPU)
-    model, drive = Model(network, choice=EngineChoice(engine, precision)), MadeUpDrive(CALIBRATION_FRAMES)
-    return Version(in_engine(model, drive.rig, drive, report=report).prepared, CPU)
+    model, drive = Model(network, engine=engine, precision=precision), MadeUpDrive(CALIBRATION_FRAMES)
+    return Version(model.in_engine(drive.rig, drive, report=report).prepared, CPU)
 
 
 def _line(name: str, *cells: str) -> str:

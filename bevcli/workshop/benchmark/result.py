@@ -18,7 +18,6 @@ from bevcli.errors import BevcliError
 from bevcli.model.kernels.onednn import has_onednn
 from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import say
-from bevcli.workshop.benchmark.limits import MachineLimits
 from bevcli.writing import write_whole
 
 MODEL_TIMEOUT_S = 4 * 3600.0
@@ -39,6 +38,23 @@ COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
     "boxes within 0.1 m": lambda r: f"{r['share_within_0.1_m']:.1%}",
     "largest score difference": lambda r: f"{r['max_score_difference']:.1g}",
 }
+
+
+@dataclass(frozen=True)
+class MachineLimits:
+    """Peak throughput.
+
+    Attributes:
+        gemm_gflops: rate of matrix products, 10^9 operations a second.
+        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
+    """
+
+    gemm_gflops: float
+    copy_gbs: float
+
+    def fastest(self, other: "MachineLimits") -> "MachineLimits":
+        """The higher of two measurements; disturbances only make a measurement lower."""
+        return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
 
 
 @dataclass(frozen=True)

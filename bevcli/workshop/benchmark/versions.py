@@ -17,10 +17,9 @@ from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, 
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
-from bevcli.workshop.benchmark.limits import wait_for
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
 from bevcli.workshop.benchmark.result import Comparison
-from bevcli.workshop.engines.box_differences import NEAR_M
+from bevcli.workshop.engines.export_cache import NEAR_M
 
 QueryResults = tuple[Tensor, Tensor]
 
@@ -62,6 +61,14 @@ class Version:
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: ModelOutputs) -> None:
         codes = outputs.box_codes[-1, 0]
         self.queries = torch.cat([codes[:, :2], codes[:, 4:5]], dim=-1), outputs.class_logits[-1, 0].sigmoid()
+
+
+def wait_for(device: torch.device) -> None:
+    """Returns when a GPU has finished all queued work; at once on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    if device.type == "mps":
+        torch.mps.synchronize()
 
 
 def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:

@@ -2,77 +2,46 @@
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from bevcli.config import config_of_table
 from bevcli.errors import WeightsError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
-from bevcli.parsing.documents import parse_json
 from bevcli.printing import counted, reason_of
-from bevcli.registry import load
-from bevcli.workshop.engines.engine import Engine
 from bevcli.workshop.engines.export_form import pixels_of
+from bevcli.workshop.engines.export_onnx import read_metadata
 
-SUFFIX = ".onnx"
-
-# The part of the metadata that bevcli itself reads, to run the file: the contents of the model's TOML file as JSON,
-# the number of cameras that may see one cell, whether the weights are random or those of the package, and the precision
-# of backbone and neck.
-METADATA = ("config", "cameras_per_cell", "untrained", "bundled", "precision")
+Arrays = Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class ExportedFile:
-    """The metadata of an exported file that describes its model.
+class LoadedFile(nn.Module):
+    """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
 
     Attributes:
-        config: of the model.
-        contents: the contents of the model's TOML file, its table of the tracker included.
-        cameras_per_cell: the number of cameras that may see one cell of the BEV map.
-        untrained: whether the weights are random.
-        bundled: whether the weights are those of the package.
-        precision: of backbone and neck, "fp32" or "int8".
+        metadata: of the file: text by name.
+        input_shapes: name of each input -> its shape.
+        outputs: names of the outputs.
     """
 
-    config: ModelConfig
-    contents: dict[str, Any]
-    cameras_per_cell: int
-    untrained: bool
-    bundled: bool
-    precision: Literal["fp32", "int8"]
+    metadata: Mapping[str, str]
+    input_shapes: Mapping[str, tuple[int, ...]]
+    outputs: tuple[str, ...]
 
-
-def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
-    """Reads the metadata of a file of `bevcli export-onnx`. Raises WeightsError, or ConfigError for its model."""
-    missing = [name for name in METADATA if name not in metadata]
-    if missing:
-        raise WeightsError(
-            f"{file}: its metadata lacks {', '.join(missing)} (expected a file of bevcli export-onnx of this version)"
-        )
-    contents, slots, untrained, bundled = (parse_json(metadata[name].encode(), file) for name in METADATA[:4])
-    if not isinstance(contents, dict) or type(slots) is not int:
-        raise WeightsError(
-            f"{file}: its metadata config or cameras_per_cell is wrong (expected a table and an integer)"
-        )
-    precision: Literal["fp32", "int8"] = "int8" if metadata["precision"] == "int8" else "fp32"
-    config = config_of_table(contents, str(file))
-    # The file's images have one size, for every rig.
-    config = replace(config, image=replace(config.image, focal_px=None, max_pixels=None))
-    return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
+    def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
+        """One step. feed: every input by name. Returns every output by name."""
+        raise NotImplementedError
 
 
 class ExportedModel(TemporalModel):
-    """An exported file, run by an engine on the CPU. `load_exported` makes one.
+    """An exported file, run by an engine on the CPU.
 
     It has no parts to look into: sampling points of the attentions and times of single stages are not available.
     """
@@ -82,7 +51,9 @@ class ExportedModel(TemporalModel):
     device = torch.device("cpu")
     digest: Tensor
 
-    def __init__(self, file: Path, engine: Engine, metadata: ExportedFile) -> None:
+    def __init__(self, file: Path, engine: LoadedFile) -> None:
+        """Raises WeightsError for a file that is not of `bevcli export-onnx`, ConfigError for its model."""
+        metadata = read_metadata(engine.metadata, file)
         super().__init__(metadata.config)
         self.file, self.engine, self.metadata = file, engine, metadata
         self._require(("images",), engine.input_shapes, "input")
@@ -163,21 +134,3 @@ class ExportedModel(TemporalModel):
                 f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
         return {name: torch.from_numpy(value) for name, value in found.items()}
-
-
-def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:
-    """Loads an exported file.
-
-    Args:
-        file: of `bevcli export-onnx` or `bevcli quantize`.
-        engine: the program that runs it, a name of `bevcli.engines`.
-        threads: that it uses; None takes PyTorch's number.
-
-    Raises:
-        BevcliError: the engine is unknown or not installed.
-        WeightsError: the file is missing, cannot be loaded, or is not of `bevcli export-onnx`.
-        ConfigError: the model in its metadata is wrong.
-    """
-    start: type[Engine] = load("bevcli.engines", engine)
-    loaded = start(file, torch.get_num_threads() if threads is None else threads)
-    return ExportedModel(file, loaded, read_metadata(loaded.metadata, file))

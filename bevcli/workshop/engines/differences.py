@@ -15,8 +15,8 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.workshop.engines.box_differences import CENTER, NEAR_M
-from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.engines.engine import load_exported
+from bevcli.workshop.engines.export_cache import CENTER, NEAR_M
 
 
 @dataclass(frozen=True)
