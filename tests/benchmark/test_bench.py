@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
+import runpy
+import subprocess
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
-from bevcli.errors import BevcliError
 from bevcli.inference.load import installed_engines
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.workshop.benchmark import made_up, measure, result
+from bevcli.workshop.benchmark import made_up, measure
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
-from bevcli.workshop.benchmark.result import BenchmarkResult, Comparison, MachineLimits
-from bevcli.workshop.benchmark.versions import Version
+from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits
+from bevcli.workshop.benchmark.versions import Comparison, Version
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -67,22 +69,23 @@ def test_the_text_contains_the_derived_numbers():
         assert words in text
 
 
-def test_a_table_has_all_rows_but_those_that_fail(tmp_path, monkeypatch):
+def test_a_table_has_all_rows_but_those_that_fail(tmp_path):
+    script = runpy.run_path(str(Path(__file__).parents[2] / "docs/site/speed_table.py"))
+    script = script["write_table"].__globals__
     document = tmp_path / "speed.md"
-    document.write_text(f"before\n{result.BEGIN}\nold\n{result.END}\nafter\n")
+    document.write_text(f"before\n{script['BEGIN']}\nold\n{script['END']}\nafter\n")
     rows = []
 
     def measured(model: str, precision: str, *_: object) -> dict[str, object]:
         rows.append(document.read_text().count("| two"))
         if model == "two" and precision == "bf16":
-            raise BevcliError("bench: two, bf16: not done within 4 h")
+            raise subprocess.TimeoutExpired("bench", 4 * 3600)
         return replace(RESULT, model=model, precision=precision).as_data()
 
-    monkeypatch.setattr(result, "measure", measured)
-    monkeypatch.setattr(result, "known_models", lambda: ["one", "two", "three"])
-    monkeypatch.setattr(result, "has_onednn", lambda _: True)
-    with pytest.raises(BevcliError, match="1 of 6 measurements failed"):
-        result.write_table(document, torch.device("cpu"), 5)
+    script["measure"], script["known_models"] = measured, lambda: ["one", "two", "three"]
+    script["has_onednn"] = lambda _: True
+    with pytest.raises(SystemExit, match="1 of 6 measurements failed"):
+        script["write_table"](document, "cpu")
     text = document.read_text()
     assert [line.split(" | ")[:2] for line in text.splitlines() if "| bf16 " in line] == [
         ["| one", "bf16"],
@@ -92,8 +95,8 @@ def test_a_table_has_all_rows_but_those_that_fail(tmp_path, monkeypatch):
     assert text.endswith("after\n")
     assert "old" not in text
     assert rows == [0, 0, 0, 1, 1, 1]  # written after each measurement
-    monkeypatch.setattr(result, "has_onednn", lambda _: False)
-    result.write_table(document, torch.device("cpu"), 5)
+    script["has_onednn"] = lambda _: False
+    script["write_table"](document, "cpu")
     assert "bf16" not in document.read_text()
 
 

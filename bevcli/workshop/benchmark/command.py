@@ -46,11 +46,6 @@ class BenchOptions:
     profile: Path | None = option(
         default=None, help="Write PyTorch's profile of one frame (open it at chrome://tracing).", metavar="OUT"
     )
-    table: Path | None = option(
-        default=None,
-        help="Measure all models in all precisions, and write the table of docs/speed.md.",
-        metavar="OUT",
-    )
 
 
 def bench(
@@ -65,15 +60,9 @@ def bench(
     """
     from bevcli.cli.progress import engine_bar
     from bevcli.config import load_config
-    from bevcli.inference.load import choose_device
     from bevcli.workshop.benchmark.engines import compare_engines
     from bevcli.workshop.benchmark.measure import run_benchmark
-    from bevcli.workshop.benchmark.result import write_table
 
-    if options.table is not None:
-        write_table(options.table, choose_device(model_options.device), options.frames)
-        say(f"wrote {options.table}", err=True)
-        return
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("`engines` compares all of them on the CPU: leave out other options")

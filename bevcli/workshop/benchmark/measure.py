@@ -5,7 +5,8 @@ import math
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -26,8 +27,7 @@ from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.recording.writer import Recording
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.workshop.benchmark.result import BenchmarkResult, MachineLimits
-from bevcli.workshop.benchmark.versions import Version, compare_with_plain, wait_for
+from bevcli.workshop.benchmark.versions import Comparison, Version, compare_with_plain, wait_for
 
 WARM_UP_FRAMES = 2  # one without and one with history
 MIN_RUN_FRAMES = 4  # of a run with reading and recording; the times between them are measured, but for the last
@@ -41,6 +41,127 @@ REPEATS = 8
 
 # Bilinear sampling: a product and a sum for each of four neighbours, then a product and a sum with the weight.
 OPERATIONS_PER_SAMPLE = 4 * 2 + 2
+
+
+@dataclass(frozen=True)
+class MachineLimits:
+    """Peak throughput.
+
+    Attributes:
+        gemm_gflops: rate of matrix products, 10^9 operations a second.
+        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
+    """
+
+    gemm_gflops: float
+    copy_gbs: float
+
+    def fastest(self, other: "MachineLimits") -> "MachineLimits":
+        """The higher of two measurements; disturbances only make a measurement lower."""
+        return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
+
+
+@dataclass(frozen=True)
+class BenchmarkResult:
+    """All measurements of one model.
+
+    Attributes:
+        model: its name.
+        device: "cpu" or "cuda".
+        precision: of the prepared model or the exported file.
+        machine: description of processor or GPU, threads and PyTorch's version.
+        stages_s: stage -> seconds of each frame; no two stages ran at the same time.
+        frame_s: seconds of the model's step for each frame, from network inputs to boxes.
+        run_frame_s: median seconds of a frame in a whole run, where other threads decode, preprocess and record.
+        run_over_model: the same, divided by the time of the model alone, which took turns with the runs.
+        peak_memory_bytes: of the process on a CPU, of tensors on a GPU.
+        operations: arithmetic operations of one frame.
+        limits: the machine's peak throughput.
+        comparison: with the plain version, None where that was not run.
+        engine: the program that ran the model.
+    """
+
+    model: str
+    device: str
+    precision: str
+    machine: str
+    stages_s: Mapping[str, tuple[float, ...]]
+    frame_s: tuple[float, ...]
+    run_frame_s: float
+    run_over_model: float
+    peak_memory_bytes: int
+    operations: float
+    limits: MachineLimits
+    comparison: Comparison | None = None
+    engine: str = "torch"
+
+    @property
+    def times_limit(self) -> float:
+        """The frame's time divided by the time of its operations at the peak rate of matrix products."""
+        return median(self.frame_s) / (self.operations / (self.limits.gemm_gflops * 1e9))
+
+    @property
+    def speedup(self) -> float | None:
+        """The plain version's median frame time divided by the fast version's."""
+        return median(self.comparison.plain_frame_s) / median(self.frame_s) if self.comparison else None
+
+    def as_data(self) -> dict[str, object]:
+        """The result for JSON."""
+        frame_s = median(self.frame_s)
+        data: dict[str, object] = {
+            **{name: getattr(self, name) for name in ("model", "device", "precision", "engine", "machine")},
+            "stages_ms": {stage: round(1000 * median(times), 3) for stage, times in self.stages_s.items()},
+            "frame_ms": round(1000 * frame_s, 3),
+            "frame_ms_spread": [round(1000 * min(self.frame_s), 3), round(1000 * max(self.frame_s), 3)],
+            "run_frame_ms": round(1000 * self.run_frame_s, 3),
+            "run_over_model": round(self.run_over_model, 3),
+            "fps": round(1 / frame_s, 4),
+            "peak_memory_mb": round(self.peak_memory_bytes / 1e6, 1),
+            "operations_g": round(self.operations / 1e9, 2),
+            "limits": {
+                "gemm_gflops": round(self.limits.gemm_gflops, 1),
+                "copy_gbs": round(self.limits.copy_gbs, 1),
+                "times_limit": round(self.times_limit, 3),
+            },
+        }
+        if self.comparison is not None and self.speedup is not None:
+            data |= {
+                "plain_frame_ms": round(1000 * median(self.comparison.plain_frame_s), 3),
+                "speedup": round(self.speedup, 3),
+                "max_box_difference_m": self.comparison.max_box_difference_m,
+                "share_within_0.1_m": self.comparison.share_within_tenth_m,
+                "max_score_difference": self.comparison.max_score_difference,
+            }
+        return data
+
+    def text(self) -> str:
+        """A table of the stages, then one line for each other measurement."""
+        lines = [f"{self.model}, {self.precision}, {self.engine}, {self.machine}", ""]
+        lines.append(f"{'stage':<22}{'median ms':>10}  fastest to slowest")
+        for stage, times in {**self.stages_s, "whole frame": self.frame_s}.items():
+            low, middle, high = (1000 * seconds for seconds in (min(times), median(times), max(times)))
+            lines.append(f"{stage:<22}{middle:>10.1f}  {low:.1f} to {high:.1f}")
+        frame_s, gemm = median(self.frame_s), self.limits.gemm_gflops
+        run_ms, memory = 1000 * self.run_frame_s, self.peak_memory_bytes / 1e6
+        lines += [
+            "",
+            f"model alone                {1 / frame_s:.3g} frames per second",
+            f"with reading, recording    {run_ms:.0f} ms per frame, {self.run_over_model:.2f} times the model alone",
+            f"operations                 {self.operations / 1e9:.0f} G per frame; "
+            f"the frame takes {self.times_limit:.2f} times their time at the peak rate",
+            f"peak rate                  {gemm:.0f} G operations per second (matrix products), "
+            f"{self.limits.copy_gbs:.1f} GB/s (copying)",
+            f"peak memory                {memory:.0f} MB",
+        ]
+        found = self.comparison
+        if found is not None:
+            lines += [
+                f"plain version              {1000 * median(found.plain_frame_s):.0f} ms per frame, "
+                f"{self.speedup:.2f} times the prepared model's",
+                f"largest difference to it   {found.max_box_difference_m:.2g} m "
+                f"({found.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
+                f"{found.max_score_difference:.2g} in the scores",
+            ]
+        return "\n".join(lines)
 
 
 def run_benchmark(
