@@ -1,4 +1,4 @@
-"""Measure every model in every precision: `python docs/site/speed_table.py docs/speed.md [DEVICE [FRAMES]]`.
+"""Measure every model in every precision: `python docs/site/speed_table.py docs/speed.md`.
 
 The table is written between two lines of the document. Nothing else should run on the machine.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import typer
 
 from bevcli.inference.load import choose_device
 from bevcli.model.kernels.onednn import has_onednn
@@ -80,4 +81,4 @@ def markdown_table(results: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    write_table(Path(sys.argv[1]), *sys.argv[2:3], *map(int, sys.argv[3:4]))
+    typer.run(write_table)
