@@ -67,10 +67,10 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
         Files of the Hugging Face Hub are served under stable addresses, by a mirror where HF_ENDPOINT names one.
         """
-        found = _HUB.fullmatch(self.source)
-        if found:
+        match = _HUB.fullmatch(self.source)
+        if match:
             hub = (os.environ.get("HF_ENDPOINT") or "https://huggingface.co").rstrip("/")
-            return f"{hub}/{found[1]}/resolve/{found[2] or 'main'}/{found[3]}"
+            return f"{hub}/{match[1]}/resolve/{match[2] or 'main'}/{match[3]}"
         return self.source if "://" in self.source else ""
 
     @property
@@ -160,11 +160,11 @@ def own_table() -> Path:
 def read_sources() -> dict[str, Source]:
     """All sources by name; those of the user's own file replace those of the package. Raises ConfigError."""
     text = resources.files("bevcli").joinpath("weights", "sources.toml").read_text(encoding="utf-8")
-    found = _parse(text, "sources.toml")
+    sources = _parse(text, "sources.toml")
     own = own_table()
     if own.is_file():
-        found |= _parse(read_text(own, TOML_BYTES, error=ConfigError), str(own))
-    return found
+        sources |= _parse(read_text(own, TOML_BYTES, error=ConfigError), str(own))
+    return sources
 
 
 def weights_folder(chosen: Path | None = None) -> Path:
@@ -187,15 +187,15 @@ def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
 
 
 def _parse(text: str, file: str) -> dict[str, Source]:
-    found = {}
+    sources = {}
     for name, table in parse_toml(text, file, ConfigError).items():
         if not _NAME.fullmatch(name):
             raise ConfigError(f"{file}: [{name:.60}]: expected a name of letters, digits and - . + _")
         try:
-            found[name] = msgspec.convert(table, Source)
+            sources[name] = msgspec.convert(table, Source)
         except msgspec.ValidationError as error:
             raise ConfigError(f"{file}: [{name}]: {error}") from None
-    return found
+    return sources
 
 
 def _read_hashes(folder: Path) -> dict[str, Known]:

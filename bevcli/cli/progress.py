@@ -93,9 +93,9 @@ class Progress:
         """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
         if self.done == self.skipped:
             return f"{self.done}/{self.total} {self.unit}"
-        each = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
-        pace = f"{1 / each:.2f} per second" if each <= SLOW_S else f"{each:.1f} s each"
-        left = f"{duration((self.total - self.done) * each)} left"
+        unit_s = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
+        pace = f"{1 / unit_s:.2f} per second" if unit_s <= SLOW_S else f"{unit_s:.1f} s each"
+        left = f"{duration((self.total - self.done) * unit_s)} left"
         return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, left, self.detail)))
 
     def _line_is_due(self, count: int) -> bool:

@@ -179,11 +179,11 @@ class Model:
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:
     """SHA-256 of names, types, shapes and numbers, in this order."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, tensor in tensors:
-        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
+        digest.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def load_model(
@@ -331,13 +331,13 @@ def _engine(name: str) -> Any:
 
 def installed_engines() -> dict[str, Any]:
     """The engines whose packages are installed, the one with the lowest rank first."""
-    found = {}
+    engines = {}
     for name in entries("bevcli.engines"):
         with suppress(BevcliError):  # not installed, or a broken package of somebody else
             engine = load("bevcli.engines", name)
             engine.require_packages()
-            found[name] = engine
-    return dict(sorted(found.items(), key=lambda item: item[1].rank))
+            engines[name] = engine
+    return dict(sorted(engines.items(), key=lambda item: item[1].rank))
 
 
 def _model_of(weights: Path) -> str:

@@ -85,15 +85,15 @@ def fetch_weights(
     url, what = weights.source.url, f"{weights.name}: {weights.source.url}"
     _download(url, partial, weights.source.bytes, lambda done, total: report(done, total, what))
     try:
-        found = _check(weights, partial)
+        fetched = _check(weights, partial)
     except BevcliError as error:
         _remove(partial)
         reason = str(error).replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
         raise WeightsError(f"{url}: refused, and deleted: {reason}") from None
-    weights.store_hash(found.known)
+    weights.store_hash(fetched.known)
     os.replace(partial, weights.file)
     _remove(partial)
-    return replace(found, path=weights.file)
+    return replace(fetched, path=weights.file)
 
 
 def _check(weights: NamedWeights, path: Path) -> FetchedWeights:
@@ -101,25 +101,25 @@ def _check(weights: NamedWeights, path: Path) -> FetchedWeights:
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found (the `source` of [{weights.name}])")
     with path.open("rb") as file:
-        found = Known(hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
+        known = Known(hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
     source, before = weights.source, weights.known
-    if source.bytes not in (None, found.bytes):
-        raise WeightsError(f"{path}: has {found.bytes:,} bytes (expected {source.bytes:,})")
-    if not found.sha256.startswith(source.sha256):
-        raise WeightsError(f"{path}: has the SHA-256 {found.sha256} (expected {source.sha256})")
-    if before is not None and before != found:
+    if source.bytes not in (None, known.bytes):
+        raise WeightsError(f"{path}: has {known.bytes:,} bytes (expected {source.bytes:,})")
+    if not known.sha256.startswith(source.sha256):
+        raise WeightsError(f"{path}: has the SHA-256 {known.sha256} (expected {source.sha256})")
+    if before is not None and before != known:
         raise WeightsError(
-            f"{path}: has the SHA-256 {found.sha256}, but the first download had {before.sha256}: the file at the "
+            f"{path}: has the SHA-256 {known.sha256}, but the first download had {before.sha256}: the file at the "
             f"source has changed; if you trust it, remove its line from {weights.folder / HASHES}"
         )
     config = load_config(weights.name)
     require_fit(read_checkpoint(path), config.name, expected_state(config))
     digits = len(source.sha256)
     if digits == 64:
-        return FetchedWeights(path, found, "all")
+        return FetchedWeights(path, known, "all")
     if before is not None:
-        return FetchedWeights(path, found, "as at its first download")
-    return FetchedWeights(path, found, f"the first {digits} digits" if digits else "nothing")
+        return FetchedWeights(path, known, "as at its first download")
+    return FetchedWeights(path, known, f"the first {digits} digits" if digits else "nothing")
 
 
 def _remove(partial: Path) -> None:
@@ -321,10 +321,10 @@ class _Download:
     def _usable_part(self) -> _Version | None:
         """The version of the part that is there; None if it cannot be used."""
         try:
-            found = msgspec.json.decode(read_bytes(self._notes, 1 << 16), type=_Version) if self.done else None
+            version = msgspec.json.decode(read_bytes(self._notes, 1 << 16), type=_Version) if self.done else None
         except (msgspec.MsgspecError, ValueError, RecursionError, OSError, BevcliError):
             return None
-        return found if found is not None and found.url == self.url and found.total >= self.done else None
+        return version if version is not None and version.url == self.url and version.total >= self.done else None
 
     def _start_anew(self) -> None:
         self.file.truncate(0)

@@ -7,6 +7,7 @@ import pickle
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,12 @@ def test_ctrl_c_ends_a_download_and_keeps_what_came(server, model, content, tmp_
     assert 0 < kept < len(content)
     assert fetch_weights(named_weights("own")).path.read_bytes() == content
     assert handler.asked[1] == ("whole", f"bytes={kept}-")
+
+
+def test_weights_that_are_here_import_no_download_and_no_pickles():
+    modules = ("bevcli.weights.fetch", "pycurl", "bevcli.parsing.pth", "bevcli.workshop.engines.engine")
+    code = f"import sys, bevcli; bevcli.load_model('demo'); print([name for name in {modules} if name in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
 @pytest.mark.parametrize("how", ["cut_for_ever", "stalling", "too_long"])

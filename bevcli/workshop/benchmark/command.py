@@ -84,12 +84,12 @@ def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
     from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
 
     if options.model.endswith(EXPORTED_SUFFIX):
-        found = load_model(options.model, options=model_options)
+        model = load_model(options.model, options=model_options)
     else:
         config = load_config(options.model)
         engine, device, precision = choose_engine(model_options, config)
-        found = Model(made_up_model(config), device, precision, engine=engine)
+        model = Model(made_up_model(config), device, precision, engine=engine)
     parts = " and ".join(f"`{name}`" for name in ("against", "profile") if getattr(options, name) is not None)
     if parts:
-        found.require_parts(parts)
-    return in_engine_with_bar(found, MadeUpDrive(CALIBRATION_FRAMES)) if found.needs_export else found
+        model.require_parts(parts)
+    return in_engine_with_bar(model, MadeUpDrive(CALIBRATION_FRAMES)) if model.needs_export else model

@@ -152,14 +152,14 @@ class BenchmarkResult:
             f"{self.limits.copy_gbs:.1f} GB/s (copying)",
             f"peak memory                {memory:.0f} MB",
         ]
-        found = self.comparison
-        if found is not None:
+        comparison = self.comparison
+        if comparison is not None:
             lines += [
-                f"plain version              {1000 * median(found.plain_frame_s):.0f} ms per frame, "
+                f"plain version              {1000 * median(comparison.plain_frame_s):.0f} ms per frame, "
                 f"{self.speedup:.2f} times the prepared model's",
-                f"largest difference to it   {found.max_box_difference_m:.2g} m "
-                f"({found.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
-                f"{found.max_score_difference:.2g} in the scores",
+                f"largest difference to it   {comparison.max_box_difference_m:.2g} m "
+                f"({comparison.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
+                f"{comparison.max_score_difference:.2g} in the scores",
             ]
         return "\n".join(lines)
 
@@ -194,7 +194,7 @@ def run_benchmark(
         profile.export_chrome_trace(str(profile_path))
     comparison = None
     if against_plain:
-        inputs = (preprocessor(drive.load(place)) for place in range(frames))
+        inputs = (preprocessor(drive.load(index)) for index in range(frames))
         comparison, frame_s = compare_with_plain(plain, fast, inputs)
     size = (prepared.images.shape[-2], prepared.images.shape[-1])
     hits = plain.pillars(prepared.image_from_bev, size, prepared.has_image)
@@ -220,14 +220,14 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
     preprocessor = fast.runner.preprocessor()
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
-        for place in range(first, timed.stop):
-            if place == first + 1:
+        for index in range(first, timed.stop):
+            if index == first + 1:
                 fast.fill_past(drive)
-            if place == timed.start:
+            if index == timed.start:
                 times.clear()
                 fast.seconds = []
             began = time.perf_counter()
-            frame = drive.load(place)
+            frame = drive.load(index)
             loaded = time.perf_counter()
             prepared = preprocessor(frame)
             before = {"decode": loaded - began, "preprocess": time.perf_counter() - loaded}
@@ -241,12 +241,12 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
 
 
 def time_runs(
-    fast: Version, drive: MadeUpDrive, place: int, frames: int, turns_s: float = TURNS_S
+    fast: Version, drive: MadeUpDrive, index: int, frames: int, turns_s: float = TURNS_S
 ) -> tuple[float, float]:
     """Median seconds of a frame in whole runs, and how many times as long that is as a frame of the model alone.
 
     Both take turns, because the speed of a machine that others use changes within seconds. The frames of the drive are
-    used once each, from `place` on; the model has seen those before.
+    used once each, from `index` on; the model has seen those before.
 
     frames: of a run, at least. turns_s: of all turns if frames are short.
     """
@@ -257,7 +257,7 @@ def time_runs(
     fast.seconds = []
     in_runs: list[float] = []
     with _recording(drive, fast) as recording:
-        for first in range(place, place + 2 * frames * runs, 2 * frames):
+        for first in range(index, index + 2 * frames * runs, 2 * frames):
             for alone in range(first, first + frames):
                 fast.step(preprocessor(drive.load(alone)))
             in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), preprocessor, recording)

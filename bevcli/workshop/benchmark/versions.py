@@ -153,7 +153,7 @@ def compare_with_plain(
     device = fast.runner.device
     plain = Version(textbook_version(model, device), device)
     fast.state, fast.seconds = None, []
-    found = []
+    differences = []
     for prepared in frames:
         if device.type == "cpu":
             return_freed_memory()
@@ -162,8 +162,8 @@ def compare_with_plain(
             keep_freed_memory()
         fast.runner.step(fast.state, prepared)  # to have memory to reuse
         fast.step(prepared)
-        found.append(difference(fast.queries, plain.queries))
-    return Comparison(tuple(plain.seconds), *largest_differences(found)), tuple(fast.seconds)
+        differences.append(difference(fast.queries, plain.queries))
+    return Comparison(tuple(plain.seconds), *largest_differences(differences)), tuple(fast.seconds)
 
 
 def difference(ours: QueryResults, theirs: QueryResults) -> tuple[Tensor, Tensor]:

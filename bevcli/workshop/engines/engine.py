@@ -165,8 +165,8 @@ class OpenVinoEngine(Engine):
         self.request = self.model.create_infer_request()
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        found = self.request.infer(dict(feed), share_inputs=True)
-        return {name: found[name] for name in self.outputs}
+        outputs = self.request.infer(dict(feed), share_inputs=True)
+        return {name: outputs[name] for name in self.outputs}
 
 
 def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:

@@ -277,15 +277,15 @@ def quantized_nodes(graph: Any) -> list[str]:
     """The names of the nodes of a file that compute in INT8. A name is "part.of.the.network/operator"."""
     constants = {value.name for value in graph.initializer}
     constants |= {name for node in graph.node if node.op_type == "Constant" for name in node.output}
-    found = []
+    names = []
     for node in graph.node:
         parts = node.name.partition("/")[0].split(".")
         computes = node.op_type in ("Conv", "MaxPool") or (
             node.op_type == "Add" and not constants.intersection(node.input)  # a sum of maps
         )
         if computes and parts[0] in QUANTIZED_PARTS and not DEFORMABLE.intersection(parts):
-            found.append(node.name)
-    return found
+            names.append(node.name)
+    return names
 
 
 def _unrounded(graph: Any) -> list[str]:

@@ -65,8 +65,8 @@ class ExportedModel(TemporalModel):
         # The only state of this module: it tells a resumed run whether the weights are the same.
         self.register_buffer("digest", torch.tensor(list(digest), dtype=torch.uint8))
 
-    def _require(self, names: Iterable[str], found: Collection[str], kind: str) -> None:
-        missing = [name for name in names if name not in found]
+    def _require(self, names: Iterable[str], present: Collection[str], kind: str) -> None:
+        missing = [name for name in names if name not in present]
         if missing:
             raise WeightsError(
                 f"{self.file}: has no {kind} {', '.join(missing)} (expected a file of bevcli export-onnx)"
@@ -89,8 +89,8 @@ class ExportedModel(TemporalModel):
             )
         if not prepared.pixels:  # prepared for the model itself, with which the file is compared
             prepared = replace(prepared, images=pixels_of(prepared.images, self.config.image), pixels=True)
-        found = self.outputs_by_name(self.form.feed(prepared, memory))
-        return self(found), self.form.memory(prepared, memory, found)
+        outputs = self.outputs_by_name(self.form.feed(prepared, memory))
+        return self(outputs), self.form.memory(prepared, memory, outputs)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
@@ -102,14 +102,14 @@ class ExportedModel(TemporalModel):
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         return self.kind.decode_results(self, outputs)
 
-    def forward(self, found: Mapping[str, Tensor]) -> ModelOutputs:
-        """The outputs as the model's own, with one decoder layer. found: of `outputs_by_name`."""
+    def forward(self, outputs: Mapping[str, Tensor]) -> ModelOutputs:
+        """The outputs as the model's own, with one decoder layer. outputs: of `outputs_by_name`."""
         segmentation = None
-        if "mask_logits" in found:
-            masks, classes = found["mask_logits"][None], found["mask_class_logits"][None]
+        if "mask_logits" in outputs:
+            masks, classes = outputs["mask_logits"][None], outputs["mask_class_logits"][None]
             segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
-        logits, codes = found["class_logits"][None], found["box_codes"][None]
-        return self.form.model_outputs(ModelOutputs(found["bev"], logits, codes, segmentation), found)
+        logits, codes = outputs["class_logits"][None], outputs["box_codes"][None]
+        return self.form.model_outputs(ModelOutputs(outputs["bev"], logits, codes, segmentation), outputs)
 
     def outputs_by_name(self, feed: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Every output of the file by name. feed: its inputs by name, see `ExportForm.feed`.
@@ -118,19 +118,19 @@ class ExportedModel(TemporalModel):
         and where more cameras see one cell than the file has slots for.
         """
         try:
-            found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
+            outputs = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
         except Exception as error:  # each engine has classes of its own
             reason = reason_of(error)
             raise WeightsError(f"{self.file}: fails when it runs ({reason:.300}); export it again") from error
         for port in self.form.outputs(decode=False):
-            if (shape := found[port.name].shape) != port.shape:
+            if (shape := outputs[port.name].shape) != port.shape:
                 raise WeightsError(
                     f"{self.file}: output {port.name} has shape {shape} (expected {port.shape}); export it again"
                 )
-        most, slots = int(found["most_cameras_per_cell"][0]), self.metadata.cameras_per_cell
+        most, slots = int(outputs["most_cameras_per_cell"][0]), self.metadata.cameras_per_cell
         if most > slots:
             raise WeightsError(
                 f"{self.file}: takes {counted(slots, 'cameras')} per BEV cell, but the sequence has {most}: "
                 f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
-        return {name: torch.from_numpy(value) for name, value in found.items()}
+        return {name: torch.from_numpy(value) for name, value in outputs.items()}
