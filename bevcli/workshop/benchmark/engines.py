@@ -1,7 +1,8 @@
 """`compare_engines`: PyTorch and the engines side by side, alternating in one process."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from statistics import median
 from typing import Any
 
@@ -85,7 +86,10 @@ def compare_engines(config: ModelConfig, frames: int, report: Report) -> EngineT
     versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []
     network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
-    for engine, precision in [*product([TORCH], ("fp32", "bf16")), *product(installed_engines(), ("fp32", "int8"))]:
+    pairs: Iterable[tuple[str, Any]] = chain(
+        product([TORCH], ("fp32", "bf16")), product(installed_engines(), ("fp32", "int8"))
+    )
+    for engine, precision in pairs:
         model = Model(network, engine=engine, precision=precision)
         try:
             model = model.in_engine(drive.rig, drive, report=report)
