@@ -14,6 +14,7 @@ Group = Literal[
     "bevcli.label_formats",
     "bevcli.engines",
     "bevcli.commands",
+    "bevcli.extensions",
 ]
 
 # Group -> name -> "module:attribute".

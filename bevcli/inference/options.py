@@ -65,5 +65,4 @@ class ModelOptions:
         help="Drive whose first frames give the ranges of numbers for int8. Default: the first drive that is run.",
         metavar="SEQUENCE",
         flag="--int8-drive",
-        old=("--calibrate-with",),
     )

@@ -48,4 +48,8 @@ OWN: dict[Group, dict[str, str]] = {
         "train": "bevcli.workshop.training.train_command:train",
         "validate": "bevcli.workshop.training.validate_command:validate",
     },
+    "bevcli.extensions": {
+        "project-debug.motion": "bevcli.workshop.calibration.command:CHECK_MOTION",
+        "run.calibrate": "bevcli.workshop.calibration.command:CALIBRATE_FIRST",
+    },
 }

@@ -33,7 +33,6 @@ class BenchOptions:
         help="Number of timed frames, after the warm-up.",
         metavar="N",
         flag="--count",
-        old=("--frames",),
         minimum=1,
     )
     against: Literal["plain"] | None = option(

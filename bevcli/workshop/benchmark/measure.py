@@ -16,7 +16,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.background import write_behind
+from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
@@ -276,7 +276,9 @@ def _time_run(
         fast.state = step[2]
         return True
 
-    write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state))
+    with WriteBehind(record) as writer:
+        for step in fast.runner.run(drive, places, preprocessor, fast.state):
+            writer.put(step)
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 

@@ -24,7 +24,6 @@ class QuantizeOptions:
         help="Drive whose images give the ranges of the numbers for int8; required. Repeatable.",
         metavar="SEQUENCE",
         flag="--int8-drive",
-        old=("--calibrate",),
         repeatable=True,
     )
     frames: int = option(
@@ -32,7 +31,6 @@ class QuantizeOptions:
         help="Number of frames for the calibration, evenly spaced over all drives.",
         metavar="N",
         flag="--count",
-        old=("--frames",),
         minimum=1,
     )
     check: Path | None = option(

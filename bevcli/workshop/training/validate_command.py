@@ -16,9 +16,7 @@ PANEL = "Score"
 def validate(
     model: Annotated[
         str | None,
-        model_option(
-            "A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.", old=("",)
-        ),
+        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
