@@ -56,8 +56,6 @@ WINGS: dict[str, set[str]] = {
 LEFT = {
     "bevcli.cli.eval",
     "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
-    "bevcli.inference.preprocess",
-    "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
     "bevcli.rig.check_calibration", "bevcli.runs.files",
     "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",
     "bevcli.sequences.nuscenes.format", "bevcli.sequences.nuscenes.map_expansion",

@@ -22,7 +22,6 @@ from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
-from bevcli.workshop.engines.export_form import pad_value_bgr
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
@@ -69,7 +68,7 @@ class Preprocessor:
         # here, and where it has more threads than there are processors, those of the model no longer spin.
         empty = np.zeros((1, len(names), height, width, 3), self._dtype)
         if self.pixels:
-            empty[:] = pad_value_bgr(self.config)
+            empty[:] = self.config.image.pad_bgr
         images = torch.from_numpy(empty).movedim(-1, 2)
 
         def write(camera: int, name: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from bevcli.frame import Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.frame import BevMap, Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
@@ -20,6 +20,7 @@ from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.config import ImageConfig
+from bevcli.model.network import Network
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
@@ -78,7 +79,7 @@ class Runner:
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
         """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
-        return Preprocessor(self.config, cameras, pixels=self.model.takes_pixels)
+        return Preprocessor(self.config, cameras, pixels=getattr(self.model, "takes_pixels", False))
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
@@ -124,15 +125,18 @@ class Runner:
     def _decoded(self, last_layers: ModelOutputs, frame: int) -> dict[str, Any]:
         """The fields of a prediction that are decoded from the outputs of the last layers, on the CPU."""
         self.clock.waited()
-        boxes = self.model.decode_boxes(last_layers)
-        if self.config.has_tracks and not self.tracks:
-            boxes = without_identities(boxes)
-        self.clock.mark("box_decoding")
-        results = with_command(self.model.decode_results(last_layers), self.options.commands, frame)
-        segmentation = self.model.decode_map(last_layers)
-        if segmentation is not None:
-            self.clock.mark("map_merging")
-        return {"boxes": boxes, "results": results, "segmentation": segmentation}
+        boxes, segmentation, results = Boxes3D.empty(), None, []
+        for decoded in self.model.decode(last_layers):
+            if isinstance(decoded, Boxes3D):
+                boxes = without_identities(decoded) if self.config.has_tracks and not self.tracks else decoded
+                self.clock.mark("box_decoding")
+            elif isinstance(decoded, BevMap):
+                segmentation = decoded
+                self.clock.mark("map_merging")
+            else:
+                results.append(decoded)
+        results_with_command = with_command(tuple(results), self.options.commands, frame)
+        return {"boxes": boxes, "results": results_with_command, "segmentation": segmentation}
 
     def frames(
         self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor
@@ -203,7 +207,7 @@ class Runner:
         return usable
 
     def _probe(self) -> AttentionProbe | None:
-        if not self.options.ask_attention or not self.model.has_parts:
+        if not self.options.ask_attention or not isinstance(self.model, Network):
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))

@@ -95,11 +95,10 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     np.testing.assert_allclose(found[0, 1], np.full_like(pixels, 120), atol=tolerance, rtol=0)
 
 
-@pytest.mark.parametrize("decoder", ["decode_boxes", "decode_map", "decode_results"])
-def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, decoder, monkeypatch):
+def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, monkeypatch):
     exported, decoded = load_exported(small_file, "onnxruntime"), object()
-    monkeypatch.setattr(exported.kind, decoder, lambda model, outputs: (model, outputs, decoded))
-    assert getattr(exported, decoder)("outputs") == (exported, "outputs", decoded)
+    monkeypatch.setattr(exported.kind, "decode", lambda model, outputs: (model, outputs, decoded))
+    assert exported.decode("outputs") == (exported, "outputs", decoded)
 
 
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))

@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.frame import Frame, Prediction
@@ -21,11 +22,13 @@ from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
+from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.recording.writer import Recording
+from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.versions import Comparison, Version, compare_with_plain, wait_for
 
@@ -318,8 +321,20 @@ def count_operations(config: ModelConfig, hits_per_camera: tuple[int, ...]) -> f
             hits_per_camera=hits_per_camera,
             cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
         )
-        model.run_on_shapes(torch.empty(1, cameras, 3, height, width), torch.zeros(cameras, dtype=torch.int64), hits)
+        images, camera_index = torch.empty(1, cameras, 3, height, width), torch.zeros(cameras, dtype=torch.int64)
+        for run in for_model("operations", type(model)):
+            run(model, images, camera_index, hits)
     return float(counter.get_total_flops())
+
+
+def run_recurrent_frame(model: BEVFormer, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+    """A frame with history, for a network on the device "meta".
+
+    images: (1, N, 3, H, W). camera_index: (N,). hits: as in a real frame.
+    """
+    history = torch.empty(1, *model.bev_queries.embedding.shape)
+    can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
+    model.compute(EncoderInputs(images, camera_index, can_bus, shift, hits, None, history, rotation))
 
 
 def _best_seconds(work: Callable[[], object], device: torch.device) -> float:

@@ -17,6 +17,7 @@ from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, 
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
+from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
 from bevcli.workshop.engines.export_cache import NEAR_M
 
@@ -72,7 +73,8 @@ class Version:
         assert self.state is not None
         assert self.state.stamp is not None
         past = [(stamp, drive.pose(stamp.index)) for stamp in drive.stamps[: self.state.stamp.index]]
-        self.state = replace(self.state, memory=model_class(self.runner.config).with_past(self.state.memory, past))
+        for with_past in for_model("past", model_class(self.runner.config))[:1]:
+            self.state = replace(self.state, memory=with_past(self.state.memory, past))
 
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: ModelOutputs) -> None:
         codes = outputs.box_codes[-1, 0]
@@ -92,7 +94,7 @@ def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
     stages = {module: stage.replace("_", " ") for module, stage in model.stages.items()}
     if "" in stages:  # of the whole model, a CUDA graph
         return stages, {}
-    if not model.has_parts:
+    if not isinstance(model, Network):
         return stages, dict.fromkeys(stages, "input")
     parts = {
         "temporal_self_attention": "temporal attention",

@@ -15,9 +15,9 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import Model, Report, tracker_of_table
 from bevcli.inference.options import ModelOptions
 from bevcli.model.config import ModelConfig
-from bevcli.model.temporal_model import model_class
 from bevcli.registry import load
 from bevcli.workshop.engines.export_cache import exported_for_rig
+from bevcli.workshop.engines.export_form import export_form
 from bevcli.workshop.engines.export_onnx import EXPORTERS, QUANTIZERS, check_size, require
 from bevcli.workshop.engines.exported import Arrays, ExportedModel, LoadedFile
 
@@ -96,7 +96,7 @@ class Engine(LoadedFile):
             raise BevcliError(f"`device={options.device}`: `engine={name}` runs on the CPU: leave out the option")
         cls.require_packages()
         require(*EXPORTERS, *(QUANTIZERS if options.precision == "int8" else ()))
-        model_class(config).export_form(config, len(config.cameras))
+        export_form(config, len(config.cameras))
 
     @classmethod
     def export(cls, model: Model, rig: CameraRig, drive: Sequence | None, report: Report) -> Model:

@@ -27,7 +27,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
-from bevcli.workshop.engines.export_form import ExportForm, Port, pad_value_bgr
+from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
 from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import check_output, whole_file
 
@@ -89,7 +89,7 @@ def export_onnx(
             f"`deformable_convolution={chosen.deformable_convolution}`"
         )
     config = network.config
-    form = network.export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
+    form = export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
     slots = min(chosen.cameras_per_cell, form.cameras)
     inputs, outputs = form.inputs, form.outputs(decode=chosen.decode)
     step = form.step(network, chosen.deformable_convolution, slots, decode=chosen.decode).eval()
@@ -148,7 +148,7 @@ def metadata(
         "image_size": image.size,
         "crop": image.crop_box,
         "padded_size": image.padded_size,
-        "pad_value_bgr": pad_value_bgr(config),
+        "pad_value_bgr": config.image.pad_bgr,
         "x_range_m": grid.x_range_m,
         "y_range_m": grid.y_range_m,
         "bev_rows_columns": (grid.rows, grid.columns),

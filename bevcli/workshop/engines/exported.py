@@ -1,7 +1,7 @@
 """An exported file in the place of a model."""
 
 import hashlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.printing import counted, reason_of
-from bevcli.workshop.engines.export_form import pixels_of
+from bevcli.workshop.engines.export_form import export_form, pixels_of
 from bevcli.workshop.engines.export_onnx import read_metadata
 
 Arrays = Mapping[str, np.ndarray]
@@ -58,7 +58,7 @@ class ExportedModel(TemporalModel):
         self.file, self.engine, self.metadata = file, engine, metadata
         self._require(("images",), engine.input_shapes, "input")
         self.kind = model_class(self.config)
-        self.form = self.kind.export_form(self.config, self.cameras)
+        self.form = export_form(self.config, self.cameras)
         self._require((port.name for port in self.form.outputs(decode=False)), engine.outputs, "output")
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
@@ -92,15 +92,9 @@ class ExportedModel(TemporalModel):
         outputs = self.outputs_by_name(self.form.feed(prepared, memory))
         return self(outputs), self.form.memory(prepared, memory, outputs)
 
-    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
+    def decode(self, outputs: ModelOutputs) -> Iterator[Boxes3D | BevMap | FrameResult]:
         """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
-        return self.kind.decode_boxes(self, outputs)
-
-    def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
-        return self.kind.decode_map(self, outputs)
-
-    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
-        return self.kind.decode_results(self, outputs)
+        return self.kind.decode(self, outputs)
 
     def forward(self, outputs: Mapping[str, Tensor]) -> ModelOutputs:
         """The outputs as the model's own, with one decoder layer. outputs: of `outputs_by_name`."""
