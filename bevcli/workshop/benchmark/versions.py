@@ -13,7 +13,7 @@ from bevcli.frame import Prediction
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
-from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
@@ -121,7 +121,7 @@ def textbook_version(model: Network, device: torch.device) -> Network:
     return textbook
 
 
-class PaddedSampling(nn.Module):
+class PaddedSampling(GridSampling):
     """`grid_sample` of all maps at once; the queries of every map are padded to the longest list."""
 
     def forward(
