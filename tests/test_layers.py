@@ -42,9 +42,9 @@ WINGS: dict[str, set[str]] = {
     "batch": set(),
     "benchmark": {"engines"},
     "calibration": set(),
-    "engines": {"benchmark"},
+    "engines": set(),
     "formats": {"vad"},
-    "robustness": {"calibration", "engines", "scores", "synth", "training"},
+    "robustness": {"calibration", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
     "scores": set(),
     "training": {"synth"},
@@ -53,9 +53,6 @@ WINGS: dict[str, set[str]] = {
 }
 # What in the core still imports the workshop.
 LEFT = {
-    "bevcli.cli.progress", "bevcli.cli.weights",
-    "bevcli.inference.load", "bevcli.inference.run", "bevcli.inference.session",
-    "bevcli.runs.run_into_folder",
 }  # fmt: skip
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
@@ -213,8 +210,7 @@ def test_only_a_download_uses_libcurl_and_http():
                 names = [node.module, *(f"{node.module}.{each.name}" for each in node.names)]
             for name in names:
                 users.setdefault(name, set()).add(path.relative_to(ROOT).as_posix())
-    assert users["pycurl"] == {"weights/download.py"}
-    assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
+    assert users["pycurl"] == {"weights/fetch.py"}
     assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/progress.py"}
     assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
     assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()

@@ -58,8 +58,8 @@ class Network(TemporalModel):
 
     def detect(self, bev: Tensor) -> ModelOutputs:
         """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""
-        # In float32: half precision is too coarse for the refinement of boxes.
-        with torch.autocast(bev.device.type, enabled=False):
+        # In float32: half precision is too coarse for the refinement of boxes. PyTorch has no autocast for "meta".
+        with torch.autocast("cpu" if bev.is_meta else bev.device.type, enabled=False):
             class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:

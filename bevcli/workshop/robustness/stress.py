@@ -18,7 +18,6 @@ from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
 from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.calibration.result import CorrectedDrive
-from bevcli.workshop.engines.in_engine import in_engine
 from bevcli.workshop.robustness.conditions import Condition, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults, read_results
@@ -87,7 +86,7 @@ def stress(
     """
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
-    model = in_engine(model, drives[0].rig, drives[0])
+    model = model.in_engine(drives[0].rig, drives[0])
     store = FrameStore()
     scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
     against = None if options.against is None else read_results(options.against)

@@ -1,9 +1,6 @@
-"""The machine's peak throughput, measured, and the number of operations of a frame, counted."""
+"""The arithmetic operations of a frame, counted."""
 
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,55 +8,14 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.prepare import DTYPES, Precision
 from bevcli.registry import for_model
-
-# Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
-CPU_EDGE, GPU_EDGE = 2048, 8192
-COPIED_FLOATS = 1 << 26
-REPEATS = 8
 
 # Bilinear sampling: a product and a sum for each of four neighbours, then a product and a sum with the weight.
 OPERATIONS_PER_SAMPLE = 4 * 2 + 2
-
-
-@dataclass(frozen=True)
-class MachineLimits:
-    """Peak throughput.
-
-    Attributes:
-        gemm_gflops: rate of matrix products, 10^9 operations a second.
-        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
-    """
-
-    gemm_gflops: float
-    copy_gbs: float
-
-    def fastest(self, other: "MachineLimits") -> "MachineLimits":
-        """The higher of two measurements; disturbances only make a measurement lower."""
-        return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
-
-
-def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
-    """The best of several matrix products in a precision, and of several copies, on a device."""
-    edge = GPU_EDGE if device.type == "cuda" else CPU_EDGE
-    matrix = torch.randn(edge, edge, device=device).to(DTYPES[precision])
-    product = torch.empty_like(matrix)
-    source, target = (torch.ones(COPIED_FLOATS, device=device) for _ in range(2))
-    gemm_s = _best_seconds(lambda: torch.mm(matrix, matrix, out=product), device)
-    copy_s = _best_seconds(lambda: target.copy_(source), device)
-    return MachineLimits(2 * edge**3 / gemm_s / 1e9, 2 * 4 * COPIED_FLOATS / copy_s / 1e9)
-
-
-def wait_for(device: torch.device) -> None:
-    """Returns when a GPU has finished all queued work; at once on a CPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    if device.type == "mps":
-        torch.mps.synchronize()
 
 
 def count_operations(config: ModelConfig, hits_per_camera: tuple[int, ...]) -> float:
@@ -95,16 +51,10 @@ def run_recurrent_frame(model: BEVFormer, images: Tensor, camera_index: Tensor, 
     model.compute(EncoderInputs(images, camera_index, can_bus, shift, hits, None, history, rotation))
 
 
-def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
-    work()
-    best = float("inf")
-    for _ in range(REPEATS):
-        wait_for(device)
-        began = time.perf_counter()
-        work()
-        wait_for(device)
-        best = min(best, time.perf_counter() - began)
-    return best
+def run_window(model: BEVFormerV2, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+    """See `run_recurrent_frame`. Every frame of the window is encoded anew; its images were seen before."""
+    features, frames = model.image_features(images, camera_index), len(model.config.frames)
+    model.compute(((features, hits),) * frames, range(frames))
 
 
 def _sampling_operations(*_shapes: Any, out_shape: Any, **_options: Any) -> int:
