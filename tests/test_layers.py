@@ -43,7 +43,7 @@ WINGS: dict[str, set[str]] = {
     "benchmark": {"engines"},
     "calibration": set(),
     "engines": set(),
-    "formats": {"vad"},
+    "formats": set(),
     "robustness": {"calibration", "scores", "synth", "training"},
     "synth": {"calibration", "formats", "vad"},
     "scores": set(),

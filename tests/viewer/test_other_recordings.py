@@ -11,7 +11,7 @@ from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording

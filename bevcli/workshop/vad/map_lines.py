@@ -68,6 +68,8 @@ class MapLines(FrameResult):
     kind = "map_lines"
     file_name = "map_lines.json"
     writer = LinesWriter
+    true_file = TRUE_LINES
+    true_names = LINE_CLASSES
 
     points: tuple[Array, ...]
     classes: NDArray[np.str_]
