@@ -45,7 +45,7 @@ WINGS: dict[str, set[str]] = {
     "engines": {"benchmark"},
     "explain": set(),
     "formats": {"vad"},
-    "robustness": {"calibration", "engines", "synth", "training"},
+    "robustness": {"calibration", "engines", "synth"},
     "synth": {"calibration", "formats", "vad"},
     "tracking_scores": set(),
     "training": {"synth", "tracking_scores", "vad"},
@@ -58,7 +58,7 @@ LEFT = {
     "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
     "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
     "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
-    "bevcli.rig.check_calibration", "bevcli.runs.files", "bevcli.runs.run_into_folder",
+    "bevcli.runs.files", "bevcli.runs.run_into_folder",
     "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",
     "bevcli.sequences.nuscenes.format", "bevcli.sequences.nuscenes.map_expansion",
 }  # fmt: skip

@@ -97,14 +97,13 @@ def run(
 def _calibrated(drive: "Sequence") -> "Sequence":
     """The drive with the rig that it shows; what is corrected is printed."""
     from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration.calibrate import STEPS, calibrate
-    from bevcli.workshop.calibration.estimates import change_text
-    from bevcli.workshop.calibration.result import CorrectedDrive
+    from bevcli.workshop.calibration.calibrate import STEPS, CorrectedDrive, calibrate
+    from bevcli.workshop.calibration.estimates import Verdict, change_text
 
     with Progress(STEPS, "steps of the calibration") as progress:
         result = calibrate(drive, after_step=progress.advance)
     for each in result.cameras:
-        reason = change_text(each) if each in result.corrected else each.reason
+        reason = each.reason if each.verdict is not Verdict.CORRECTED else change_text(each)
         say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
     return CorrectedDrive(drive, result)
 

@@ -10,7 +10,7 @@ from bevcli.findings import Finding, errors_of, rig_error
 from bevcli.frame import DerivedSequence, FrameStamp, Sequence as Drive
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig.rig_report import rig_errors
+from bevcli.rig.rig_checks import rig_errors
 
 MAX_SPEED = 70.0  # m/s, 250 km/h
 MIN_MOVING_SPEED = 1.0  # m/s; at lower speeds the direction of motion is noise
@@ -60,17 +60,11 @@ def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Drive:
-    """T poses of a drive.
+    """T poses of a drive."""
 
-    Attributes:
-        rotations: (T, 3, 3), world_from_ego.
-        steps: (T-1, 3), from each pose to the next, metres in the world frame.
-        seconds: (T-1,), duration of each step.
-    """
-
-    rotations: Array
-    steps: Array
-    seconds: Array
+    rotations: Array  # (T, 3, 3), world_from_ego
+    steps: Array  # (T-1, 3), from each pose to the next, metres in the world frame
+    seconds: Array  # (T-1,), duration of each step
 
     @property
     def speeds(self) -> Array:

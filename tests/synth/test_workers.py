@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 from bevcli.errors import InputError, OutputError
-from bevcli.workshop.synth.export import render
+from bevcli.workshop.synth.drive import render
 from bevcli.workshop.synth.workers import shared_out
 
 

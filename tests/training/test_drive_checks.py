@@ -16,9 +16,8 @@ from small_fleet import write_fleet
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
 from bevcli.sequences.native.folder import FolderSequence
-from bevcli.workshop.synth.drives import FolderDrives
+from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.synth.splits import read_split, scored_drives
 from bevcli.workshop.training.changes import with_changes
 from bevcli.workshop.training.drive_checks import check_scored_drives, check_training_drives
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training

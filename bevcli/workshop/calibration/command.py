@@ -23,7 +23,7 @@ def calibrate(
 
     Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
     fine, corrected, or not measurable. Writes calibration.json with the corrected rig, report.json with all numbers,
-    calibration.png and recording.rrd, which show the cameras before and after. Nothing in SEQUENCE is changed.
+    and calibration.png, which shows the cameras before and after. Nothing in SEQUENCE is changed.
     `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
     """
     from bevcli.cli.progress import Progress

@@ -1,22 +1,29 @@
-"""calibration.png and recording.rrd: what each camera sees, with the stated and with the measured calibration."""
+"""calibration.png: what each camera sees, with the stated and with the measured calibration."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from bevcli.geometry.cameras import CameraRig
-from bevcli.recording import entities, log_cameras
-from bevcli.recording.blueprint import Layout
-from bevcli.rig.drawings import FAINT, INK, PAPER, save
-from bevcli.rig.mounting import horizon
-from bevcli.rig.overlay import GROUND, HORIZON, draw_lines, ground_lines, visible_runs
-from bevcli.rig.rig_recording import Lines, camera_views, log_image, log_lines, rig_recording, rig_view
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array
+from bevcli.rig.drawings import (
+    FAINT,
+    GROUND,
+    HORIZON,
+    INK,
+    PAPER,
+    draw_lines,
+    ground_lines,
+    horizon,
+    save,
+    visible_runs,
+)
+from bevcli.workshop.calibration.adjustment import geometry_at
 from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, change_text
 from bevcli.workshop.calibration.measure import Measurement
 
@@ -28,7 +35,9 @@ HEADINGS = (
     "measured: ground grid (green), horizon (yellow)",
     "stated minus measured, 3 deviations",
 )
-TABLE = "calibration"  # in the recording
+MOST_SHOWN = 60  # matches of a camera
+DEPTHS_M = np.geomspace(0.7, 300, 400)  # along the ray of a point
+PIECE_PX = 30.0  # length of the shown piece of an epipolar line to each side
 
 
 def write_sheet(path: Path, measurement: Measurement, cameras: tuple[CameraEstimate, ...]) -> None:
@@ -42,29 +51,50 @@ def write_sheet(path: Path, measurement: Measurement, cameras: tuple[CameraEstim
         for column in (0, 1):
             axes = figure.add_axes((0.01 + 0.38 * column, bottom + 0.1 / height, 0.37, size))
             _draw_image(axes, measurement, row, measured=column == 1)
-        figure.text(0.01, bottom + size + 0.13 / height, _title(estimate), color=COLORS[estimate.verdict], fontsize=10)
+        title = f"{estimate.camera}: {estimate.verdict.value}; {estimate.reason or change_text(estimate)}"
+        figure.text(0.01, bottom + size + 0.13 / height, title, color=COLORS[estimate.verdict], fontsize=10)
         axes = figure.add_axes((0.82, bottom + 0.45 / height, 0.16, size - 0.4 / height))
         _draw_ellipse(axes, estimate)
     save(figure, path)
 
 
-def _title(estimate: CameraEstimate) -> str:
-    text = estimate.reason or change_text(estimate)
-    return f"{estimate.camera}: {estimate.verdict.value}; {text}"
-
-
 def _draw_image(axes: Axes, measurement: Measurement, index: int, *, measured: bool) -> None:
-    """The image with the ground grid and the horizon, matched points, and pieces of their epipolar lines."""
+    """The image with the ground grid and the horizon, matched points, and pieces of their epipolar lines.
+
+    Of a camera's pairs of images, that with most matches is shown.
+    """
     axes.set(xticks=[], yticks=[])
-    grey, camera = measurement.image(index), measurement.camera(index, measured=measured)
-    blank = np.full((camera.height, camera.width), 40, dtype=np.uint8)
-    canvas = np.repeat((blank if grey is None else grey)[..., None], 3, axis=-1)
+    unknowns, views, matches = measurement.unknowns, measurement.views, measurement.matches
+    x = measurement.solution.x * (1.0 if measured else 0.0)
+    camera = replace(views.rig.cameras[index], ego_from_camera=unknowns.ego_from_camera(x)[index])
+    counts = np.bincount(matches.group[matches.same], minlength=len(unknowns.groups))
+    counts = np.where(unknowns.groups[:, 1] == index, counts, 0)
+    group = int(np.argsort(counts)[-1])
+    grey = np.full((camera.height, camera.width), 40, dtype=np.uint8)
+    if counts[group]:
+        grey = views.sides(views.groups()[group])[1].pixels
+    canvas = np.repeat(grey[..., None], 3, axis=-1)
     draw_lines(canvas, ground_lines(camera), GROUND, 1)
     draw_lines(canvas, visible_runs(horizon(camera)), HORIZON, 2)
-    for point, pieces in measurement.shown_matches(index, measured=measured):
-        draw_lines(canvas, pieces, LINE, 2)
+    mine = np.flatnonzero(matches.group == group) if counts[group] else np.zeros(0, dtype=np.int64)
+    motion = geometry_at(unknowns, x).camera_b_from_camera_a[group]
+    for match in mine[:: 1 + len(mine) // MOST_SHOWN]:
+        point = matches.pixels_b[match]
+        draw_lines(canvas, _epipolar_piece(camera, motion, matches.rays_a[match], point), LINE, 2)
         cv2.circle(canvas, (round(point[0]), round(point[1])), 4, POINT, -1, cv2.LINE_AA)
     axes.imshow(canvas)
+
+
+def _epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, point: Array) -> list[Array]:
+    """The part of a ray's image that is nearest to a point, as lines (P, 2) in pixels."""
+    points = DEPTHS_M[:, None] * ray @ camera_b_from_camera_a[:3, :3].T + camera_b_from_camera_a[:3, 3]
+    pixels = camera.project(points)[0]
+    distance = np.linalg.norm(pixels - point, axis=-1)
+    if not np.isfinite(distance).any():
+        return []
+    nearest = pixels[np.nanargmin(distance)]
+    near = np.linalg.norm(pixels - nearest, axis=-1) < PIECE_PX
+    return visible_runs(np.where(near[:, None], pixels, np.nan))
 
 
 def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
@@ -84,51 +114,3 @@ def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
     axes.set_ylabel("pitch, degrees", color=FAINT, fontsize=8, labelpad=1)
     axes.tick_params(colors=FAINT, labelsize=7)
     axes.grid(color=FAINT, alpha=0.25)
-
-
-def write_calibration_recording(path: Path, measurement: Measurement, table: str) -> None:
-    """Write the recording: frame 0 shows the stated calibration, frame 1 the measured one. Raises OutputError.
-
-    table: the text of the result.
-    """
-    rig = measurement.views.rig
-    with rig_recording(path, "bevcli-calibrate", rig, _layout(rig)) as stream:
-        text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
-        stream.log(TABLE, text, static=True)
-        for index in range(len(rig.cameras)):
-            _log_image(stream, measurement, index)
-        for step in (0, 1):
-            stream.set_time(entities.FRAME_TIMELINE, sequence=step)
-            for index in range(len(rig.cameras)):
-                _log_camera(stream, measurement, index, measured=step == 1)
-
-
-def _log_image(stream: rr.RecordingStream, measurement: Measurement, index: int) -> None:
-    """What both calibrations share: the image and its matched points."""
-    name, pixels = measurement.views.rig.names[index], measurement.image(index)
-    if pixels is None:
-        return
-    log_image(stream, name, pixels)
-    points = [point for point, _ in measurement.shown_matches(index, measured=True)]
-    dots = rr.Points2D(points, colors=POINT, radii=rr.Radius.ui_points(2.5), draw_order=30)
-    stream.log(entities.overlay(name, "matches"), dots, static=True)
-
-
-def _log_camera(stream: rr.RecordingStream, measurement: Measurement, index: int, *, measured: bool) -> None:
-    """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
-    camera, matches = measurement.camera(index, measured=measured), measurement.shown_matches(index, measured=measured)
-    stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera))
-    pieces = [piece for _, lines in matches for piece in lines]
-    lines: dict[str, Lines] = {
-        "epipolar_lines": (pieces, LINE, 1.2),
-        "ground_grid": (ground_lines(camera), GROUND, 0.6),
-        "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
-    }
-    log_lines(stream, camera, lines, static=False)
-
-
-def _layout(rig: CameraRig) -> Layout:
-    scene = rig_view(rig, ("matches", "epipolar_lines", "ground_grid", "horizon"))
-    middle = rrb.Horizontal(scene, rrb.TextDocumentView(origin=TABLE, name="Calibration"), column_shares=[2, 5])
-    rows = camera_views(rig)
-    return Layout(rrb.Vertical(*rows[:1], middle, *rows[1:]), rrb.TimePanel(state="collapsed"))

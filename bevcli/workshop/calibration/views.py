@@ -44,19 +44,12 @@ class View:
 
 @dataclass(frozen=True)
 class Views:
-    """What a drive shows.
+    """What a drive shows."""
 
-    Attributes:
-        stated: the rig of the frames.
-        rig: the same with cameras for the reduced images.
-        pairs: places of the frames of each pair.
-        of: (place, camera index) -> view; missing images are left out.
-    """
-
-    stated: CameraRig
-    rig: CameraRig
-    pairs: tuple[tuple[int, int], ...]
-    of: dict[tuple[int, int], View]
+    stated: CameraRig  # the rig of the frames
+    rig: CameraRig  # the same with cameras for the reduced images
+    pairs: tuple[tuple[int, int], ...]  # places of the frames of each pair
+    of: dict[tuple[int, int], View]  # (place, camera index) -> view; missing images are left out
 
     def groups(self) -> list[tuple[int, int, int]]:
         """(pair, camera of its first frame, camera of its second one): each camera with itself and its neighbours."""

@@ -43,8 +43,7 @@ def stress(
     from bevcli.sequences.open import open_sequence
     from bevcli.sequences.selection import select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.report import stress_table
-    from bevcli.workshop.robustness.results import read_results
+    from bevcli.workshop.robustness.results import read_results, stress_table
     from bevcli.workshop.robustness.stress import stress
     from bevcli.workshop.synth.drives import open_drives
 

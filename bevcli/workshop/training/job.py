@@ -19,10 +19,9 @@ from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
 from bevcli.weights.fetch import weights_file
-from bevcli.workshop.synth.drives import Drives, check_training_seeds
+from bevcli.workshop.synth.drives import Drives, check_training_seeds, split_of, training_drives, write_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
-from bevcli.workshop.synth.splits import split_of, training_drives, write_split
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.backbone_weights import start_backbone
 from bevcli.workshop.training.changes import with_changes

@@ -21,8 +21,8 @@ from bevcli.inference.machine import peak_memory
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.synth.splits import read_split
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
 from bevcli.workshop.training.options import Preset, TrainOptions
 from bevcli.workshop.training.presets import INSIDE_PERCENT, PRESETS, DataFacts, look_at, model_table

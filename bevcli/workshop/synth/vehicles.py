@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from bevcli.workshop.synth.assets.mesh import Mesh, Row, axles, block, made, rod, side_profile, twin_blocks, wheel
-from bevcli.workshop.synth.assets.paint import (
+from bevcli.workshop.synth.mesh import (
     CARGO,
     DYED_PAINT,
     GLASS,
@@ -13,6 +12,15 @@ from bevcli.workshop.synth.assets.paint import (
     TRIM,
     Finish,
     Material,
+    Mesh,
+    Row,
+    axles,
+    block,
+    made,
+    rod,
+    side_profile,
+    twin_blocks,
+    wheel,
 )
 
 

@@ -10,7 +10,7 @@ Positions are in the world frame in metres, colours are linear RGB.
 import numpy as np
 
 from bevcli.jit import njit
-from bevcli.workshop.synth.assets.paint import Material
+from bevcli.workshop.synth.mesh import Material
 
 LIGHT_LIMIT = 1.6  # the brightest light in the display table
 ROUGH_TEXEL_M = 0.25  # texel size of the ground's roughness

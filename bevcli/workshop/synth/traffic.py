@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.workshop.synth.assets.catalog import Body
-from bevcli.workshop.synth.assets.people import RIDDEN
-from bevcli.workshop.synth.world.city import CityPlan
-from bevcli.workshop.synth.world.route import JunctionPass, Route
+from bevcli.workshop.synth.catalog import Body
+from bevcli.workshop.synth.city import CityPlan, JunctionPass, Route
+from bevcli.workshop.synth.people import RIDDEN
 
 Light = Literal["red", "yellow", "green"]
 YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all directions
@@ -66,15 +65,10 @@ HARDEST = -3.4  # m/s², strongest deceleration
 
 @dataclass(frozen=True)
 class Unit:
-    """One part of a vehicle: the vehicle itself, its tractor or its trailer.
+    """One part of a vehicle: the vehicle itself, its tractor or its trailer."""
 
-    Attributes:
-        body: size and looks.
-        lag: distance from the vehicle's front to the front of this unit, metres.
-    """
-
-    body: Body
-    lag: float
+    body: Body  # size and looks
+    lag: float  # distance from the vehicle's front to the front of this unit, metres
 
 
 @dataclass(eq=False)
@@ -233,23 +227,14 @@ _DIFFERENCE_S = 0.02  # half the interval of the central differences that give v
 
 @dataclass(frozen=True)
 class ActorState:
-    """An actor at one time.
+    """An actor at one time."""
 
-    Attributes:
-        body: size and looks.
-        position: (3,) middle of the bottom, world, metres.
-        yaw: world, radians.
-        attribute: nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes.
-        velocity: (2,) world, m/s.
-        pose: index of the mesh among the variant's poses; taken modulo their number.
-    """
-
-    body: Body
-    position: Array
-    yaw: float
-    attribute: str
-    velocity: Array = field(default_factory=lambda: np.zeros(2))
-    pose: int = 0
+    body: Body  # size and looks
+    position: Array  # (3,) middle of the bottom, world, metres
+    yaw: float  # world, radians
+    attribute: str  # nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes
+    velocity: Array = field(default_factory=lambda: np.zeros(2))  # (2,) world, m/s
+    pose: int = 0  # index of the mesh among the variant's poses; taken modulo their number
 
 
 @dataclass(frozen=True)
