@@ -9,7 +9,7 @@ import bevcli.workshop.synth
 
 ROOT = Path(bevcli.workshop.synth.__file__).parent
 ORDER = (
-    *("corruptions", "workers", "options"),
+    *("corruptions", "options"),
     *("mesh", "vehicles", "people", "street_objects", "catalog"),
     *("city", "looks", "ground", "traffic", "roadside", "scenery", "simulation"),
     *("rig", "shading_kernels", "renderer"),

@@ -24,6 +24,9 @@ OF_CAMERA = 7  # unknowns: rotation, position, delay
 HEIGHT = 5  # place of a camera's height among them
 OF_PAIR = 3  # the error of the vehicle's rotation
 OF_RIG = 3  # scale of the ego-motion, slope of the road along x and y
+# Standard deviations of what is stated: capture times, the vehicle's rotation between two frames, the scale of the
+# ego-motion, and the tilt of the ego frame over the road.
+DELAY_S, TURN, SCALE, TILT = 0.1, np.radians(0.1), 0.003, np.radians(0.2)
 
 
 @dataclass(frozen=True)
@@ -54,13 +57,10 @@ class Unknowns:
         groups = views.groups()
         poses = np.stack([[_quaternions(view.poses) for view in views.sides(group)] for group in groups])
         poses[..., 4:] -= poses[:, :1, :1, 4:]
-        rotation, tilt = np.radians(options.rotation_deg), np.radians(options.tilt_deg)
-        camera_deviations = [rotation] * 3 + [options.position_m] * 3 + [options.delay_ms / 1000]
-        cameras = len(views.rig.cameras)
-        of_cameras = np.tile(camera_deviations, cameras)
-        of_pairs = np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg))
-        deviations = np.concatenate([of_cameras, of_pairs, [options.scale, tilt, tilt]])
         stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
+        of_camera = [np.radians(options.rotation_deg)] * 3 + [options.position_m] * 3 + [DELAY_S]
+        of_pairs = np.full(OF_PAIR * len(views.pairs), TURN)
+        deviations = np.concatenate([np.tile(of_camera, len(stated)), of_pairs, [SCALE, TILT, TILT]])
         return Unknowns(stated, poses, np.array(groups), len(views.pairs), deviations)
 
     @property

@@ -243,15 +243,6 @@ class Group(Enum):
     OTHER = auto()  # averaged with nothing
 
 
-class Shown(Enum):
-    """The part of a frame that shows a corruption on the contact sheet."""
-
-    IMAGE = auto()  # of the camera that looks ahead
-    BOXES = auto()  # the same with ground truth boxes: the image stays, they show where the model looks
-    CAMERAS = auto()  # all cameras
-    NOTHING = auto()  # it changes no image
-
-
 @dataclass(frozen=True)
 class Corruption:
     """A kind of corruption with its severities."""
@@ -259,8 +250,7 @@ class Corruption:
     name: str  # on the command line and in stress.json
     levels: Mapping[str, int]  # severity, such as "easy", or a number -> level
     apply: Apply  # makes of a scene what is run
-    shown: Shown = Shown.IMAGE  # on the contact sheet
-    group: Group = Group.ROBOBEV  # the corruptions that it is averaged with
+    group: Group = Group.ROBOBEV  # of those that it is averaged with
 
 
 @dataclass(frozen=True)
@@ -286,14 +276,14 @@ def _severities(easy: int, mid: int, hard: int) -> dict[str, int]:
 
 def _of_images(corrupt: ImageCorruption, *levels: int, group: Group = Group.ROBOBEV) -> Corruption:
     """A corruption of each image alone, named as its function."""
-    return Corruption(corrupt.__name__, _severities(*levels), partial(CorruptedImages, corrupt=corrupt), group=group)
+    return Corruption(corrupt.__name__, _severities(*levels), partial(CorruptedImages, corrupt=corrupt), group)
 
 
-CLEAN = Corruption("clean", {"": 0}, lambda scene, *_: scene, Shown.NOTHING, Group.OTHER)
+CLEAN = Corruption("clean", {"": 0}, lambda scene, *_: scene, Group.OTHER)
 CORRUPTIONS = (
     # Levels of the first eight as published: RoboBEV, docs/CREATE.md.
-    Corruption("camera_crash", _severities(2, 4, 5), CameraCrash, Shown.CAMERAS),
-    Corruption("frame_lost", _severities(2, 4, 5), FrameLost, Shown.CAMERAS),
+    Corruption("camera_crash", _severities(2, 4, 5), CameraCrash),
+    Corruption("frame_lost", _severities(2, 4, 5), FrameLost),
     _of_images(corruptions.color_quantisation, 1, 2, 3),
     _of_images(corruptions.motion_blur, 2, 4, 5),
     _of_images(corruptions.brightness, 2, 4, 5),
@@ -305,16 +295,11 @@ CORRUPTIONS = (
     _of_images(corruptions.impulse_noise, 2, 4, 5, group=Group.UNSEEN),
     _of_images(corruptions.jpeg, 2, 4, 5, group=Group.UNSEEN),
     _of_images(corruptions.saturation, 2, 4, 5, group=Group.UNSEEN),
-    Corruption(
-        "calibration_noise", {"1": 1, "2": 2, "3": 3, "4": 4}, CalibrationNoise, Shown.BOXES, Group.OTHER
-    ),
-    Corruption("time_offset", _severities(50, 100, 200), TimeOffsets, Shown.BOXES, Group.OTHER),
-    Corruption("ego_motion_lost", _severities(2, 4, 5), EgoMotionLost, Shown.NOTHING, Group.OTHER),
-    Corruption(
-        "frame_rate", _severities(2, 3, 4), lambda scene, step, *_: at_lower_rate(scene, step), Shown.NOTHING,
-        Group.OTHER,
-    ),
-)  # fmt: skip
+    Corruption("calibration_noise", {"1": 1, "2": 2, "3": 3, "4": 4}, CalibrationNoise, Group.OTHER),
+    Corruption("time_offset", _severities(50, 100, 200), TimeOffsets, Group.OTHER),
+    Corruption("ego_motion_lost", _severities(2, 4, 5), EgoMotionLost, Group.OTHER),
+    Corruption("frame_rate", _severities(2, 3, 4), lambda scene, step, *_: at_lower_rate(scene, step), Group.OTHER),
+)
 NAMES = tuple(corruption.name for corruption in CORRUPTIONS)
 _GROUP_OF_LEVEL = {"1": "easy", "2": "mid", "3": "mid", "4": "hard"}  # of corruptions with numbered levels
 

@@ -61,7 +61,7 @@ class StressOutputOptions:
     )
     out: Path | None = option(
         default=None,
-        help="Folder for stress.json and corruptions.png. Default: runs/stress-MODEL.",
+        help="Folder for stress.json. Default: runs/stress-MODEL.",
         metavar="DIR",
     )
     force: bool = option(default=False, help="Replace the files of an earlier test in the output folder.")

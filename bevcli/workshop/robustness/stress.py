@@ -25,7 +25,7 @@ from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults, read_results
 from bevcli.writing import write_whole
 
-RESULTS, SHEET = "stress.json", "corruptions.png"
+RESULTS = "stress.json"
 # Predicted boxes and ground truth of each scored frame of a scene, in the ego frame.
 SceneBoxes = tuple[tuple[Boxes3D, Boxes3D], ...]
 _INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
@@ -65,7 +65,7 @@ def stress(
         model: of `load_model`.
         drives: of `open_sequence`, with ground truth.
         conditions: of `choose_conditions`. Results of an earlier, resumed test are kept.
-        out: the folder for stress.json and, when the test is complete, corruptions.png; made where it is missing.
+        out: the folder for stress.json; made where it is missing.
         options: see `StressOptions`.
         force: remove the files that an earlier test wrote into `out`.
         resume: go on with an interrupted test; it may get further conditions.
@@ -107,12 +107,6 @@ def stress(
                 run.remove_boxes(condition)
             results = replace(results, is_complete=True)
         _write_results(folder, results, against)
-        if results.is_complete:
-            from bevcli.workshop.robustness.contact_sheet import write_contact_sheet
-
-            folder.add(folder.path / SHEET)
-            shown = [each for each in choose_conditions() if each.severity in results.of(each.name)]
-            write_contact_sheet(folder.path / SHEET, scenes[0], shown, options)
     return results
 
 

@@ -3,10 +3,10 @@
 `render` makes a drive and writes it, `export_drive` writes a given one.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, r
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Simulation
 from bevcli.workshop.synth.traffic import ActorState
-from bevcli.workshop.synth.workers import shared_out
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
@@ -277,7 +276,6 @@ class RenderedDrive:
 EGO_MOTION_HZ = 50.0
 SUPERSAMPLED_WIDTH = 1000  # images up to this width are supersampled by default
 THREADS = 2
-NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -313,9 +311,8 @@ def render(
 
     Args:
         out: the sequence folder to write.
-        options: the options; by default those of `RenderOptions`. With several `workers`, a program must call this
-            function under `if __name__ == "__main__":`, because each of them imports the program.
-        progress: called with each frame after it is written. With several `workers`, its images have no pixels.
+        options: the options; by default those of `RenderOptions`.
+        progress: called with each frame after it is written.
         changes: options by name, such as `seed=7` and `resolution=(800, 450)`.
 
     Raises:
@@ -324,29 +321,12 @@ def render(
     """
     chosen = gather(RenderOptions, options, changes)
     rig = rig_for_rendering(chosen.rig, chosen.resolution)
-    drive = _drive_of(chosen, rig, THREADS)
-    export = partial(export_drive, drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
-    if chosen.workers == 1:
-        export()
-    else:
-        with shared_out(partial(_frames_of, chosen, rig), chosen.frames, chosen.workers) as frames:
-            export(frames=frames)
-    return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
-
-
-def _drive_of(chosen: RenderOptions, rig: CameraRig, threads: int) -> RenderedDrive:
     samples = chosen.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
-    return RenderedDrive(
-        chosen.seed, chosen.frames, chosen.rate_hz, rig, chosen.weather, supersampling=samples, threads=threads
+    drive = RenderedDrive(
+        chosen.seed, chosen.frames, chosen.rate_hz, rig, chosen.weather, supersampling=samples, threads=THREADS
     )
-
-
-def _frames_of(chosen: RenderOptions, rig: CameraRig, indices: Sequence[int]) -> Iterator[Frame]:
-    """Some frames of the drive, for a process of its own. Their images have no pixels, only files."""
-    drive = _drive_of(chosen, rig, threads=1)
-    for frame in _encoded(drive, indices, chosen.quality):
-        bare = {name: replace(image, pixels_bgr=NO_PIXELS) for name, image in frame.images.items()}
-        yield replace(frame, images=bare)
+    export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
+    return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
 
 
 def export_drive(
@@ -356,16 +336,15 @@ def export_drive(
     force: bool = False,
     quality: int = JPEG_QUALITY,
     progress: Callable[[Frame], None] | None = None,
-    frames: Iterable[Frame] | None = None,
 ) -> None:
     """Render all frames of a drive and write them, with ego-motion at EGO_MOTION_HZ, ground truth boxes and maps.
 
     folder: the sequence folder. force: whether to replace a sequence in it. quality: JPEG quality, 1 to 100.
-    progress: called with each frame after it is written. frames: those of the drive, if they are rendered elsewhere.
+    progress: called with each frame after it is written.
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
     with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
-        for frame in _encoded(drive, range(drive.frames), quality) if frames is None else frames:
+        for frame in _encoded(drive, quality):
             writer.write(frame)
             if progress is not None:
                 progress(frame)
@@ -373,25 +352,19 @@ def export_drive(
     write_ego_motion(folder / "ego_motion.csv", drive.ego_motion(EGO_MOTION_HZ))
 
 
-def _encoded(drive: RenderedDrive, indices: Sequence[int], quality: int) -> Iterator[Frame]:
+def _encoded(drive: RenderedDrive, quality: int) -> Iterator[Frame]:
     """Frames of the drive with image files."""
     motion = drive.ego_motion(EGO_MOTION_HZ)
-    for index in indices:
-        rendered = drive.frame(index)
-        images = {
-            name: CameraImage(rendered.camera_timestamps_ns[name], pixels, _encode_jpeg(pixels, quality), "image/jpeg")
-            for name, pixels in rendered.images.items()
-        }
+    for rendered in map(drive.frame, range(drive.frames)):
+        images = {}
+        for name, pixels in rendered.images.items():
+            encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+            images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
         yield Frame(
             rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
             motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
             ground_truth_map=rendered.bev_map, ground_truth_lines=rendered.lines,
         )  # fmt: skip
-
-
-def _encode_jpeg(pixels_bgr: NDArray[np.uint8], quality: int) -> bytes:
-    """The bytes of a JPEG file."""
-    return cv2.imencode(".jpg", pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _rounded(boxes: Boxes3D) -> Boxes3D:

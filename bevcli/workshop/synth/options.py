@@ -72,13 +72,6 @@ class RenderOptions:
         minimum=1,
         maximum=4,
     )
-    workers: int = option(
-        default=1,
-        help="Number of processes that render; each takes some 0.4 GB. The files are the same for any number.",
-        metavar="N",
-        minimum=1,
-        maximum=256,
-    )
     force: bool = option(default=False, help="Replace a sequence in OUT.")
 
     def __post_init__(self) -> None:
