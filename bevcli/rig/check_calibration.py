@@ -136,7 +136,6 @@ def _has_other_format(path: Path) -> bool:
 
 
 def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationCheck:
-    """A drive that is read as `bevcli run` reads it."""
     sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
     report = with_findings(check_rig(shown.rig), _missing_images(shown))

@@ -142,7 +142,6 @@ def _contains(words: Sequence[str], word: str) -> bool:
 
 
 def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Finding]]:
-    """Pairs of cameras with the same pose and field of view."""
     found = []
     for a, b in combinations(cameras, 2):
         distance = float(np.linalg.norm(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]))
@@ -210,7 +209,6 @@ def _swap_finding(moved: Sequence[str], named: Mapping[str, float], yaws: Mappin
 
 
 def _direction_text(yaw_deg: float) -> str:
-    """A direction as text, such as "back left (109°)"."""
     return f"{side_of(yaw_deg)} ({yaw_deg:.0f}°)"
 
 
@@ -301,7 +299,6 @@ def units_per_metre(length: float) -> float:
 
 
 def _defects(camera: Camera) -> list[Finding]:
-    """The implausible properties of a pose, the most severe first."""
     mounting, name = mounting_of(camera.ego_from_camera), camera.name
     (low, high), away_m = HEIGHTS_M, np.hypot(*mounting.position[:2])
     defects = []

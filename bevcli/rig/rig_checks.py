@@ -54,7 +54,6 @@ def _swapped_behind_mistake(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
 
 
 def _without_errors(cameras: Sequence[Camera], findings: Iterable[Finding]) -> tuple[Camera, ...]:
-    """The cameras that no error names."""
     wrong = {finding.camera for finding in errors_of(findings)}
     return tuple(camera for camera in cameras if camera.name not in wrong)
 

@@ -57,7 +57,6 @@ def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: M
 
 
 def _findings_markdown(report: RigReport) -> str:
-    """The findings and the comparison with nuScenes, as Markdown."""
     lines = ["## Findings", ""]
     for finding in report.findings:
         where = f"`{finding.camera}` " if finding.camera else ""

@@ -35,21 +35,15 @@ class Unknowns:
 
     x holds for each camera its rotation (3, radians, in the camera frame), position (3, metres, in the ego frame) and
     delay (seconds); for each pair the rotation of the vehicle (3, radians); at last the scale of the ego-motion (a
-    share), and the slopes of the road along x and y of the ego frame.
-
-    Attributes:
-        stated: (C, 4, 4) ego_from_camera.
-        poses: (G, 2, 25, 7) world_from_ego of both images of a group, by delay: quaternion (x, y, z, w), translation.
-        groups: (G, 3) pair, camera of the first image and camera of the second one.
-        pairs: number of pairs.
-        deviations: (P,) the standard deviation of each unknown before anything is measured.
+    share), and the slopes of the road along x and y of the ego frame. Poses are quaternions (x, y, z, w) and
+    translations.
     """
 
-    stated: Array
-    poses: Array
-    groups: Indices
+    stated: Array  # (C, 4, 4) ego_from_camera
+    poses: Array  # (G, 2, 25, 7) world_from_ego of both images of a group, by delay
+    groups: Indices  # (G, 3) pair, camera of the first image and camera of the second one
     pairs: int
-    deviations: Array
+    deviations: Array  # (P,) the standard deviation of each unknown before anything is measured
 
     @staticmethod
     def of(views: Views, options: CalibrateOptions) -> "Unknowns":
@@ -204,14 +198,11 @@ class EpipolarResiduals(Residuals):
 class RoadResiduals(Residuals):
     """The distance of road points from where they would be on a flat road.
 
-    Attributes:
-        weights: (N, 2, 3) from an error of a ray in the second image to pixels of the first one, less where the image
-            shows no contrast along an axis.
-        beside_m: (N,) distance of the points from the way of the vehicle.
+    The weights turn an error of a ray in the second image into pixels of the first one.
     """
 
-    weights: Array
-    beside_m: Array
+    weights: Array  # (N, 2, 3), less where the image shows no contrast along an axis
+    beside_m: Array  # (N,) distance of the points from the way of the vehicle
 
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 2) pixels."""

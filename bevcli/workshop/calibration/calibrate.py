@@ -217,7 +217,6 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
-    """The median residual of a camera's matched points, in pixels of the reduced image."""
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
     residuals_px = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
     return float(np.median(residuals_px)) if residuals_px.size else 0.0

@@ -98,7 +98,6 @@ def _epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, p
 
 
 def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
-    """Yaw and pitch, with the ellipse of three standard deviations."""
     axes.set_facecolor(PAPER)
     yaw, pitch, _ = estimate.rotation_deg
     covariance = np.degrees(np.degrees(estimate.covariance[:2, :2]))[::-1, ::-1] * [[1, -1], [-1, 1]]

@@ -132,7 +132,6 @@ def _rigid(rays_a: Array, rays_b: Array, camera: Camera) -> NDArray[np.bool_]:
 
 
 def _spread(pixels: Array, distance: Array, camera: Camera) -> NDArray[np.int64]:
-    """Indices of the best matches in each cell of the image."""
     cell = (pixels / [camera.width, camera.height] * CELLS).astype(int).clip(0, np.array(CELLS) - 1) @ [1, CELLS[0]]
     order = np.lexsort((distance, cell))
     first = np.searchsorted(cell[order], cell[order])

@@ -125,7 +125,6 @@ def _seen(camera: Camera, image: NDArray[np.uint8], points_camera: Array) -> Arr
 
 
 def _tiles(values: Array) -> Array:
-    """Values (60, 100) of the grid -> (tiles, 100)."""
     (rows, columns), (height, width) = TILES, POINTS
     return values.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(rows * columns, height * width)
 

@@ -29,17 +29,11 @@ DELAYS_S = np.linspace(-0.3, 0.3, 25)  # of a camera's capture times, where the 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's image at one time.
+    """One camera's image at one time."""
 
-    Attributes:
-        pixels: (h, w) uint8, grey, at most WIDTH wide.
-        texture: (h, w) uint8, their fine structure with about the same contrast everywhere, without light and shade.
-        poses: (25, 4, 4) world_from_ego at the time when it was taken and each of DELAYS_S later.
-    """
-
-    pixels: NDArray[np.uint8]
-    texture: NDArray[np.uint8]
-    poses: Array
+    pixels: NDArray[np.uint8]  # (h, w) grey, at most WIDTH wide
+    texture: NDArray[np.uint8]  # (h, w) fine structure with even contrast, without light and shade
+    poses: Array  # (25, 4, 4) world_from_ego when it was taken, and each of DELAYS_S later
 
 
 @dataclass(frozen=True)

@@ -20,23 +20,14 @@ FORMAT = "bevcli-stress/1"
 
 @dataclass(frozen=True)
 class ConditionScores:
-    """The scores under one condition, over the classes that have ground truth: an entry of "conditions" in stress.json.
+    """An entry of "conditions" in stress.json: scores over the classes that have ground truth."""
 
-    Attributes:
-        corruption: its name, or "clean".
-        severity: "easy", "mid", "hard" or a level; "" for clean.
-        nd_score: NDS, 0 to 1.
-        mean_ap: mAP, 0 to 1.
-        tp_errors: true-positive errors by the devkit's names; NaN, or None of a file, where undefined.
-        mean_dist_aps: class -> AP.
-    """
-
-    corruption: str
-    severity: str
-    nd_score: float
-    mean_ap: float
-    tp_errors: Mapping[str, float | None]
-    mean_dist_aps: Mapping[str, float]
+    corruption: str  # name, or "clean"
+    severity: str  # "easy", "mid", "hard" or a level; "" for clean
+    nd_score: float  # NDS, 0 to 1
+    mean_ap: float  # mAP, 0 to 1
+    tp_errors: Mapping[str, float | None]  # by the devkit's names; NaN (None of a file) if undefined
+    mean_dist_aps: Mapping[str, float]  # class -> AP
 
 
 @dataclass(frozen=True)
@@ -149,7 +140,6 @@ def stress_table(results: StressResults, against: StressResults | None = None) -
 def _block(
     results: StressResults, severities: tuple[str, ...], group: list[Corruption], against: StressResults | None
 ) -> str:
-    """The corruptions with the same severities, a row each."""
     scale = "level " if severities[0].isdecimal() else ""
     head = [cell for severity in severities for cell in (f"{scale}{severity}: NDS", "mAP")]
     rows = [("corruption", *head, "mean NDS", "RR %", *(("CE %",) if against else ()))]

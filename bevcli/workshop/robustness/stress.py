@@ -177,7 +177,6 @@ class _StressRun:
         return boxes
 
     def _run_sequence(self, sequence: Sequence) -> Iterator[tuple[Boxes3D, Boxes3D]]:
-        """The predicted boxes and the ground truth of each frame that has any."""
         model = self.model
         if self.runner is None:
             self.runner = model.runner(track=False, temporal=self.options.temporal)

@@ -103,7 +103,6 @@ class Assets:
 
 
 def _person(name: str, *strides: int) -> Variant:
-    """A person with a pose for each stride."""
     poses = tuple(joined(people.person(name, stride)) for stride in strides)
     size = poses[0].extents * (0.68 if name == "child" else 1.0)
     return Variant("pedestrian", name if any(strides) else f"{name}_standing", poses, size, CLOTHES, CLOTHES)

@@ -59,21 +59,13 @@ class Street:
 
 @dataclass(frozen=True)
 class Block:
-    """The land between four streets, in plan coordinates.
+    """The land between four streets, in plan coordinates."""
 
-    Attributes:
-        column: index of the street on its west side.
-        row: index of the street on its south side.
-        low: south-west corner of the kerb, metres.
-        high: north-east corner of the kerb, metres.
-        sidewalks: widths of the pavements on the south, east, north and west side, metres.
-    """
-
-    column: int
-    row: int
-    low: tuple[float, float]
-    high: tuple[float, float]
-    sidewalks: tuple[float, float, float, float]
+    column: int  # index of the street on its west side
+    row: int  # index of the street on its south side
+    low: tuple[float, float]  # south-west corner of the kerb, metres
+    high: tuple[float, float]  # north-east corner of the kerb, metres
+    sidewalks: tuple[float, float, float, float]  # widths on the south, east, north and west side, metres
 
     def inside(self, margin: float = 0.0) -> tuple[Array, Array]:
         """South-west and north-east corner (2,) of the land behind the pavements, `margin` metres from them."""
@@ -82,18 +74,11 @@ class Block:
 
 
 class Neighbourhood(NamedTuple):
-    """A part of the city.
+    """A part of the city."""
 
-    Attributes:
-        blocks: column and row of each block.
-        nodes: column and row of each junction.
-        stretches: axis and index of the street of each stretch, and index of the street that crosses it at the
-            beginning.
-    """
-
-    blocks: list[tuple[int, int]]
-    nodes: list[tuple[int, int]]
-    stretches: list[tuple[int, int, int]]
+    blocks: list[tuple[int, int]]  # column and row
+    nodes: list[tuple[int, int]]  # column and row of each junction
+    stretches: list[tuple[int, int, int]]  # axis and index of the street, index of the street that crosses it first
 
 
 class CityPlan:

@@ -58,27 +58,16 @@ def texel_sizes(width: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame of a rendered drive.
-
-    Attributes:
-        stamp: index, scene and timestamp.
-        views: camera name to image.
-        world_from_ego: pose of the ego vehicle.
-        world_from_ego_at: camera name to pose of the ego vehicle at the camera's time.
-        camera_timestamps_ns: camera name to the time of its image.
-        boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
-        bev_map: ground truth map.
-        lines: true lines of the map, bev frame.
-    """
+    """One frame of a rendered drive with its ground truth."""
 
     stamp: FrameStamp
-    views: Mapping[str, RenderedView]
+    views: Mapping[str, RenderedView]  # by camera
     world_from_ego: Pose
-    world_from_ego_at: Mapping[str, Pose]
-    camera_timestamps_ns: Mapping[str, int]
-    boxes: Boxes3D
+    world_from_ego_at: Mapping[str, Pose]  # by camera, at the time of its image
+    camera_timestamps_ns: Mapping[str, int]  # by camera
+    boxes: Boxes3D  # world frame, with attributes, instances, visibilities, pixels
     bev_map: BevMap
-    lines: MapLines
+    lines: MapLines  # bev frame
 
     @property
     def images(self) -> dict[str, NDArray[np.uint8]]:
@@ -165,7 +154,6 @@ class RenderedDrive:
         return [state for _, state in self._actors(index)]
 
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
-        """The annotated objects around the vehicle at a frame, with their states."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
         seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))
         return [(a, state) for a, state in seen if state and np.hypot(*(state.position[:2] - origin)) < ACTORS_M]
@@ -226,7 +214,6 @@ class RenderedDrive:
             return dict(zip(names, pool.map(render_one, names), strict=True))
 
     def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
-        """The scenery around a world point, the texture of the ground, and the shadow map of the scenery."""
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         scenery = self._scenery.around(center, SCENERY_M)
@@ -237,11 +224,9 @@ class RenderedDrive:
         return scenery, texture, shadows
 
     def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
-        """The mesh of a body in the world."""
         return self._template(body, pose).placed((x, y, z), yaw)
 
     def _make_template(self, body: Body, pose: int) -> TriangleSoup:
-        """The mesh of a body in its size and colours."""
         mesh, paint = body.variant.poses[pose % len(body.variant.poses)], body.paint
         if self._looks is not None:
             mesh, paint = self._looks.body(mesh, body.instance), self._looks.paint(paint, body.instance)
@@ -353,7 +338,6 @@ def export_drive(
 
 
 def _encoded(drive: RenderedDrive, quality: int) -> Iterator[Frame]:
-    """Frames of the drive with image files."""
     motion = drive.ego_motion(EGO_MOTION_HZ)
     for rendered in map(drive.frame, range(drive.frames)):
         images = {}

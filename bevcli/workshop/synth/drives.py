@@ -347,7 +347,6 @@ def _drawn(path: Path, drives: object, validate_share: object, seed: object) -> 
 
 
 def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
-    """The folders of a list. Raises InputError."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f'{path}: {key}: expected a list of folders, such as ["drives/a"], found {names!r:.60}')
     folders: list[Path] = []

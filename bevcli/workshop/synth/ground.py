@@ -44,17 +44,11 @@ LINE_M = 0.14  # width of lane lines
 
 @dataclass(frozen=True)
 class GroundPaint:
-    """A polygon of one colour.
+    """A polygon of one colour."""
 
-    Attributes:
-        outline: (P, 2) world, metres.
-        color: sRGB.
-        width_m: width of a line, metres; infinite for areas. Textures coarser than twice the width leave it out.
-    """
-
-    outline: Array
-    color: Color
-    width_m: float = float("inf")
+    outline: Array  # (P, 2) world, metres
+    color: Color  # sRGB
+    width_m: float = float("inf")  # of a line; infinite for areas; coarser textures leave it out
 
 
 @dataclass(frozen=True)
@@ -86,7 +80,6 @@ class GroundPlan:
         ]
 
     def _make_block(self, column: int, row: int) -> GroundPiece:
-        """The kerb, the pavement with its joints, and the land behind it."""
         city, block = self.city, self.city.block(column, row)
         (x0, y0), (x1, y1) = block.low, block.high
         outline = city.bend(rounded_rectangle(block.low, block.high, CORNER_M))
@@ -103,7 +96,6 @@ class GroundPlan:
         return GroundPiece(tuple(paints))
 
     def _make_junction(self, column: int, row: int) -> GroundPiece:
-        """The area where two streets meet, with its crossings and stop lines."""
         a, b = self.city.street(1, column), self.city.street(0, row)
         x, y = a.position, b.position
         outline = _junction_outline(x, y, a.half_width + CORNER_M, b.half_width + CORNER_M)
@@ -231,23 +223,14 @@ ROUGH_SIZE = 256
 
 @dataclass(frozen=True)
 class GroundTexture:
-    """A square of the ground in the world frame, rows along y.
+    """A square of the ground in the world frame, rows along y."""
 
-    Attributes:
-        texels: (K, 3) square root of linear RGB, 0 to 255; all levels one after another, the finest first.
-        rough: (256, 256) made by `roughness`.
-        offsets: (LEVELS,) index of the first texel of each level.
-        origin: x and y of the first texel's corner, metres.
-        texel_m: size of a texel of the finest level, metres.
-        size: texels along a side of the finest level, a multiple of 2^(LEVELS - 1).
-    """
-
-    texels: NDArray[np.uint8]
-    rough: NDArray[np.float32]
-    offsets: NDArray[np.int64]
-    origin: tuple[float, float]
-    texel_m: float
-    size: int
+    texels: NDArray[np.uint8]  # (K, 3) square root of linear RGB, 0 to 255; all levels, the finest first
+    rough: NDArray[np.float32]  # (256, 256) made by `roughness`
+    offsets: NDArray[np.int64]  # (LEVELS,) index of the first texel of each level
+    origin: tuple[float, float]  # x and y of the first texel's corner, metres
+    texel_m: float  # size of a texel of the finest level
+    size: int  # texels along a side of the finest level, a multiple of 2^(LEVELS - 1)
 
 
 def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, texel_m: float) -> GroundTexture:
@@ -280,7 +263,6 @@ def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[i
 
 @lru_cache(maxsize=256)
 def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
-    """An sRGB colour as texels hold it."""
     return tuple(round(float(np.sqrt(c)) * 255) for c in linear(color))
 
 

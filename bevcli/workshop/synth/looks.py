@@ -21,22 +21,16 @@ Range = tuple[float, float]  # lowest and highest value
 
 @dataclass(frozen=True)
 class Weather:
-    """The light of a drive.
+    """The light of a drive. A light of 1 is about the brightness of a white surface in full sun.
 
-    Attributes:
-        name: one of WEATHER_NAMES.
-        to_sun: (3,) unit vector towards the sun, world.
-        light: (7, 3) linear RGB; 1 is about the brightness of a white surface in full sun. The rows are the light from
-            the sun, from above and, reflected by the ground, from below; the colours of the sky overhead and at the
-            horizon; the colours of the haze and of the clouds.
-        clouds: (512, 512) cloud cover, 0 to 1, on a horizontal plane; it repeats in both directions.
-        kind: the numbers of its name.
+    The rows of `light` are the light from the sun, from above and, reflected by the ground, from below; the colours of
+    the sky overhead and at the horizon, of the haze and of the clouds.
     """
 
-    name: str
-    to_sun: NDArray[np.float64]
-    light: NDArray[np.float64]
-    clouds: NDArray[np.float32]
+    name: str  # one of WEATHER_NAMES
+    to_sun: NDArray[np.float64]  # (3,) unit vector, world
+    light: NDArray[np.float64]  # (7, 3) linear RGB
+    clouds: NDArray[np.float32]  # (512, 512) cover, 0 to 1, of a horizontal plane; it repeats in both directions
     kind: "WeatherKind"
 
 

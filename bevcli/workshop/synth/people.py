@@ -117,7 +117,6 @@ def rider(seat: Place, bars: Place, pedal: Place, helmet: Color) -> list[Mesh]:
 
 
 def _thin_wheel(x: float, radius: float, width: float) -> list[Mesh]:
-    """A wheel: a dark tyre around a lighter disc."""
     return [
         crossbar(x, radius, width / 2, radius, RUBBER, 14),
         crossbar(x, radius, width / 2 + 0.005, radius * 0.86, (150, 152, 156), 14),

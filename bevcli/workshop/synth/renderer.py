@@ -30,18 +30,11 @@ from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT, shade_pixels
 
 @dataclass(frozen=True)
 class VisibilityBuffer:
-    """Nearest triangle and depth of each pixel of an image.
+    """Nearest triangle and depth of each pixel of an image."""
 
-    Attributes:
-        triangles: (H, W) index of the nearest triangle; -1 for none.
-        inverse_depth: (H, W) 1 / depth, 1/metres; 0 for none.
-        unoccluded: (O,) number of pixels that each object would cover without occlusion. It can be too small (down to
-            0) for an object that is hidden completely.
-    """
-
-    triangles: NDArray[np.int32]
-    inverse_depth: NDArray[np.float32]
-    unoccluded: NDArray[np.int64]
+    triangles: NDArray[np.int32]  # (H, W) index of the nearest triangle; -1 for none
+    inverse_depth: NDArray[np.float32]  # (H, W) 1 / depth, 1/metres; 0 for none
+    unoccluded: NDArray[np.int64]  # (O,) pixels of each object without occlusion; may be too small for a hidden one
 
 
 def rasterise(soup: TriangleSoup, camera: Camera, camera_from_world: Array, object_count: int) -> VisibilityBuffer:
@@ -308,23 +301,14 @@ NO_PATTERN = (0.0, 1.0, 0.0)
 
 @dataclass(frozen=True)
 class WorldSnapshot:
-    """The world at one time, as the renderer needs it.
+    """The world at one time, as the renderer needs it."""
 
-    Attributes:
-        soup: all triangles around the vehicle.
-        object_count: O; the annotated objects in the soup are 0 to O - 1.
-        ground: texture of the ground.
-        shadows: shadow map.
-        weather: light, sky and haze.
-        pattern: strength, waves per metre and hardness of a pattern on all surfaces but the ground.
-    """
-
-    soup: TriangleSoup
-    object_count: int
+    soup: TriangleSoup  # all triangles around the vehicle
+    object_count: int  # O; the annotated objects in the soup are 0 to O - 1
     ground: GroundTexture
     shadows: ShadowMap
-    weather: Weather
-    pattern: tuple[float, float, float] = NO_PATTERN
+    weather: Weather  # light, sky and haze
+    pattern: tuple[float, float, float] = NO_PATTERN  # strength, waves per metre, hardness; not on the ground
 
 
 @dataclass(frozen=True)

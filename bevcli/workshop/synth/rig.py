@@ -38,18 +38,13 @@ FACES = np.array(
 class LensPart:
     """A pinhole image that gives a part of the image of a camera with distortion.
 
-    Attributes:
-        pinhole: the camera of the pinhole image.
-        columns: (H, W) column in the pinhole image for each pixel of the camera's image; OUTSIDE for those that another
-            part gives, or none.
-        rows: as `columns`.
-        needed: (H', W') 1 for the pixels of the pinhole image that are needed, 0 for the others.
+    Columns and rows are OUTSIDE for pixels that another part gives, or none.
     """
 
     pinhole: Camera
-    columns: NDArray[np.float32]
-    rows: NDArray[np.float32]
-    needed: NDArray[np.uint8]
+    columns: NDArray[np.float32]  # (H, W) in the pinhole image, for each pixel of the camera's image
+    rows: NDArray[np.float32]  # (H, W)
+    needed: NDArray[np.uint8]  # (H', W') 1 for the pixels of the pinhole image that are needed, else 0
 
 
 def lens_parts(camera: Camera) -> tuple[LensPart, ...]:
@@ -193,56 +188,30 @@ class RigDistribution:
     """The [training.rigs] table: the distribution of the rigs, and of how their images were taken.
 
     A share is a probability from 0 to 1. A range is the lowest and the highest value, drawn uniformly.
-
-    Attributes:
-        random_share: share of the drives with a random rig. The others have the default rig.
-        cameras: range of the number of cameras.
-        fov_deg: range of the horizontal field of view. The cameras of a rig that looks all around get at least the
-            field of view at which they leave no gap, as far as the range allows.
-        fov_spread: cameras of a rig differ in their field of view by a factor of at most 1 + this, up or down.
-        aspects: widths divided by heights of the images; one of them for each rig.
-        focal_ratio: largest relative difference of the focal lengths along x and y.
-        principal_point: largest distance of the principal point from the middle, relative to width and height.
-        height_m: range of the cameras' height above the ground; the cameras of a rig differ by at most 0.15 m.
-        radius_m: range of the cameras' distance from the middle of the roof, along x; half of it along y.
-        front_share: share of the rigs that look ahead and to the sides only.
-        yaw_jitter_deg: largest deviation of a camera from even spacing.
-        tilt_deg: largest pitch and roll of a camera.
-        bev_tilt_deg: largest pitch and roll of the bev frame.
-        bev_height_m: range of the height of the bev frame's origin above the ground.
-        distorted_share: share of the rigs with lens distortion.
-        delayed_share: share of the rigs whose cameras take their images at different times.
-        delay_s: largest time of an image after that of its frame.
-        supersampled_share: share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel.
-        coarse_share: share of the rigs with images of a lower resolution than the model's, by a factor from
-            `coarsest` to 1.
-        coarsest: see `coarse_share`.
-        jpeg_quality: range of the quality of the images.
-        varied_share: share of the drives whose looks are varied: shapes, colours, patterns, light, nameless objects.
     """
 
-    random_share: float = 0.0
-    cameras: tuple[int, int] = (4, 8)
-    fov_deg: Range = (45.0, 110.0)
-    fov_spread: float = 0.2
-    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)
-    focal_ratio: float = 0.02
-    principal_point: float = 0.06
-    height_m: Range = (0.8, 2.8)
-    radius_m: Range = (0.2, 1.8)
-    front_share: float = 0.2
-    yaw_jitter_deg: float = 12.0
-    tilt_deg: float = 3.0
-    bev_tilt_deg: float = 2.0
-    bev_height_m: Range = (0.0, 2.5)
-    distorted_share: float = 0.2
-    delayed_share: float = 0.4
-    delay_s: float = 0.05
-    supersampled_share: float = 0.5
-    coarse_share: float = 0.15
-    coarsest: float = 0.6
+    random_share: float = 0.0  # share of the drives with a random rig; the others have the default rig
+    cameras: tuple[int, int] = (4, 8)  # number of cameras
+    fov_deg: Range = (45.0, 110.0)  # horizontal; rigs that look all around get enough to leave no gap, if possible
+    fov_spread: float = 0.2  # cameras of a rig differ in it by a factor of at most 1 + this, up or down
+    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)  # width / height of the images
+    focal_ratio: float = 0.02  # largest relative difference of the focal lengths along x and y
+    principal_point: float = 0.06  # largest distance from the image centre, relative to width and height
+    height_m: Range = (0.8, 2.8)  # of the cameras above the ground; those of a rig differ by at most 0.15 m
+    radius_m: Range = (0.2, 1.8)  # distance from the middle of the roof, along x; half of it along y
+    front_share: float = 0.2  # share of the rigs that look ahead and to the sides only
+    yaw_jitter_deg: float = 12.0  # largest deviation of a camera from even spacing
+    tilt_deg: float = 3.0  # largest pitch and roll of a camera
+    bev_tilt_deg: float = 2.0  # largest pitch and roll of the bev frame
+    bev_height_m: Range = (0.0, 2.5)  # height of the bev frame's origin above the ground
+    distorted_share: float = 0.2  # share of the rigs with lens distortion
+    delayed_share: float = 0.4  # share of the rigs whose cameras take their images at different times
+    delay_s: float = 0.05  # largest time of an image after that of its frame
+    supersampled_share: float = 0.5  # share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel
+    coarse_share: float = 0.15  # share of the rigs with images of a lower resolution than the model's,
+    coarsest: float = 0.6  # by a factor from this to 1
     jpeg_quality: tuple[int, int] = (60, 95)
-    varied_share: float = 0.0
+    varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
 
     def __post_init__(self) -> None:
         for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
@@ -265,21 +234,13 @@ class RigDistribution:
 
 @dataclass(frozen=True)
 class DrawnRig:
-    """The rig of a drive, and how its images are taken.
-
-    Attributes:
-        rig: the cameras.
-        delays_s: camera name to the time of its images after that of the frame, seconds; empty for none.
-        supersampling: samples per pixel along each axis.
-        jpeg_quality: 1 to 100.
-        varied: whether the looks of the drive are varied.
-    """
+    """The rig of a drive, and how its images are taken."""
 
     rig: CameraRig
-    delays_s: dict[str, float] = field(default_factory=dict)
-    supersampling: int = 1
-    jpeg_quality: int = 90
-    varied: bool = False
+    delays_s: dict[str, float] = field(default_factory=dict)  # camera -> time of its images after the frame's
+    supersampling: int = 1  # samples per pixel along each axis
+    jpeg_quality: int = 90  # 1 to 100
+    varied: bool = False  # whether the looks of the drive are varied
 
 
 def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:
@@ -340,7 +301,6 @@ def _yaws_deg(
 
 
 def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribution, random: Generator) -> Array:
-    """(3, 3) pixels."""
     width, height = size
     focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
     ratio = 1 + random.uniform(-1, 1) * distribution.focal_ratio

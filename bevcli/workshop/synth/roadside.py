@@ -186,7 +186,6 @@ class Roadside:
         return [*self._kerbside(axis, index, cross, -1), *self._kerbside(axis, index, cross, 1)]
 
     def _block(self, column: int, row: int) -> list[StandingActor]:
-        """Actors on the pavements of a block, and on its building site."""
         site = self._site(column, row) if self.city.landuse(column, row) == "site" else []
         return [*self._on_pavement(column, row), *site]
 
@@ -198,7 +197,6 @@ class Roadside:
         spread: float = 0.05,
         names: Collection[str] | None = None,
     ) -> Body:
-        """Draw a look, of those with these names, and an individual of it."""
         return draw_body(self.assets.draw(class_name, rng, names), rng, instance, spread)
 
     def _kerbside(self, axis: int, index: int, cross: int, side: int) -> list[StandingActor]:
@@ -275,7 +273,6 @@ class Roadside:
         return self._stand_on_land(body, plan, self.city.heading(plan, direction) + turn, 0.0)
 
     def _on_pavement(self, column: int, row: int) -> list[StandingActor]:
-        """Parked bicycles and motorcycles, and groups of standing people."""
         rng = self.city.stream("pavement", column, row)
         land, made = self.city.block(column, row), []
         for side in range(4):
@@ -312,7 +309,6 @@ class Roadside:
         return StandingActor(body, np.array([*self.city.bend(point), height]), yaw, attribute)
 
     def _site(self, column: int, row: int) -> list[StandingActor]:
-        """A building site on a block: barriers around machines, trucks, trailers, cones and workers."""
         rng = self.city.stream("site", column, row)
         name, (low, high) = f"{column}.{row}", self.city.block(column, row).inside(0.4)
         made = list(self._fence(low, high, rng, name))
@@ -338,7 +334,6 @@ class Roadside:
         return made
 
     def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> Iterator[StandingActor]:
-        """Barriers along the edges of a rectangle of the plan, with gaps."""
         barrier = self.assets.draw("barrier", rng)
         for side in range(4):
             start, way, _, length = side_of(low, high, side)

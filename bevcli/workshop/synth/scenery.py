@@ -147,7 +147,6 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
-    """Slanted awnings over some of the shop fronts."""
     colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
     for k in range(4):
         start, end = ground[k], ground[(k + 1) % 4]
@@ -210,7 +209,6 @@ class Scenery:
         return meshes
 
     def _park(self, land: Block, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-        """Trees and bushes all over a block."""
         low, high = land.inside(1.5)
         count = int(np.prod(high - low) / 75)
         for point in low + rng.random((count, 2)) * (high - low):

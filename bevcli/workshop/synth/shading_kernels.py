@@ -389,7 +389,6 @@ def _shop(u, z, length, shop_m, seed, out):
 
 @njit(nogil=True, inline="always")
 def _hash(a, b):
-    """Hash two integers to one from 0 to 2^31 - 1."""
     h = (a * 73856093) ^ (b * 19349663)
     h = (h ^ (h >> 13)) * 1274126177
     return (h ^ (h >> 16)) & 0x7FFFFFFF

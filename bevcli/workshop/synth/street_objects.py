@@ -35,7 +35,6 @@ BLACK_RUBBER = (30, 30, 32)
 
 
 def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) -> Mesh:
-    """A cabin with windows, a roof and four posts."""
     length, width, height = size
     posts = [(x + sx * length, y + sy * width) for sx in (-0.5, 0.5) for sy in (-0.5, 0.5)]
     parts = [
@@ -47,7 +46,6 @@ def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) 
 
 
 def _track(y: float, length: float, height: float, width: float) -> Mesh:
-    """A crawler track with its rollers."""
     half, foot, shoulder = length / 2, length / 2 - height / 2, length / 2 - height * 0.35
     outline = [
         (-foot, 0), (foot, 0), (half, height * 0.5), (shoulder, height), (-shoulder, height), (-half, height * 0.5),

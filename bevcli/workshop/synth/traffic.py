@@ -40,7 +40,6 @@ class Signals:
         return greens, starts, offset
 
     def _since_green(self, node: tuple[int, int], axis: int, time_s: float) -> float:
-        """Seconds since an axis last got green, at a time in seconds."""
         greens, starts, offset = self._cycle(node)
         return (time_s + offset - starts[axis]) % (sum(greens) + 2 * (YELLOW_S + CLEARING_S))
 
@@ -73,25 +72,15 @@ class Unit:
 
 @dataclass(eq=False)
 class Vehicle:
-    """A vehicle on its route.
-
-    Attributes:
-        route: the route.
-        units: the vehicle, or tractor and trailer, from front to rear.
-        front: route position of the vehicle's front, metres.
-        speed: m/s.
-        liveliness: factor on the acceleration, about 1.
-        bicycle: whether it is a bicycle.
-        track: (time, front, speed) of every step since it appeared; seconds, metres, m/s.
-    """
+    """A vehicle on its route. Its track has every step since it appeared."""
 
     route: Route
-    units: tuple[Unit, ...]
-    front: float
-    speed: float
-    liveliness: float
+    units: tuple[Unit, ...]  # the vehicle, or tractor and trailer, from front to rear
+    front: float  # route position, metres
+    speed: float  # m/s
+    liveliness: float  # factor on the acceleration, about 1
     bicycle: bool = False
-    track: list[tuple[float, float, float]] = field(default_factory=list)
+    track: list[tuple[float, float, float]] = field(default_factory=list)  # time (s), front (m), speed (m/s)
 
     @cached_property
     def length(self) -> float:
@@ -239,18 +228,11 @@ class ActorState:
 
 @dataclass(frozen=True)
 class DrivingActor:
-    """One unit of a driving vehicle. Its axles are on the route.
+    """One unit of a driving vehicle. Its axles are on the route."""
 
-    Attributes:
-        vehicle: the vehicle, after the simulation.
-        unit: the unit.
-        track: (3, T) times of the simulation steps (seconds), route positions of the vehicle's front (metres), speeds
-            (m/s).
-    """
-
-    vehicle: Vehicle
+    vehicle: Vehicle  # after the simulation
     unit: Unit
-    track: Array
+    track: Array  # (3, T) seconds, route positions of the vehicle's front (metres), speeds (m/s)
 
     def state(self, time_s: float) -> ActorState | None:
         """The state at a time of the drive in seconds; None before the vehicle appears and after it leaves."""

@@ -26,30 +26,20 @@ from bevcli.workshop.synth.mesh import (
 
 @dataclass(frozen=True)
 class CarShape:
-    """Proportions of a car.
+    """Proportions of a car, metres.
 
-    Attributes:
-        length: metres.
-        width: metres.
-        height: metres.
-        belt: height of the lower edge of the windows, metres.
-        nose: height of the bonnet's front edge, metres.
-        tail: height of the boot's rear edge, metres.
-        cabin: positions along the car as fractions of its length: rear window's lower edge, its upper edge,
-            windscreen's upper edge, its lower edge.
-        wheel_radius: metres.
-        clearance: height of the body's underside, metres.
+    cabin: fractions of the length: the rear window's lower and upper edge, the windscreen's upper and lower edge.
     """
 
     length: float
     width: float
     height: float
-    belt: float
-    nose: float
-    tail: float
+    belt: float  # height of the lower edge of the windows
+    nose: float  # height of the bonnet's front edge
+    tail: float  # height of the boot's rear edge
     cabin: tuple[float, float, float, float]
     wheel_radius: float = 0.33
-    clearance: float = 0.2
+    clearance: float = 0.2  # height of the body's underside
 
     def at(self, fraction: float) -> float:
         """x in metres of a fraction of the length, 0 at the tail and 1 at the nose."""
@@ -96,7 +86,6 @@ def car(name: str) -> list[Mesh]:
 
 
 def _details(s: CarShape, half: float) -> list[Mesh]:
-    """Bumpers, number plates, lamps, mirrors, sills, and wheels with their arches."""
     lamp_z, tail_z, lamp = s.nose - 0.1, s.tail - 0.12, Finish((255, 250, 230), Material.GLOW)
     parts = [
         block((s.at(0.995), 0, s.clearance + 0.2), (0.06, half * 1.5, 0.16), TRIM),
