@@ -11,14 +11,7 @@ import numpy as np
 from bevcli.findings import Finding, errors_of, rig_error
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
-from bevcli.rig.pose_checks import (
-    check_names,
-    check_poses,
-    corrected,
-    reordered,
-    seen_fov_deg,
-    units_per_metre,
-)
+from bevcli.rig.pose_checks import check_names, check_poses, corrected, reordered, seen_fov_deg, units_per_metre
 
 BEV_ASSUMED = Finding(
     "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',

@@ -18,8 +18,7 @@ PANEL = "Score"
 
 def stress(
     sequence: Annotated[
-        list[Path] | None,
-        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        list[Path] | None, argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS.")
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],

@@ -10,10 +10,7 @@ from bevcli.workshop.synth.options import RenderOptions
 PANEL = "Start"
 
 
-def render(
-    out: Annotated[Path, argument("The sequence folder to write.", reads=None)],
-    options: RenderOptions,
-) -> None:
+def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
     from bevcli.cli.progress import Progress
     from bevcli.jit import is_compiled

@@ -92,9 +92,7 @@ class DemoOptions:
 
     out: Path = option(default=Path("runs/demo"), help="Folder for the drive and the results.")
     seed: int = option(
-        default=1_000_001,
-        help="Seed of the drive. The model was trained on seeds below 1000000 only.",
-        minimum=0,
+        default=1_000_001, help="Seed of the drive. The model was trained on seeds below 1000000 only.", minimum=0
     )
     frames: int = option(
         default=8, help="Number of frames, two per second.", metavar="N", flag="--count", old=("--frames",), minimum=1
