@@ -7,21 +7,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.workshop.synth import people, street_objects, vehicles
-from bevcli.workshop.synth.mesh import (
-    BUS_PAINTS,
-    CAR_PAINTS,
-    CLOTHES,
-    MACHINE_PAINTS,
-    TRUCK_PAINTS,
-    Color,
-    Mesh,
-    joined,
-    linear,
-    made,
-)
+from bevcli.workshop.synth.mesh import Color, Mesh, joined, linear, made
 from bevcli.workshop.synth.people import CYCLES, RIDDEN
 from bevcli.workshop.synth.street_objects import MACHINES, StreetFurniture
 
+# Colours to draw from.
+CAR_PAINTS: tuple[Color, ...] = (
+    (235, 236, 238), (196, 199, 203), (120, 124, 130), (62, 66, 72), (26, 28, 32), (170, 28, 30), (120, 22, 30),
+    (28, 60, 128), (52, 108, 176), (22, 40, 70), (34, 84, 62), (214, 178, 40), (204, 98, 32), (150, 132, 104),
+    (108, 80, 58), (92, 132, 142),
+)  # fmt: skip
+TRUCK_PAINTS: tuple[Color, ...] = (
+    (238, 238, 236), (228, 228, 224), (196, 40, 34), (30, 84, 160), (226, 168, 30), (44, 112, 72), (104, 108, 112),
+    (232, 120, 36),
+)  # fmt: skip
+BUS_PAINTS: tuple[Color, ...] = (
+    (224, 60, 44), (36, 98, 176), (240, 190, 40), (240, 240, 236), (48, 140, 92), (128, 52, 120), (52, 168, 178),
+)  # fmt: skip
+MACHINE_PAINTS: tuple[Color, ...] = ((236, 176, 24), (232, 140, 20), (222, 92, 28), (236, 200, 60), (188, 190, 60))
+CLOTHES: tuple[Color, ...] = (
+    (40, 42, 48), (70, 76, 88), (132, 136, 142), (204, 202, 196), (150, 40, 44), (40, 70, 130), (78, 112, 160),
+    (58, 96, 70), (188, 148, 60), (120, 72, 110), (196, 112, 92), (96, 76, 60),
+)  # fmt: skip
 OWN_PAINTS: dict[str, tuple[Color, ...]] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
 
 

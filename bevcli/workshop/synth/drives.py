@@ -32,19 +32,16 @@ from bevcli.writing import write_whole
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
 FRAMES_PER_DRIVE = 20
-InputShape = tuple[int, int, int]  # cameras, height, width
+InputShape = tuple[int, int, int]  # number of cameras; height and width, pixels
 
 
 class Drives(Protocol):
-    """A list of drives. Several threads may open them at the same time.
-
-    Attributes:
-        input_shapes: of each drive, the number of cameras, and height and width of the network's input in pixels; None
-            where any of them may share a batch.
-    """
+    """A list of drives. Several threads may open them at the same time."""
 
     @property
-    def input_shapes(self) -> tuple[InputShape, ...] | None: ...
+    def input_shapes(self) -> tuple[InputShape, ...] | None:
+        """Of each drive the shape of the network's input; None where any of them may share a batch."""
+        ...
 
     def __len__(self) -> int: ...
 
@@ -107,9 +104,9 @@ class RenderedDrives(FolderDrives):
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
-            found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
-            self._rigs = [DrawnRig(found)] * len(seeds)
-            name += "" if rig is None else f"-rig-{_digest(found)}"
+            fitting = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
+            self._rigs = [DrawnRig(fitting)] * len(seeds)
+            name += "" if rig is None else f"-rig-{_digest(fitting)}"
         super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
         self._seeds, self._config = tuple(seeds), config
         self._rendering = threading.Lock()
@@ -177,8 +174,6 @@ def _digest(rig: CameraRig) -> str:
 
 
 class _Subset:
-    """Some of the drives."""
-
     def __init__(self, drives: Drives, indices: range) -> None:
         self._drives, self._indices = drives, indices
         shapes = drives.input_shapes
@@ -249,38 +244,29 @@ def count_frames(drives: Drives) -> int:
 
 
 KEYS = ("train", "validate")
-DRAWN_KEYS = ("drives", "validate_share", "seed")  # of a file whose drives are drawn
 
 
 @dataclass(frozen=True)
 class Split:
-    """The sequence folders of a split file."""
+    """The sequence folders of a split file: to train on, and to score on."""
 
-    train: tuple[Path, ...]  # to train on
-    validate: tuple[Path, ...]  # to score on, none of which is trained on
+    train: tuple[Path, ...]
+    validate: tuple[Path, ...]
 
 
 def read_split(path: Path) -> Split:
-    """The drives in a TOML file with the keys train and validate, or with drives that are drawn by a seed.
+    """The drives in a TOML file with the keys train and validate.
 
         train = ["drives/2024-*"]
         validate = ["drives/2025-01", "drives/2025-02"]
-
-        drives = ["drives/*"]
-        validate_share = 0.2
-        seed = 0
 
     Folders are relative to the file; *, ? and [abc] stand for the folders that match, in the order of their names.
     Raises InputError for another key, a list that leaves no drive, or a drive that is missing or stands there twice.
     """
     table = parse_toml(read_text(path, TOML_BYTES), path)
-    if set(table) == set(DRAWN_KEYS):
-        split = _drawn(path, **table)
-    elif set(table) == set(KEYS):
-        split = Split(*(_folders(path, key, table[key]) for key in KEYS))
-    else:
-        either = f"{' and '.join(KEYS)}, or {', '.join(DRAWN_KEYS)}"
-        raise InputError(f"{path}: expected the keys {either}, found {', '.join(table) or 'none'}")
+    if set(table) != set(KEYS):
+        raise InputError(f"{path}: expected the keys {' and '.join(KEYS)}, found {', '.join(table) or 'none'}")
+    split = Split(*(_folders(path, key, table[key]) for key in KEYS))
     times = Counter(folder.resolve() for folder in (*split.train, *split.validate))
     twice = [str(folder) for folder, count in times.items() if count > 1]
     if twice:
@@ -331,31 +317,15 @@ def _only_split(data: DriveOptions, path: Path) -> Split:
     return read_split(path)
 
 
-def _drawn(path: Path, drives: object, validate_share: object, seed: object) -> Split:
-    """The split that follows from a seed and the names of the drives, whatever their order. Raises InputError."""
-    folders = _folders(path, "drives", drives)
-    if not isinstance(validate_share, float) or not 0 < validate_share < 1:
-        raise InputError(f"{path}: validate_share: expected a number between 0 and 1, found {validate_share!r:.40}")
-    if not isinstance(seed, int):
-        raise InputError(f"{path}: seed: expected an integer, found {seed!r:.40}")
-    if len(folders) < 2:
-        raise InputError(f"{path}: drives: leaves no drive to score on (expected at least two folders)")
-    drawn = sorted(folders, key=lambda folder: hashlib.sha256(f"{seed} {folder.name}".encode()).digest())
-    count = min(max(1, round(validate_share * len(folders))), len(folders) - 1)
-    validate = set(drawn[:count])
-    return Split(*(tuple(each for each in folders if (each in validate) == chosen) for chosen in (False, True)))
-
-
 def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f'{path}: {key}: expected a list of folders, such as ["drives/a"], found {names!r:.60}')
     folders: list[Path] = []
     for name in names:
-        found = sorted(glob.glob(str(path.parent / name))) if set(name) & set("*?[") else [str(path.parent / name)]
-        missing = [each for each in found if not Path(each).exists()]
-        if missing or not found:
+        matching = sorted(glob.glob(str(path.parent / name))) if set(name) & set("*?[") else [str(path.parent / name)]
+        if not matching or not all(Path(folder).exists() for folder in matching):
             raise InputError(f"{path}: {key}: {name}: there is no such folder")
-        folders += map(Path, found)
+        folders += map(Path, matching)
     if not folders:
         raise InputError(f"{path}: {key}: leaves no drive (expected at least one folder)")
     return tuple(folders)
