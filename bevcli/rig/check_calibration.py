@@ -101,11 +101,11 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    if _has_other_format(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
+    if _is_other_drive(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
         return _check_other_sequence(path, frame, options)
     file = path / CALIBRATION if path.is_dir() else path
     draft = draft_calibration(file)
-    if folder is not None and _has_other_format(folder):
+    if folder is not None and _is_other_drive(folder):
         return _check_other_sequence(folder, frame, {**options, "calibration": file})
     if folder is None and path.is_dir():
         folder = path
@@ -115,6 +115,11 @@ def check_calibration(
         of_drive, images = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
     name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
     return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), of_drive), images)
+
+
+def _is_other_drive(path: Path) -> bool:
+    """True for a drive that is not a native folder, such as a bag."""
+    return is_drive(path) and format_of(path) is not NATIVE
 
 
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
@@ -128,11 +133,6 @@ def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
         "cells_by_cameras": {str(cameras): int(cells) for cameras, cells in enumerate(counts)},
         "seen_by_camera": {name: round(share, 6) for name, share in coverage.shares.items()},
     }
-
-
-def _has_other_format(path: Path) -> bool:
-    """True for a drive that is no native folder, such as a nuScenes root or a bag."""
-    return is_drive(path) and format_of(path) is not NATIVE
 
 
 def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationCheck:

@@ -24,9 +24,7 @@ OF_CAMERA = 7  # unknowns: rotation, position, delay
 HEIGHT = 5  # place of a camera's height among them
 OF_PAIR = 3  # the error of the vehicle's rotation
 OF_RIG = 3  # scale of the ego-motion, slope of the road along x and y
-# Standard deviations of what is stated: capture times, the vehicle's rotation between two frames, the scale of the
-# ego-motion, and the tilt of the ego frame over the road.
-DELAY_S, TURN, SCALE, TILT = 0.1, np.radians(0.1), 0.003, np.radians(0.2)
+DELAY_S, TILT = 0.1, np.radians(0.2)  # standard deviations of capture times and of the ego frame's tilt over the road
 
 
 @dataclass(frozen=True)
@@ -53,8 +51,8 @@ class Unknowns:
         poses[..., 4:] -= poses[:, :1, :1, 4:]
         stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
         of_camera = [np.radians(options.rotation_deg)] * 3 + [options.position_m] * 3 + [DELAY_S]
-        of_pairs = np.full(OF_PAIR * len(views.pairs), TURN)
-        deviations = np.concatenate([np.tile(of_camera, len(stated)), of_pairs, [SCALE, TILT, TILT]])
+        of_pairs = np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg))
+        deviations = np.concatenate([np.tile(of_camera, len(stated)), of_pairs, [options.scale, TILT, TILT]])
         return Unknowns(stated, poses, np.array(groups), len(views.pairs), deviations)
 
     @property

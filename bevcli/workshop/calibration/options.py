@@ -19,6 +19,14 @@ class CalibrateOptions:
         default=0.2, help="How far off a stated position of a camera may be: standard deviation an axis, metres.",
         minimum=0.001, maximum=2,
     )  # fmt: skip
+    turn_deg: float = option(
+        default=0.1, help="Error of the vehicle's stated rotation between two frames: standard deviation, degrees.",
+        minimum=0.001, maximum=5,
+    )  # fmt: skip
+    scale: float = option(
+        default=0.003, help="Error of the scale of the ego-motion: standard deviation, as a share.",
+        minimum=0.0001, maximum=0.2,
+    )  # fmt: skip
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
 
 
