@@ -146,9 +146,9 @@ def _draw_distances(canvas: Pixels, camera: Camera) -> None:
         pixel = pixels_in_image(camera, start + distance * ahead)
         if np.isfinite(pixel).all() and last - pixel[1] > 22:
             last = float(pixel[1])
-            place = (round(pixel[0]), round(pixel[1]))
+            corner = (round(pixel[0]), round(pixel[1]))
             for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
-                cv2.putText(canvas, f"{distance:g} m", place, font, size, color, thickness, cv2.LINE_AA)
+                cv2.putText(canvas, f"{distance:g} m", corner, font, size, color, thickness, cv2.LINE_AA)
 
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
@@ -179,8 +179,8 @@ def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Ma
     tops = GAP + np.cumsum([0.0, *heights[:2]])
     for row, top in ((front, tops[0]), (back, tops[2])):
         start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
-        for place, camera in enumerate(row):
-            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, images)
+        for column_index, camera in enumerate(row):
+            _draw_camera(sheet, (start + column_index * (SLOT + GAP), top), camera, rig, report, images)
     for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
         top = tops[1]
         for camera in column:
@@ -356,12 +356,12 @@ def _draw_vehicle(axes: Axes, rig: CameraRig) -> None:
 
 def _draw_field_of_view(axes: Axes, camera: Camera, rig: CameraRig) -> None:
     bev_from_camera = inverse(rig.ego_from_bev) @ camera.ego_from_camera
-    place, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
+    position, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
     yaw = float(np.degrees(np.arctan2(forward[1], forward[0])))
     for angle in np.radians(yaw - np.array(seen_range_deg(camera, 0))):
-        end = place + 80 * np.array([np.cos(angle), np.sin(angle)])
-        axes.plot([place[0], end[0]], [place[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
-    label = place + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
+        end = position + 80 * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot([position[0], end[0]], [position[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
+    label = position + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
     box = {"facecolor": PAPER, "edgecolor": "none", "alpha": 0.75, "boxstyle": "round,pad=0.25"}
     style: dict[str, Any] = {"color": INK, "fontsize": 8, "ha": "center", "va": "center", "bbox": box}
     axes.text(float(label[0]), float(label[1]), camera.name, zorder=5, clip_on=True, **style)

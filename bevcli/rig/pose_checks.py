@@ -142,7 +142,7 @@ def _contains(words: Sequence[str], word: str) -> bool:
 
 
 def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Finding]]:
-    found = []
+    copies = []
     for a, b in combinations(cameras, 2):
         distance = float(np.linalg.norm(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]))
         cosine = np.clip((np.trace(a.ego_from_camera[:3, :3].T @ b.ego_from_camera[:3, :3]) - 1) / 2, -1, 1)
@@ -155,8 +155,8 @@ def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Find
                 f"{distance:.3f} m and {turn:.2f}° apart", "different positions or viewing directions",
                 "one pose is a copy of the other: give each camera its own",
             )  # fmt: skip
-            found.append(((a.name, b.name), finding))
-    return found
+            copies.append(((a.name, b.name), finding))
+    return copies
 
 
 def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> Finding | None:
@@ -165,7 +165,7 @@ def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> 
         return None
     turns = np.exp(1j * np.radians([yaws[name] - named[name] for name in named]))
     turn = float(np.degrees(np.angle(turns.mean())))
-    spread = max(turn_deg(float(np.degrees(np.angle(one))), turn) for one in turns)
+    spread = max(turn_deg(float(np.degrees(np.angle(turned))), turn) for turned in turns)
     if abs(turn) < EGO_TURN_DEG[0] or spread > EGO_TURN_DEG[1]:
         return None
     return rig_error(

@@ -131,9 +131,9 @@ def geometry(unknowns: Unknowns, local: Array) -> GroupGeometry:
 
 def _pose_at(table: Array, delay: Array) -> Array:
     """(G, 4, 4) poses of tables (G, 25, 7) at delays (G,), seconds."""
-    place = (delay - DELAYS_S[0]) / (DELAYS_S[1] - DELAYS_S[0])
-    before = np.clip(place.astype(int), 0, len(DELAYS_S) - 2)
-    share, every = (place - before)[:, None], np.arange(len(table))
+    index = (delay - DELAYS_S[0]) / (DELAYS_S[1] - DELAYS_S[0])
+    before = np.clip(index.astype(int), 0, len(DELAYS_S) - 2)
+    share, every = (index - before)[:, None], np.arange(len(table))
     pose = (1 - share) * table[every, before] + share * table[every, before + 1]
     result = np.tile(np.eye(4), (len(table), 1, 1))
     result[:, :3, :3] = Rotation.from_quat(pose[:, :4]).as_matrix()
@@ -183,13 +183,13 @@ class EpipolarResiduals(Residuals):
         return (self.focal * (self.rays_b * normal_a).sum(-1) / np.maximum(length, SHORTEST))[:, None]
 
     def depths(self, geometry: GroupGeometry) -> Array:
-        """(N, 2) metres along both rays to where they meet, or come nearest to it; 0 for parallel rays."""
+        """(N, 2) metres scaled both rays to where they meet, or come nearest to it; 0 for parallel rays."""
         relative = geometry.camera_b_from_camera_a[self.group]
         ray_a, ray_b = np.einsum("nij,nj->ni", relative[:, :3, :3], self.rays_a), self.rays_b
         shift, cosine = relative[:, :3, 3], (ray_a * ray_b).sum(-1)
         along_a, along_b = (shift * ray_a).sum(-1), (shift * ray_b).sum(-1)
-        found = np.stack([cosine * along_b - along_a, along_b - cosine * along_a], axis=-1)
-        return found / np.maximum(1 - cosine**2, SHORTEST)[:, None]
+        scaled = np.stack([cosine * along_b - along_a, along_b - cosine * along_a], axis=-1)
+        return scaled / np.maximum(1 - cosine**2, SHORTEST)[:, None]
 
 
 @dataclass(frozen=True)
@@ -274,9 +274,9 @@ def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
     prior = 1 / unknowns.deviations**2
     damping, cost = DAMPING[0], _cost(unknowns, terms, x, prior)
     for _ in range(STEPS):
-        found = _at(unknowns, terms, x)
-        matrix = found.information + np.diag(prior)
-        gradient = _summed(found.columns, found.gradients, len(x)) + prior * x
+        here = _at(unknowns, terms, x)
+        matrix = here.information + np.diag(prior)
+        gradient = _summed(here.columns, here.gradients, len(x)) + prior * x
         while damping < DAMPING[1]:
             step = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
             reached = _cost(unknowns, terms, x + step, prior)
@@ -296,12 +296,12 @@ def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
 
     A camera with few residuals has that of all.
     """
-    found, camera = np.abs(values(unknowns, residuals, x)), unknowns.groups[residuals.group, 1]
-    result = np.full(len(found), DEVIATION * np.median(found) if found.size else 1.0)
+    sizes, camera = np.abs(values(unknowns, residuals, x)), unknowns.groups[residuals.group, 1]
+    result = np.full(len(sizes), DEVIATION * np.median(sizes) if sizes.size else 1.0)
     for each in np.unique(camera):
         mine = camera == each
         if mine.sum() >= FEWEST:
-            result[mine] = DEVIATION * np.median(found[mine])
+            result[mine] = DEVIATION * np.median(sizes[mine])
     return np.maximum(result, SMALLEST_PX)
 
 
@@ -338,8 +338,8 @@ def _summed(columns: Indices, parts: Array, size: int) -> Array:
     """Vectors (G, 20) or matrices (G, 20, 20) of groups summed up in all unknowns: (P,) or (P, P)."""
     if parts.ndim == 2:
         return np.asarray(np.bincount(columns.ravel(), parts.ravel(), size), dtype=np.float64)
-    places = columns[:, :, None] * size + columns[:, None, :]
-    return np.asarray(np.bincount(places.ravel(), parts.ravel(), size**2), dtype=np.float64).reshape(size, size)
+    indices = columns[:, :, None] * size + columns[:, None, :]
+    return np.asarray(np.bincount(indices.ravel(), parts.ravel(), size**2), dtype=np.float64).reshape(size, size)
 
 
 def _curvature(squares: Array) -> float:

@@ -56,19 +56,19 @@ def search_heights(
 ) -> Array:
     """(C,) corrections of the heights in x (P,), at most `reach_m` metres; 0 for cameras outside a mask (C,)."""
     corrections = np.arange(-reach_m, reach_m + STEP_M / 2, STEP_M)
-    found = np.zeros(unknowns.cameras)
-    searched = np.arange(len(found)) if cameras is None else np.flatnonzero(cameras)
+    heights = np.zeros(unknowns.cameras)
+    searched = np.arange(len(heights)) if cameras is None else np.flatnonzero(cameras)
     with ThreadPoolExecutor(THREADS) as threads:
-        found[searched] = list(threads.map(lambda c: _best(views, unknowns, x, c, corrections), searched))
-    return found
+        heights[searched] = list(threads.map(lambda c: _best(views, unknowns, x, c, corrections), searched))
+    return heights
 
 
 def _best(views: Views, unknowns: Unknowns, x: Array, index: int, corrections: Array) -> float:
     """The correction of a camera among some (H,), by all its pairs of images."""
     groups = [group for group in unknowns.within_camera if unknowns.groups[group, 1] == index]
-    found, scores = geometry_at(unknowns, x), np.zeros(len(corrections))
+    geometry, scores = geometry_at(unknowns, x), np.zeros(len(corrections))
     for group in groups:
-        scores += _scores(views, unknowns, found, int(group), corrections)
+        scores += _scores(views, unknowns, geometry, int(group), corrections)
     return float(corrections[_lowest_level(scores)]) if scores.any() else 0.0
 
 
@@ -84,12 +84,12 @@ def _lowest_level(scores: Array) -> int:
     return int(np.flatnonzero(sharp >= LEAST_SHARPNESS * sharp.max())[-1])
 
 
-def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int, corrections: Array) -> Array:
+def _scores(views: Views, unknowns: Unknowns, geometry: GroupGeometry, group: int, corrections: Array) -> Array:
     """The score of each correction (H,) in a pair of images: tiles of the road that look alike vote for it."""
     pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
     images = [view.texture for view in views.sides((pair, index, index))]
-    pose, motion = found.ego_from_camera_a[group], found.ego_b_from_ego_a[group]
+    pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
     points = _grid(pose)
     moved = points @ motion[:3, :3].T + motion[:3, 3]
     alike = []
@@ -131,7 +131,7 @@ def _tiles(values: Array) -> Array:
 
 def _correlation(first: Array, second: Array) -> Array:
     """(tiles,) normalised cross-correlation of tiles (tiles, n); 0 where one of them is not seen whole."""
-    a, b = (each - each.mean(-1, keepdims=True) for each in (first, second))
+    a, b = (tiles - tiles.mean(-1, keepdims=True) for tiles in (first, second))
     spread = np.sqrt((a**2).sum(-1) * (b**2).sum(-1))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.nan_to_num((a * b).sum(-1) / spread, nan=0.0, posinf=0.0, neginf=0.0)
@@ -139,23 +139,23 @@ def _correlation(first: Array, second: Array) -> Array:
 
 def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
     """Road points of all groups, at most `most_px` pixels from where the unknowns x (P,) expect them."""
-    groups, found = unknowns.within_camera, geometry_at(unknowns, x)
+    groups, geometry = unknowns.within_camera, geometry_at(unknowns, x)
     with ThreadPoolExecutor(THREADS) as threads:
-        parts = list(threads.map(lambda group: _points_of(views, unknowns, found, int(group), most_px), groups))
+        parts = list(threads.map(lambda group: _points_of(views, unknowns, geometry, int(group), most_px), groups))
     counts = [len(part[0]) for part in parts]
     columns = (np.concatenate([part[side] for part in parts]) for side in range(4))
     return RoadResiduals(np.repeat(groups, counts), *columns)
 
 
 def _points_of(
-    views: Views, unknowns: Unknowns, found: GroupGeometry, group: int, most_px: float
+    views: Views, unknowns: Unknowns, geometry: GroupGeometry, group: int, most_px: float
 ) -> tuple[Array, Array, Array, Array]:
     """The fields of `RoadResiduals` after the first for the points of a group."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
     pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
     first, second = (view.texture for view in views.sides((pair, index, index)))
-    warp = _warp(camera, found, group)
+    warp = _warp(camera, geometry, group)
     if warp is None:
         return nothing
     field, road = warp
@@ -171,11 +171,11 @@ def _points_of(
         return nothing
     target = _sample(field, at + flow)
     rays_a, rays_b = camera.rays(at), camera.rays(target)
-    beside = beside_way(points_of_road(found.ego_from_camera_a[group], rays_a), found.ego_b_from_ego_a[group])
+    beside = beside_way(points_of_road(geometry.ego_from_camera_a[group], rays_a), geometry.ego_b_from_ego_a[group])
     return rays_a, rays_b, _weights(camera, first, field, at, target), beside
 
 
-def _warp(camera: Camera, found: GroupGeometry, group: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+def _warp(camera: Camera, geometry: GroupGeometry, group: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
     """The map from the first image of a group to the second, over a flat road; None where they share no road.
 
     Returns (h, w, 2) pixels in the second image, far outside where there is no road to compare, and (h, w) the pixels
@@ -184,11 +184,11 @@ def _warp(camera: Camera, found: GroupGeometry, group: int) -> tuple[NDArray[np.
     columns, rows = np.arange(0, camera.width + STRIDE, STRIDE), np.arange(0, camera.height + STRIDE, STRIDE)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
     rays = camera.rays(pixels.reshape(-1, 2))
-    pose, motion = found.ego_from_camera_a[group], found.ego_b_from_ego_a[group]
+    pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
     points = points_of_road(pose, rays)
     away = np.linalg.norm((points - pose[:3, 3])[:, :2], axis=-1)
     road = (away > NEAREST * pose[2, 3]) & (away < FARTHEST * pose[2, 3]) & (beside_way(points, motion) < WIDEST_M)
-    ahead = rays_of_road_points(found, np.full(len(rays), group), np.nan_to_num(rays, nan=-1.0))
+    ahead = rays_of_road_points(geometry, np.full(len(rays), group), np.nan_to_num(rays, nan=-1.0))
     target, in_front = camera.project(ahead)
     road &= camera.contains(target, in_front)
     shape = pixels.shape[:2]
@@ -229,11 +229,11 @@ def _flow(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The flow (n, 2) from the first image at points (n, 2), and whether it is believed."""
     start, size, levels = at[:, None], (WINDOW, WINDOW), 2
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, warped, start, start.copy(), winSize=size, maxLevel=levels)
+    there, tracked, _ = cv2.calcOpticalFlowPyrLK(first, warped, start, start.copy(), winSize=size, maxLevel=levels)
     back, again, _ = cv2.calcOpticalFlowPyrLK(warped, first, there, start.copy(), winSize=size, maxLevel=levels)
     returned = np.linalg.norm((back - start)[:, 0], axis=-1) < MOST_BACK_PX
     flow = np.asarray(there - start, dtype=np.float64)[:, 0]
-    return flow, (found.ravel() > 0) & (again.ravel() > 0) & returned
+    return flow, (tracked.ravel() > 0) & (again.ravel() > 0) & returned
 
 
 def sampled(image: NDArray[Any], pixels: NDArray[Any]) -> NDArray[Any]:
@@ -295,7 +295,9 @@ def level_corrections(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarRes
     pairs = np.unique(np.sort(unknowns.groups[ties.group, 1:], axis=-1), axis=0)
     sets = [each for each in (*np.arange(unknowns.cameras)[:, None], *pairs) if not stays[each].any()]
     for _ in sets:  # the largest contradiction first: it may be the cause of others
-        gain, best = max((_best_level(unknowns, ties, corrected, each) for each in sets), key=lambda found: found[0])
+        gain, best = max(
+            (_best_level(unknowns, ties, corrected, each) for each in sets), key=lambda gain_and_x: gain_and_x[0]
+        )
         if gain <= 0:
             break
         corrected = best

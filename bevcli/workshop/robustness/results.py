@@ -59,10 +59,10 @@ class StressResults:
 
     def resilience(self, name: str) -> float:
         """Resilience rate of a corruption: its mean NDS over its severities, over the NDS of clean drives."""
-        found = self.of(name).values()
-        if self.clean is None or not found or not self.clean.nd_score:
+        severities = self.of(name).values()
+        if self.clean is None or not severities or not self.clean.nd_score:
             return math.nan
-        return sum(scores.nd_score for scores in found) / len(found) / self.clean.nd_score
+        return sum(scores.nd_score for scores in severities) / len(severities) / self.clean.nd_score
 
     def corruption_error(self, name: str, against: Self) -> float:
         """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""

@@ -360,13 +360,13 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
     yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
     limits = _speed_limits(positions, yaws, speed)
     passes, start = [], 0
-    for node, direction, turn, *places in marks:
-        found = []
-        for place in places:
+    for node, direction, turn, *plan_points in marks:
+        reached = []
+        for point in plan_points:
             window = plan[start : start + int(160 / STEP_M)]
-            start += int(np.argmin(np.linalg.norm(window - place, axis=1)))
-            found.append(float(positions[start]))
-        passes.append(JunctionPass(node, direction, turn, *found))
+            start += int(np.argmin(np.linalg.norm(window - point, axis=1)))
+            reached.append(float(positions[start]))
+        passes.append(JunctionPass(node, direction, turn, *reached))
     return Route(points, positions, yaws, limits, tuple(passes))
 
 
@@ -375,9 +375,9 @@ def distances_along(points: Array) -> Array:
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
-def points_at(places: ArrayLike, points: Array, positions: Array) -> Array:
-    """Points (..., 2) of a line at places (...,) along it. points: (P, 2) with positions (P,) along the line."""
-    at = np.asarray(places, dtype=np.float64)
+def points_at(distances: ArrayLike, points: Array, positions: Array) -> Array:
+    """Points (..., 2) of a line at distances (...,) along it. points: (P, 2) with positions (P,) along the line."""
+    at = np.asarray(distances, dtype=np.float64)
     return np.stack([np.interp(at, positions, points[:, k]) for k in (0, 1)], -1)
 
 

@@ -316,8 +316,8 @@ def true_lines(pieces: list[GroundPiece], bev_from_world: Array) -> MapLines:
     """Lane dividers, pedestrian crossings (closed) and road boundaries, as by `lines_in_area`, bev frame."""
     outlines = [moved(bev_from_world, road) for piece in pieces for road in piece.roads]
     roads = union_all([Polygon(outline).buffer(GAP_M) for outline in outlines]).buffer(-GAP_M)
-    found: list[tuple[str, BaseGeometry]] = [(BOUNDARY, roads.boundary)]
+    lines: list[tuple[str, BaseGeometry]] = [(BOUNDARY, roads.boundary)]
     for piece in pieces:
-        found += [(DIVIDER, LineString(moved(bev_from_world, line))) for line in piece.lane_boundaries]
-        found += [(CROSSING, Polygon(moved(bev_from_world, outline)).boundary) for outline in piece.crossings]
-    return lines_in_area(found)
+        lines += [(DIVIDER, LineString(moved(bev_from_world, line))) for line in piece.lane_boundaries]
+        lines += [(CROSSING, Polygon(moved(bev_from_world, outline)).boundary) for outline in piece.crossings]
+    return lines_in_area(lines)

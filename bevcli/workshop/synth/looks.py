@@ -176,9 +176,9 @@ class Looks:
             float(rng.random() < 0.4),
         )
 
-    def clutter(self, length_m: float, *place: int) -> Iterator[tuple[TriangleSoup, float, float]]:
+    def clutter(self, length_m: float, *indices: int) -> Iterator[tuple[TriangleSoup, float, float]]:
         """Nameless objects on a pavement, with their distances along it and away from the kerb, metres."""
-        rng = self.stream("clutter", *place)
+        rng = self.stream("clutter", *indices)
         for _ in range(rng.poisson(length_m * CLUTTER_PER_M)):
             yield TriangleSoup.from_mesh(nameless(rng)), rng.uniform(4, max(length_m - 4, 5)), rng.uniform(0.8, 4.5)
 

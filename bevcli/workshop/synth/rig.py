@@ -136,10 +136,10 @@ EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
     """Six horizontal cameras around the vehicle. width, height: of the images, pixels; the fields of view stay."""
     cameras = []
-    for name, (*place, yaw_deg, focal) in _MOUNTS.items():
+    for name, (*position, yaw_deg, focal) in _MOUNTS.items():
         intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
         rotation = rotation_about_z(np.radians(yaw_deg)) @ EGO_AXES_FROM_CAMERA
-        camera = Camera(name, 1600, 900, intrinsics, rigid(place, rotation))
+        camera = Camera(name, 1600, 900, intrinsics, rigid(position, rotation))
         cameras.append(camera.scaled(width / 1600, height / 900))
     return CameraRig(tuple(cameras), default_ego_from_bev())
 
@@ -152,20 +152,20 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
     Raises InputError where the file is wrong, or a camera has too wide a field of view for its lens model.
     """
     if rig is None:
-        where, found = "", nuscenes_like_rig()
+        where, chosen = "", nuscenes_like_rig()
     elif isinstance(rig, CameraRig):
-        where, found = "rig: ", rig
+        where, chosen = "rig: ", rig
     else:
-        where, found = f"{rig}: ", read_calibration(Path(rig))
+        where, chosen = f"{rig}: ", read_calibration(Path(rig))
     if size is not None:
-        found = replace(found, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in found.cameras))
-    for camera in found.cameras:
+        chosen = replace(chosen, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in chosen.cameras))
+    for camera in chosen.cameras:
         if camera.distortion is not None:
             try:
                 lens_parts(camera)
             except InputError as error:
                 raise InputError(f"{where}camera {camera.name}: {error}") from None
-    return found
+    return chosen
 
 
 _STREAM = 0x7269_6773  # keeps the draws apart from those of the street with the same seed
@@ -279,11 +279,11 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
         spread = random.uniform(-1, 1)
         own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
         intrinsics = _intrinsics(image_size, own_fov, distribution, random)
-        place = _place(yaw_deg, radius, height, distribution, random)
+        position = _position(yaw_deg, radius, height, distribution, random)
         tilt = _tilt(distribution.tilt_deg, random)
         rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
         distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
-        cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(place, rotation), distortion))
+        cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(position, rotation), distortion))
     return CameraRig(tuple(cameras), _ego_from_bev(distribution, random))
 
 
@@ -308,7 +308,7 @@ def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribu
     return np.array([[focal, 0, x * width], [0, focal * ratio, y * height], [0, 0, 1.0]])
 
 
-def _place(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
+def _position(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
     """(3,) ego, metres: on an ellipse around the middle of the vehicle, in the viewing direction."""
     around = np.radians(yaw_deg + random.uniform(-20, 20))
     x = _CENTER_X_M + radius * np.cos(around)

@@ -41,7 +41,7 @@ class Walker:
     body: Body  # size and looks
     path: Array  # (P, 2) plan points, metres
     times: Array  # (K,) seconds; between them the person moves evenly
-    places: Array  # (K,) position along the path at these times, metres
+    walked_m: Array  # (K,) position along the path at these times, metres
     road: tuple[float, float]  # start and end of the part of the path that is on a road, metres; negative for none
 
     @cached_property
@@ -51,19 +51,19 @@ class Walker:
 
     def plan_at(self, time_s: ArrayLike) -> Array:
         """Plan points (..., 2) at times (...,) in seconds."""
-        places = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.places)
-        return points_at(places, self.path, self.positions)
+        walked_m = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.walked_m)
+        return points_at(walked_m, self.path, self.positions)
 
     def on_road(self, time_s: float) -> bool:
         """True while the person walks and is on the road, so that vehicles must stop."""
         walks = self.times[0] < time_s < self.times[-1]
-        return bool(walks and self.road[0] - 0.3 < np.interp(time_s, self.times, self.places) < self.road[1] + 0.3)
+        return bool(walks and self.road[0] - 0.3 < np.interp(time_s, self.times, self.walked_m) < self.road[1] + 0.3)
 
     def state(self, time_s: float) -> ActorState | None:
         """The state, or None before the walk begins and after it ends."""
         if not self.times[0] <= time_s <= self.times[-1]:
             return None
-        place = float(np.interp(time_s, self.times, self.places))
+        walked = float(np.interp(time_s, self.times, self.walked_m))
         plan = self.plan_at([time_s - 0.02, time_s, time_s + 0.02])
         before, here, after = self.city.bend(plan)
         velocity = (after - before) / 0.04
@@ -71,13 +71,13 @@ class Walker:
         if moving:
             yaw = float(np.arctan2(velocity[1], velocity[0]))
         else:  # a waiting person faces along the path
-            segment = int(np.searchsorted(self.positions, place, side="right"))
+            segment = int(np.searchsorted(self.positions, walked, side="right"))
             way = self.path[segment] - self.path[segment - 1]
             yaw = self.city.heading(plan[1], way / max(float(np.hypot(*way)), 1e-9))
-        inside = min(place - self.road[0], self.road[1] - place)  # metres into the road, negative on pavements
+        inside = min(walked - self.road[0], self.road[1] - walked)  # metres into the road, negative on pavements
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
-        return ActorState(self.body, position, yaw, attribute, velocity, int(place / STRIDE_M) % 2)
+        return ActorState(self.body, position, yaw, attribute, velocity, int(walked / STRIDE_M) % 2)
 
 
 def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
@@ -143,8 +143,8 @@ def _crosser(
     start += rng.uniform(0, 1.0) if start > arrival else 0.0
     end = start + (2 * reach - kerb) / speed
     body = _person(assets, rng, name)
-    times, places = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
-    return Walker(city, body, path, times, places, (ALONG_PAVEMENT_M, far))
+    times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
+    return Walker(city, body, path, times, walked_m, (ALONG_PAVEMENT_M, far))
 
 
 def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:

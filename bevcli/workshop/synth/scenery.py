@@ -189,12 +189,12 @@ class Scenery:
 
     def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
         """Meshes within `reach_m` metres of a world point (2,)."""
-        found = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
-        spheres = np.concatenate([mesh.mesh_spheres for mesh in found])
+        meshes = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
+        spheres = np.concatenate([mesh.mesh_spheres for mesh in meshes])
         distances = np.hypot(*(spheres[:, :2] - np.asarray(center, dtype=np.float64)).T)
         # Draw walls first, near ones before far ones: they hide most of the rest, which is then skipped.
-        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in found]])
-        return TriangleSoup.gather([found[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
+        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in meshes]])
+        return TriangleSoup.gather([meshes[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
 
     def _make_block(self, column: int, row: int) -> list[TriangleSoup]:
         land, use = self.city.block(column, row), self.city.landuse(column, row)

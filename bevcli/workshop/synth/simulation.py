@@ -155,14 +155,14 @@ class Simulation:
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
         """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
         near = self.city.around(point, reach_m)
-        found: list[Actor] = [*self._driving]
+        actors: list[Actor] = [*self._driving]
         for block in near.blocks:
-            found += [*self.roadside.block(*block), *self._strollers(*block)]
+            actors += [*self.roadside.block(*block), *self._strollers(*block)]
         for stretch in near.stretches:
-            found += self.roadside.stretch(*stretch)
+            actors += self.roadside.stretch(*stretch)
         for node in near.blocks:
-            found += self._crossers(node)
-        return found
+            actors += self._crossers(node)
+        return actors
 
     def _run(self) -> None:
         vehicles, start = [self._ego], self.span_s[0] - STEP_S

@@ -51,8 +51,8 @@ def _track(y: float, length: float, height: float, width: float) -> Mesh:
         (-foot, 0), (foot, 0), (half, height * 0.5), (shoulder, height), (-shoulder, height), (-half, height * 0.5),
     ]  # fmt: skip
     start, end, z = y - width / 2 - 0.02, y + width / 2 + 0.02, height * 0.45
-    places = (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7)
-    rollers = [rod((x, start, z), (x, end, z), height * 0.3, WORN_STEEL, sections=8) for x in places]
+    positions = (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7)
+    rollers = [rod((x, start, z), (x, end, z), height * 0.3, WORN_STEEL, sections=8) for x in positions]
     return joined([side_profile(outline, width / 2, BLACK_RUBBER, y=y), *rollers])
 
 

@@ -172,18 +172,18 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
 
 @njit(nogil=True)
 def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
-    """(count, 2) evenly spaced points of a route from position start to end.
+    """(count, 2) evenly spaced points of a route from at start to end.
 
     points: (P, 2) of the route. positions: (P,) along it, metres.
     """
-    found = np.empty((count, 2))
+    result = np.empty((count, 2))
     for i in range(count):
-        place = start + (end - start) * i / (count - 1)
-        k = min(max(int(np.searchsorted(positions, place)) - 1, 0), len(positions) - 2)
-        w = min(max((place - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
-        found[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
-        found[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
-    return found
+        at = start + (end - start) * i / (count - 1)
+        k = min(max(int(np.searchsorted(positions, at)) - 1, 0), len(positions) - 2)
+        w = min(max((at - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
+        result[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
+        result[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
+    return result
 
 
 @njit(nogil=True)

@@ -296,13 +296,13 @@ def bus(name: str) -> list[Mesh]:
         display = Finish((255, 170, 40), Material.GLOW)
         parts.append(block((nose - 0.05, 0, min(height - 0.25, 2.75)), (0.12, 1.7, 0.28), display))
         parts += [block((x, -half + 0.01, 1.4), (1.1, 0.05, 2.0), GLASS) for x in (nose - 1.0, 0.0)]
-    places = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
+    positions = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
     return [
         *parts,
         block((0, 0, floor + 0.35), (length * 0.92, half * 2.01, 0.22), CARGO),
         twin_blocks((front - 0.02, half * 0.75, 0.75), (0.08, 0.4, 0.2), HEADLAMP),
         twin_blocks((-front, half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL_LAMP),
-        axles(places, half + 0.02 - 0.16, 0.46, 0.3),
+        axles(positions, half + 0.02 - 0.16, 0.46, 0.3),
     ]
 
 
