@@ -177,7 +177,6 @@ def test_the_command_writes_a_calibration(tmp_path):
     assert {path.name for path in (tmp_path / "rig").iterdir()} == {
         "calibration.json",
         "report.json",
-        "calibration.png",
     }
 
 

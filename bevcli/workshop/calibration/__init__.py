@@ -7,5 +7,4 @@ In the order of the work:
     measure              matched points, and all of it in rounds
     estimates            what is said about each camera and the whole rig, with the text for the terminal
     calibrate            the entry point: reads a drive, measures, judges; the result is printed, written, or used
-    drawings             calibration.png
 """

@@ -57,7 +57,6 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
-        measurement: what it was measured from.
     """
 
     name: str
@@ -67,7 +66,6 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
-    measurement: Measurement
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(each for each in self.cameras if each.camera == camera)
@@ -88,19 +86,14 @@ class CalibrationResult:
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write calibration.json (the corrected rig), report.json and calibration.png into a folder.
+        """Write calibration.json (the corrected rig) and report.json into a folder. Returns their paths.
 
-        Returns their paths. The folder is made where it is missing; existing files are overwritten. Raises OutputError.
+        The folder is made where it is missing; existing files are overwritten. Raises OutputError.
         """
-        # Only writing draws: matplotlib takes half a second to load.
-        from bevcli.workshop.calibration.drawings import write_sheet
-
-        folder = Path(folder)
-        paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png")]
-        write_whole(paths[1], f"{self.to_json()}\n".encode(), parents=True)
-        write_sheet(paths[2], self.measurement, self.cameras)
-        write_calibration(paths[0], self.rig, self.facts)
-        return paths
+        rig, report = Path(folder) / "calibration.json", Path(folder) / "report.json"
+        write_whole(report, f"{self.to_json()}\n".encode(), parents=True)
+        write_calibration(rig, self.rig, self.facts)
+        return [rig, report]
 
 
 class CorrectedDrive(DerivedSequence):
@@ -164,7 +157,7 @@ def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
             for camera, pose, estimate in zip(stated.cameras, moved(unknowns.stated, changes), cameras, strict=True)
         ),
     )
-    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, measurement)
+    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts)
 
 
 def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:

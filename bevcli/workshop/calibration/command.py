@@ -22,9 +22,8 @@ def calibrate(
     """Measure the calibration of a drive from its own images and ego-motion.
 
     Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
-    fine, corrected, or not measurable. Writes calibration.json with the corrected rig, report.json with all numbers,
-    and calibration.png, which shows the cameras before and after. Nothing in SEQUENCE is changed.
-    `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
+    fine, corrected, or not measurable. Writes calibration.json with the corrected rig and report.json with all numbers.
+    Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
     """
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
