@@ -8,12 +8,14 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.model_uses",
     "bevcli.sequences",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
     "bevcli.engines",
     "bevcli.commands",
+    "bevcli.extensions",
 ]
 
 # Group -> name -> "module:attribute".
@@ -21,6 +23,11 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.models": {
         "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
         "BEVFormerV2": "bevcli.model.bevformer_v2.bevformer_v2:BEVFormerV2",
+    },
+    # What others need to know of a model, by its class or a base class: see `bevcli.registry.for_model`.
+    "bevcli.model_uses": {
+        "constant_parts BEVFormer": "bevcli.model.prepare:fix_first_attention",
+        "constant_parts BEVFormerV2": "bevcli.model.bevformer_v2.constant_parts:fix_attentions",
     },
     "bevcli.sequences": {
         "native": "bevcli.sequences.native.format:FORMAT",

@@ -42,11 +42,11 @@ WINGS: dict[str, set[str]] = {
     "batch": {"vad"},
     "benchmark": {"engines"},
     "calibration": set(),
-    "engines": {"benchmark"},
+    "engines": set(),
     "explain": set(),
     "formats": {"vad"},
-    "robustness": {"calibration", "engines", "synth"},
-    "synth": {"calibration", "formats", "vad"},
+    "robustness": {"calibration", "synth"},
+    "synth": {"formats", "vad"},
     "tracking_scores": set(),
     "training": {"synth", "tracking_scores", "vad"},
     "uniad": set(),
@@ -54,11 +54,9 @@ WINGS: dict[str, set[str]] = {
 }
 # What in the core still imports the workshop.
 LEFT = {
-    "bevcli.cli.eval", "bevcli.cli.progress", "bevcli.cli.project_debug", "bevcli.cli.run", "bevcli.cli.weights",
+    "bevcli.cli.eval",
     "bevcli.evaluation.evaluate", "bevcli.evaluation.inputs", "bevcli.evaluation.scores_report",
-    "bevcli.inference.load", "bevcli.inference.preprocess", "bevcli.inference.run", "bevcli.inference.session",
-    "bevcli.model.bevformer.bevformer", "bevcli.model.bevformer_v2.bevformer_v2", "bevcli.model.temporal_model",
-    "bevcli.runs.files", "bevcli.runs.run_into_folder",
+    "bevcli.runs.files",
     "bevcli.sequences.native.folder",    "bevcli.sequences.native.format",
     "bevcli.sequences.nuscenes.format", "bevcli.sequences.nuscenes.map_expansion",
 }  # fmt: skip
@@ -218,8 +216,7 @@ def test_only_a_download_uses_libcurl_and_http():
                 names = [node.module, *(f"{node.module}.{each.name}" for each in node.names)]
             for name in names:
                 users.setdefault(name, set()).add(path.relative_to(ROOT).as_posix())
-    assert users["pycurl"] == {"weights/download.py"}
-    assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
+    assert users["pycurl"] == {"weights/fetch.py"}
     assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/progress.py"}
     assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
     assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()

@@ -22,12 +22,13 @@ def classes_of(folder: Path) -> set[str]:
 
 
 def trees_outside() -> dict[Path, ast.Module]:
-    """The files outside of the models' folders."""
-    left = {ROOT.joinpath(*name.split(".")[1:]).with_suffix(".py") for name in LEFT}
+    """The files outside of the models' folders, but for those that are registered for a use of a model."""
+    registered = {value.partition(":")[0] for value in own("bevcli.model_uses").values()}
+    left = {ROOT.joinpath(*name.split(".")[1:]).with_suffix(".py") for name in (*LEFT, *registered)}
     return {
         path: tree
         for path, tree in trees().items()
-        if path not in left and path.name != "window_export.py" and not any(path.is_relative_to(one) for one in FOLDERS)
+        if path not in left and not any(path.is_relative_to(one) for one in FOLDERS)
     }
 
 

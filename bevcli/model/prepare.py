@@ -16,7 +16,7 @@ from bevcli.errors import WeightsError
 from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.cuda_graph import Captured
-from bevcli.model.decoder import DecoderLayer
+from bevcli.model.decoder import DecoderLayer, ObjectQueries
 from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
@@ -25,10 +25,12 @@ from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.cuda_layers import FusedBottleneck, MapOnDevice, TokensInOnePass, attention_by_products
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
+from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.segmentation import MaskDecoderLayer, SegmentationHead
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.registry import for_model
 
 Precision = Literal["fp32", "bf16", "fp16"]
 TOKENS_OF_A_BLOCK = 1024  # the sums of a block stay in the cache
@@ -41,8 +43,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
-    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `LastCall`). On a
-    CUDA GPU, `TemporalModel.device_parts` are replayed as CUDA graphs.
+    Results that do not change from frame to frame are computed once ("constant_parts" of the model, `LastCall`). On a
+    CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -51,7 +53,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
     """
     network = copy.deepcopy(model).eval().requires_grad_(False)
-    network.exchange_parts()
+    for fix_constant_parts in for_model("constant_parts", type(network))[:1]:
+        fix_constant_parts(network)
     for module in network.modules() if device.type != "cpu" else ():
         if isinstance(module, Pillars):
             add_to_class(module, PaddedPillars)
@@ -62,11 +65,12 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     if device.type == "cuda":
         _use_cuda_layers(network, device)
     dtype = DTYPES[precision]
-    for part in network.image_parts:
+    image_parts: list[nn.Module] = [network.backbone, network.neck] if isinstance(network, Network) else []
+    for part in image_parts:
         part.to(dtype)
         if isinstance(part, Backbone) and part.by_image and device.type == "cpu":
             add_to_class(part, ImageByImage)
-    for part in network.image_parts[:1]:
+    for part in image_parts[:1]:
         part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     rounds_attention = rounds or (precision != "fp32" and device.type == "cuda")
@@ -87,8 +91,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
             add_to_class(module, TokensInBlocks)
     _check_finite(network)
     if device.type == "cuda":
-        network.stages = {"": "model"} if network.device_parts else network.stages  # a graph has no stages
-        for name in network.device_parts:
+        for name in methods_on_device(type(network)):
+            network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
     if device.type == "cpu":
@@ -103,6 +107,11 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         loading.start()
         atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return network
+
+
+def methods_on_device(kind: type) -> list[str]:
+    """Names of the methods of a class that are marked by `on_device`."""
+    return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
 
 
 def _use_cuda_layers(network: TemporalModel, device: torch.device) -> None:
@@ -126,6 +135,31 @@ def _use_cuda_layers(network: TemporalModel, device: torch.device) -> None:
         elif isinstance(module, SegmentationHead):
             add_to_class(module, MapOnDevice)
             vars(module).update(config=network.config.segmentation, grid=network.config.bev_grid)
+
+
+def fix_first_attention(model: Network) -> None:
+    """The object queries attend to each other before they see the frame: computed once, for the first decoder layer."""
+    first = model.decoder.layers[0]
+    first.self_attention = ConstantSelfAttention(first, model.decoder.object_queries(batch=1))
+
+
+class ConstantSelfAttention(nn.Module):
+    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
+        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
+        super().__init__()
+        assert isinstance(first, DecoderLayer)
+        with torch.no_grad():
+            key = queries.content + queries.position
+            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
+        return self.attended.expand_as(value), None
 
 
 def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -115,18 +115,6 @@ class ModelOutputs:
         return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
 
 
-class ClipInputs(Protocol):
-    """The inputs of B training clips of T frames each."""
-
-    @property
-    def inputs(self) -> Sequence[ModelInputs]:
-        """T inputs, one a frame of the clips."""
-
-    @property
-    def world_from_bev(self) -> Tensor:
-        """(T, B, 4, 4) float64, the pose of each frame's bev frame."""
-
-
 @dataclass(frozen=True)
 class FrameTruth:
     """The ground truth of one frame, bev frame.
@@ -143,31 +131,6 @@ class FrameTruth:
     lines: MapLines
     driven: Array
     command: str
-
-
-@dataclass(frozen=True)
-class SceneAttention:
-    """Attention to Q objects and N lines, the mean over heads. Places are in metres, bev frame.
-
-    Attributes:
-        objects: one box for each object query, with its best class.
-        object_weights: (Q,), which sum to 1.
-        lines: of all line queries, each with its best class.
-        line_weights: (N,), which sum to 1 together with `no_line`.
-        paths: (K, T + 1, 2), that come of the attention: planned paths, or futures of the attending object.
-        best: index of the path that counts; None where it is not known.
-        no_line: weight of the entry that stands for no line; 0 for a part without one.
-        attending: index of the object that attends; None for the own vehicle.
-    """
-
-    objects: Boxes3D
-    object_weights: Array
-    lines: MapLines
-    line_weights: Array
-    paths: Array
-    best: int | None = None
-    no_line: float = 0.0
-    attending: int | None = None
 
 
 def model_inputs(

@@ -1,4 +1,4 @@
-"""Reads the tensors of a .safetensors file, and of a PyTorch file (.pth) in the zip format and in the older one.
+"""Reads the tensors of a PyTorch file (.pth) in the zip format and in the older one.
 
 Nothing in a file is run. Tensors and plain values are read. Whatever else a PyTorch file names becomes a `Placeholder`:
 it is neither imported nor called. The tensors that a pickle describes are checked against the bytes that the file has
@@ -16,11 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import safetensors
 import torch
 from torch import Tensor
 
-from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.errors import WeightsError
 from bevcli.parsing.files import open_regular
 from bevcli.parsing.pickles import MOST_OPCODES, Global, PickleError, PickleReader
 
@@ -303,18 +302,3 @@ def _damaged(path: Path, reason: str) -> WeightsError:
         f"{path}: not a weights file that is safe to read (expected .safetensors, or a PyTorch file of tensors and "
         f"plain values): it is damaged, is another kind of file, or holds objects that could run code ({reason:.200})"
     )
-
-
-def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors by name, on the CPU, and the metadata.
-
-    error: kind of exception for a file that is missing, damaged or no regular file.
-    """
-    open_regular(path, error=error).close()  # the library would wait for the writer of a pipe
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return tensors, dict(file.metadata() or {})
-    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
-        reason = " ".join(str(failure).split())
-        raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None

@@ -1,16 +1,15 @@
-"""The boxes of a recording, and their export: a table (.csv), or a boxes file that `bevcli eval` reads (.json)."""
+"""The boxes of a recording."""
 
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 
 MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
@@ -22,18 +21,6 @@ def read_recording(recording: Path) -> BoxesFile:
     if not frames:
         raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
     return BoxesFile("world", frames)
-
-
-def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
-    """Write the shown boxes, in the world frame, metres and radians; return the number of frames and of boxes.
-
-    Raises InputError if the path does not end in .csv or .json, OutputError if the file cannot be written.
-    """
-    writers = {".csv": write_csv, ".json": write_boxes}
-    if path.suffix.lower() not in writers:
-        raise InputError(f"{path}: the file must end in .csv or .json")
-    boxes = read_recording(recording)
-    return len(boxes.frames), writers[path.suffix.lower()](boxes, path)
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:

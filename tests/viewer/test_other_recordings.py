@@ -11,9 +11,10 @@ from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
 from bevcli.errors import InputError
+from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
-from bevcli.viewer.export import export_boxes, read_recording, recorded_boxes
+from bevcli.viewer.export import read_recording, recorded_boxes
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.summary import summarise
@@ -28,7 +29,7 @@ def recording(tmp_path_factory):
 
 
 def table(path, folder) -> str:
-    export_boxes(path, folder / "boxes.csv")
+    write_csv(read_recording(path), folder / "boxes.csv")
     return (folder / "boxes.csv").read_text()
 
 

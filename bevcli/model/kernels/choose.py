@@ -15,6 +15,7 @@ from bevcli.model.deformable_convolution import (
     predicted_deformable_convolution,
 )
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
+from bevcli.model.network import Network
 from bevcli.model.temporal_model import TemporalModel
 
 VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
@@ -25,7 +26,7 @@ def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: boo
 
     gradients: whether the model is trained; then only kernels with gradients are used.
     """
-    if model.has_parts:
+    if isinstance(model, Network):
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     kept_sizes = cache(level_sizes)  # all: CUDA graphs hold their addresses
     for module in model.modules():

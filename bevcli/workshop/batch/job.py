@@ -17,11 +17,11 @@ from bevcli.frame import Sequence
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
+from bevcli.published import weights_folder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, format_of, option_classes
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
-from bevcli.weights.cache import weights_folder
 from bevcli.workshop.batch.drives import Drive
 from bevcli.workshop.batch.storage import is_url
 
@@ -59,9 +59,9 @@ class Job:
     evaluate: bool = False
     retries: int = 2
 
-    def load_model(self, device: str | None = None) -> Model:
-        """The model with its weights. device: another one than the job's. Raises BevcliError."""
-        return load_model(options=self.model if device is None else replace(self.model, device=device))
+    def load_model(self) -> Model:
+        """The model with its weights. Raises BevcliError."""
+        return load_model(options=self.model)
 
     def own_of(self, kind: type[Own]) -> Own:
         """The own options of a format. kind: their dataclass."""

@@ -40,6 +40,17 @@ class CalibrateFirstOptions:
     )
 
 
+@options()
+class CheckMotionOptions:
+    """Whether a check of a calibration measures it too."""
+
+    motion: bool = option(
+        default=True,
+        help="With a sequence, also measure the calibration from its motion, in the short form of `bevcli calibrate`.",
+        flag="--motion/--no-motion",
+    )
+
+
 @options("Output")
 class CalibrateOutputOptions:
     """The output folder of `bevcli calibrate`."""

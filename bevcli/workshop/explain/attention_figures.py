@@ -1,5 +1,7 @@
 """Figures of a model that plans: the objects and the lines of the map that its plan, and one object's motion, used."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -8,8 +10,7 @@ from matplotlib.figure import Figure
 
 from bevcli.frame import Plan
 from bevcli.geometry.transforms import Array
-from bevcli.model.step import SceneAttention
-from bevcli.workshop.explain import drawing
+from bevcli.workshop.explain import drawing, overview
 from bevcli.workshop.explain.drawing import ACCENT, FAINT, GREY, INK, SECOND
 from bevcli.workshop.explain.trace import Trace
 
@@ -57,11 +58,11 @@ def motion_attention(trace: Trace) -> Figure | str:
     )
 
 
-def _attention(part: str, trace: Trace) -> SceneAttention | None:
+def _attention(part: str, trace: Trace) -> Any | None:
     return trace.attentions.get(part) if trace.prediction.results else None
 
 
-def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: str, subtitle: str) -> Figure:
+def _figure(trace: Trace, attention: Any, chosen: int | None, title: str, subtitle: str) -> Figure:
     figure = drawing.titled_figure(9.6, title, subtitle, heading_inches=1.6)
     spec = figure.add_gridspec(1, 3, width_ratios=(1, 1, 1.25), wspace=0.24, left=0.045, right=0.985, bottom=0.06)
     sides = (
@@ -85,13 +86,13 @@ def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: 
     return figure
 
 
-def _draw_objects(axes: Axes, attention: SceneAttention) -> None:
+def _draw_objects(axes: Axes, attention: Any) -> None:
     for place in np.argsort(attention.object_weights):  # the largest on top
         color, width = _style(attention.object_weights, place)
         drawing.outline_boxes(axes, attention.objects[[place]], color, width)
 
 
-def _draw_lines(axes: Axes, attention: SceneAttention) -> None:
+def _draw_lines(axes: Axes, attention: Any) -> None:
     scores = attention.lines.scores
     assert scores is not None
     for place in np.argsort(attention.line_weights):
@@ -106,14 +107,14 @@ def _style(weights: Array, place: int) -> tuple[str, float]:
     return str(to_hex(WEIGHT_COLORS(share))), 0.8 + 2.4 * share
 
 
-def _draw_paths(axes: Axes, attention: SceneAttention, chosen: int | None) -> None:
+def _draw_paths(axes: Axes, attention: Any, chosen: int | None) -> None:
     for place, path in enumerate(attention.paths):
         is_chosen = place == chosen
         width, opacity = (3.4, 1.0) if is_chosen else (1.4, 0.45)
         axes.plot(*path.T, "-o", color=SECOND, lw=width, alpha=opacity, ms=width + 1, zorder=9 + is_chosen)
 
 
-def _draw_table(axes: Axes, attention: SceneAttention) -> None:
+def _draw_table(axes: Axes, attention: Any) -> None:
     """The largest weights of objects and of lines."""
     boxes, lines = attention.objects, attention.lines
     assert boxes.scores is not None
@@ -147,3 +148,4 @@ def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
 
 
 FIGURES: dict[str, drawing.Draw] = {"plan-attention": plan_attention, "motion-attention": motion_attention}
+ALL_FIGURES = {**overview.FIGURES, **FIGURES}

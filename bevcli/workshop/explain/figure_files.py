@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 from bevcli.errors import OutputError
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import model_class
+from bevcli.registry import for_model
 from bevcli.workshop.explain.drawing import ACCENT, Draw
 from bevcli.workshop.explain.options import ImageFormat
 from bevcli.workshop.explain.trace import Trace
@@ -22,7 +22,7 @@ SAVING: dict[ImageFormat, dict[str, Any]] = {
 
 def figures_of(config: ModelConfig) -> dict[str, Draw]:
     """The figures of a model by the name of the step, the end of the file's name, in the order of the steps."""
-    return {step: draw for listed in model_class(config).figures for step, draw in resolve_name(listed).items()}
+    return dict(next(iter(for_model("figures", model_class(config))), {}))
 
 
 def check_figures(config: ModelConfig, folder: Path, *, force: bool) -> None:

@@ -137,3 +137,4 @@ FIGURES: dict[str, drawing.Draw] = {
     "box-code": box_code,
     "segmentation": segmentation,
 }
+NO_FIGURES: dict[str, drawing.Draw] = {}

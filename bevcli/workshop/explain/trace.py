@@ -18,8 +18,9 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
-from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, SceneAttention
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.registry import for_model
 from bevcli.sequences.selection import scenes_of
 
 RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
@@ -61,7 +62,7 @@ class Trace:
     first_reference_points: Tensor
     visible: Tensor
     cell: tuple[int, int]
-    attentions: Mapping[str, SceneAttention]
+    attentions: Mapping[str, Any]
 
     @property
     def frame(self) -> Frame:
@@ -114,7 +115,7 @@ def trace(
     Raises InputError when the cell lies outside the grid, when the frame has no image, for a model without figures, or
     for an unknown command.
     """
-    if not model.figures:
+    if not next(iter(for_model("figures", type(model))), None):
         kind = model.config.architecture
         raise InputError(
             f"model {model.config.name} is a {kind}, which has no figures "
@@ -177,6 +178,9 @@ def _traced_step(
         _, prediction = runner.step(state, prepared)
     inputs: ModelInputs = arguments[model][0][0].to(runner.device)
     history = arguments[model.encoder][1]["history"]
+    attentions: Mapping[str, Any] = {}
+    for attend in for_model("scene_attentions", type(model)):
+        attentions = attend(model, outputs[model], (float(x), float(y)))
     return Trace(
         config=config,
         recent=(*recent, (prepared.frame, prediction)),
@@ -191,7 +195,7 @@ def _traced_step(
         first_reference_points=model.decoder.object_queries(batch=1).reference_points[0],
         visible=model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).visible[0],
         cell=cell,
-        attentions=model.scene_attentions(outputs[model], (float(x), float(y))),
+        attentions=attentions,
     )
 
 

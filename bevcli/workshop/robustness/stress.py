@@ -19,7 +19,6 @@ from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
 from bevcli.sequences.selection import scenes_of, select
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
-from bevcli.workshop.engines.in_engine import in_engine
 from bevcli.workshop.robustness.conditions import KEPT_BYTES, Condition, KeptFrames, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults, read_results
@@ -80,7 +79,7 @@ def stress(
     """
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
-    model = in_engine(model, drives[0].rig, drives[0])
+    model = model.in_engine(drives[0].rig, drives[0])
     parts = [part for drive in drives for part in split_scenes(drive)]
     scenes = [KeptFrames(part, KEPT_BYTES // len(parts)) for part in parts]
     against = None if options.against is None else read_results(options.against)

@@ -44,9 +44,7 @@ class RenderOptions:
     """The options of a rendered drive. Raises InputError for a value out of range."""
 
     seed: int = option(default=0, help="Seed of the drive. The same seed gives the same files.", minimum=0)
-    frames: int = option(
-        default=20, help="Number of frames.", metavar="N", flag="--count", old=("--frames",), minimum=1
-    )
+    frames: int = option(default=20, help="Number of frames.", metavar="N", flag="--count", minimum=1)
     rig: str | Path | CameraRig | None = option(
         reads="path",
         default=None,
@@ -94,9 +92,7 @@ class DemoOptions:
     seed: int = option(
         default=1_000_001, help="Seed of the drive. The model was trained on seeds below 1000000 only.", minimum=0
     )
-    frames: int = option(
-        default=8, help="Number of frames, two per second.", metavar="N", flag="--count", old=("--frames",), minimum=1
-    )
+    frames: int = option(default=8, help="Number of frames, two per second.", metavar="N", flag="--count", minimum=1)
     view: bool = option(default=True, help="Open the viewer at the end.", flag="--view/--no-view")
     force: bool = option(default=False, help="Replace an earlier demo in OUT.")
 

@@ -20,12 +20,13 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.inference.load import weights_file
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelInputs, ModelOutputs
-from bevcli.weights.fetch import weights_file
+from bevcli.workshop.training.clip_steps import clip_steps
 from bevcli.workshop.training.detection_loss import (
     AnyTargets,
     DetectionLossConfig,
@@ -166,7 +167,7 @@ class Teacher:
     def lessons(self, clip: Batch) -> Iterator[Lesson]:
         """The results for each frame of clips, lazily."""
         image, own, network = self._taught.image, self._network.config.image, self._network
-        memory: Any = None
+        steps, memory = clip_steps(network), None
         if image != own:
             clip = replace(
                 clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
@@ -175,7 +176,7 @@ class Teacher:
             bev = None
             with last_outputs(network.neck) as features:
                 if self._config.weight:
-                    outputs, memory = network.learn(clip, place, memory)
+                    outputs, memory = steps.outputs(clip, place, memory)
                     bev = outputs.bev.float()
                 else:
                     network.image_features(inputs.images, inputs.camera_index)

@@ -20,7 +20,7 @@ PANEL = "Train"
 def train(
     model: Annotated[
         str | None,
-        model_option("A model name or a FILE.toml; required. Its training table holds the settings.", old=("",)),
+        model_option("A model name or a FILE.toml; required. Its training table holds the settings."),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],

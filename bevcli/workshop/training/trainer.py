@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, product, repeat
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.training import files
+from bevcli.workshop.training.clip_steps import clip_steps
 from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
 from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.workshop.training.loading import BatchMaker, loaded_batches
@@ -91,17 +92,17 @@ def forward_clip(
     """
     frames = len(batch.inputs)
     first_learned = 0 if learn_all else frames - 1
-    memory: Any = None
+    steps, memory = clip_steps(model), None
     model.eval()
     with torch.no_grad():
         for place in range(first_learned):
-            memory = model.remember(batch, place, memory)
+            memory = steps.history(batch, place, memory)
     model.train()
     for module in model.modules():
         if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
     for place in range(first_learned, frames):
-        outputs, memory = model.learn(batch, place, memory)
+        outputs, memory = steps.outputs(batch, place, memory)
         yield outputs
 
 

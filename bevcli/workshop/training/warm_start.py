@@ -189,11 +189,20 @@ def named_rows(checkpoint: Checkpoint, model: Network, rig: Callable[[], CameraR
     """
     config = model.config
     classes, cameras = _names(checkpoint, config, "classes"), _names(checkpoint, config, "cameras")
-    rows = dict.fromkeys(model.class_keys, NamedRows("class rows", classes, _likes(config, classes)))
+    rows = dict.fromkeys(_class_keys(model), NamedRows("class rows", classes, _likes(config, classes)))
     if model.image_tokens.camera_embedding is not None:
         starts, remark = _views(config.cameras, cameras, rig), "; by heading where it is known; all are trained"
         rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
     return rows
+
+
+def _class_keys(model: Network) -> list[str]:
+    """Keys of the tensors that have a row for each class."""
+    layers = [
+        f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
+        for branch, modules in model.detection_head.class_branches.named_children()
+    ]
+    return [f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias")]
 
 
 def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes", "cameras"]) -> tuple[str, ...]:

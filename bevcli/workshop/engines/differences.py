@@ -15,8 +15,8 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.workshop.engines.box_differences import CENTER, NEAR_M
-from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.engines.engine import load_exported
+from bevcli.workshop.engines.export_cache import CENTER, NEAR_M
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def check_exported(
         network = prepare_for_inference(reference.network, torch.device("cpu"))
     exported = load_exported(file, engine)
     preprocess = Preprocessor(exported.config)  # of the exported file, whose images have one size
-    frames = (preprocess(sequence.load(place)) for place in range(len(sequence.stamps)))
+    frames = (preprocess(sequence.load(index)) for index in range(len(sequence.stamps)))
     for prepared, ours, theirs in paired_steps(network, exported, frames):
         yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
 
@@ -74,7 +74,9 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> Fra
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
     distances = codes[..., CENTER].norm(dim=-1)
     others = [index for index in range(codes.shape[-1]) if index not in CENTER]
-    probabilities = [_probabilities(one.segmentation) for one in (ours, theirs) if one.segmentation is not None]
+    probabilities = [
+        _probabilities(outputs.segmentation) for outputs in (ours, theirs) if outputs.segmentation is not None
+    ]
     return FrameDifference(
         frame=frame,
         bev=_largest(ours.bev, theirs.bev),
@@ -104,5 +106,5 @@ def _probabilities(segmentation: SegmentationOutputs) -> Tensor:
     return segmentation.mask_logits[-1].sigmoid() * segmentation.class_logits[-1].sigmoid()[..., None]
 
 
-def _largest(one: Tensor, other: Tensor) -> float:
-    return (one - other).abs().max().item()
+def _largest(ours: Tensor, theirs: Tensor) -> float:
+    return (ours - theirs).abs().max().item()
