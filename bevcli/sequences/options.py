@@ -127,9 +127,6 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
-def _complete_format(incomplete: str) -> list[str]:
-    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
-
 
 @options("Input")
 class LabelOptions:

@@ -18,8 +18,7 @@ PANEL = "Score"
 
 def stress(
     sequence: Annotated[
-        list[Path] | None,
-        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        list[Path] | None, argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS.")
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
@@ -41,8 +40,7 @@ def stress(
     from bevcli.errors import InputError
     from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.report import stress_table
-    from bevcli.workshop.robustness.results import read_results
+    from bevcli.workshop.robustness.results import read_results, stress_table
     from bevcli.workshop.robustness.stress import stress
     from bevcli.workshop.synth.drives import open_drives
 

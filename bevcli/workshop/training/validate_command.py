@@ -32,8 +32,7 @@ def validate(
     """
     from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
-    from bevcli.workshop.synth.drives import count_frames
-    from bevcli.workshop.synth.splits import scored_drives
+    from bevcli.workshop.synth.drives import count_frames, scored_drives
     from bevcli.workshop.training.job import rig_for_drives
     from bevcli.workshop.training.validation import check_scored_drives, validate as validate_model
 

@@ -10,7 +10,7 @@ Positions are in the world frame in metres, colours are linear RGB.
 import numpy as np
 
 from bevcli.jit import njit
-from bevcli.workshop.synth.assets.paint import Material
+from bevcli.workshop.synth.mesh import Material
 
 LIGHT_LIMIT = 1.6  # the brightest light in the display table
 ROUGH_TEXEL_M = 0.25  # texel size of the ground's roughness
@@ -389,7 +389,6 @@ def _shop(u, z, length, shop_m, seed, out):
 
 @njit(nogil=True, inline="always")
 def _hash(a, b):
-    """Hash two integers to one from 0 to 2^31 - 1."""
     h = (a * 73856093) ^ (b * 19349663)
     h = (h ^ (h >> 13)) * 1274126177
     return (h ^ (h >> 16)) & 0x7FFFFFFF

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from bevcli.workshop.synth.assets.mesh import Mesh, Row, axles, block, made, rod, side_profile, twin_blocks, wheel
-from bevcli.workshop.synth.assets.paint import (
+from bevcli.workshop.synth.mesh import (
     CARGO,
     DYED_PAINT,
     GLASS,
@@ -13,35 +12,34 @@ from bevcli.workshop.synth.assets.paint import (
     TRIM,
     Finish,
     Material,
+    Mesh,
+    Row,
+    axles,
+    block,
+    made,
+    rod,
+    side_profile,
+    twin_blocks,
+    wheel,
 )
 
 
 @dataclass(frozen=True)
 class CarShape:
-    """Proportions of a car.
+    """Proportions of a car, metres.
 
-    Attributes:
-        length: metres.
-        width: metres.
-        height: metres.
-        belt: height of the lower edge of the windows, metres.
-        nose: height of the bonnet's front edge, metres.
-        tail: height of the boot's rear edge, metres.
-        cabin: positions along the car as fractions of its length: rear window's lower edge, its upper edge,
-            windscreen's upper edge, its lower edge.
-        wheel_radius: metres.
-        clearance: height of the body's underside, metres.
+    cabin: fractions of the length: the rear window's lower and upper edge, the windscreen's upper and lower edge.
     """
 
     length: float
     width: float
     height: float
-    belt: float
-    nose: float
-    tail: float
+    belt: float  # height of the lower edge of the windows
+    nose: float  # height of the bonnet's front edge
+    tail: float  # height of the boot's rear edge
     cabin: tuple[float, float, float, float]
     wheel_radius: float = 0.33
-    clearance: float = 0.2
+    clearance: float = 0.2  # height of the body's underside
 
     def at(self, fraction: float) -> float:
         """x in metres of a fraction of the length, 0 at the tail and 1 at the nose."""
@@ -88,7 +86,6 @@ def car(name: str) -> list[Mesh]:
 
 
 def _details(s: CarShape, half: float) -> list[Mesh]:
-    """Bumpers, number plates, lamps, mirrors, sills, and wheels with their arches."""
     lamp_z, tail_z, lamp = s.nose - 0.1, s.tail - 0.12, Finish((255, 250, 230), Material.GLOW)
     parts = [
         block((s.at(0.995), 0, s.clearance + 0.2), (0.06, half * 1.5, 0.16), TRIM),
@@ -299,13 +296,13 @@ def bus(name: str) -> list[Mesh]:
         display = Finish((255, 170, 40), Material.GLOW)
         parts.append(block((nose - 0.05, 0, min(height - 0.25, 2.75)), (0.12, 1.7, 0.28), display))
         parts += [block((x, -half + 0.01, 1.4), (1.1, 0.05, 2.0), GLASS) for x in (nose - 1.0, 0.0)]
-    places = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
+    positions = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
     return [
         *parts,
         block((0, 0, floor + 0.35), (length * 0.92, half * 2.01, 0.22), CARGO),
         twin_blocks((front - 0.02, half * 0.75, 0.75), (0.08, 0.4, 0.2), HEADLAMP),
         twin_blocks((-front, half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL_LAMP),
-        axles(places, half + 0.02 - 0.16, 0.46, 0.3),
+        axles(positions, half + 0.02 - 0.16, 0.46, 0.3),
     ]
 
 

@@ -1,18 +1,66 @@
 """Coloured low-polygon meshes: what they are made of, the primitives that build them, and meshes placed in the world.
 
 A mesh has its own frame: x forward, y left, z up, the origin in the middle of the bottom. Lengths are in metres.
+Colours are chosen in sRGB; light is computed in linear RGB.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from enum import IntEnum
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import rigid
-from bevcli.workshop.synth.assets.paint import Color, Finish, Material, Surface, linear
+
+Color = tuple[int, int, int]  # sRGB, 0 to 255
+
+
+class Material(IntEnum):
+    """Kind of shading of a face. PAINT and DYE faces take the two colours of the individual."""
+
+    MATTE = 0
+    PAINT = 1
+    GLASS = 2
+    GLOW = 3
+    GROUND = 4
+    FACADE = 5
+    DYE = 6
+    LEAVES = 7
+
+
+class Finish(NamedTuple):
+    """The colour and the material of a surface."""
+
+    color: Color  # sRGB. That of PAINT and DYE is a placeholder.
+    material: Material = Material.MATTE  # kind of shading
+
+
+Surface = Color | Finish  # a colour alone is matte
+
+# Parts of vehicles.
+PAINT = Finish((200, 200, 200), Material.PAINT)
+DYED_PAINT = Finish((200, 200, 200), Material.DYE)
+CARGO = Finish((224, 224, 220), Material.DYE)
+GLASS = Finish((38, 48, 56), Material.GLASS)
+TRIM: Color = (34, 35, 38)
+HEADLAMP = Finish((255, 248, 226), Material.GLOW)
+TAIL_LAMP = Finish((190, 16, 18), Material.GLOW)
+
+
+def linear(color: ArrayLike) -> NDArray[np.float32]:
+    """Convert sRGB (..., 3), 0 to 255, to linear RGB (..., 3), 0 to 1."""
+    c = np.asarray(color, dtype=np.float64) / 255
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def darker(color: Color, factor: float) -> Color:
+    """The colour with each component multiplied by a factor."""
+    red, green, blue = (int(component * factor) for component in color)
+    return red, green, blue
+
 
 Point = tuple[float, float, float]  # x, y, z, metres
 NO_FACADES = np.zeros((0, 16), np.float32)
@@ -21,17 +69,11 @@ Row = tuple[Any, ...]  # of a table of parts: the function that makes a part, an
 
 @dataclass(frozen=True)
 class Mesh:
-    """F triangles with colours.
+    """F triangles with colours."""
 
-    Attributes:
-        faces: (F, 3, 3) corner points, metres; counter-clockwise seen from outside.
-        albedo: (F, 3) linear RGB.
-        material: (F,) values of `Material`.
-    """
-
-    faces: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    material: NDArray[np.uint8]
+    faces: NDArray[np.float32]  # (F, 3, 3) corner points, metres; counter-clockwise seen from outside
+    albedo: NDArray[np.float32]  # (F, 3) linear RGB
+    material: NDArray[np.uint8]  # (F,) values of `Material`
 
     @property
     def extents(self) -> NDArray[np.float64]:
@@ -54,28 +96,17 @@ class TriangleSoup:
 
     A soup of one mesh in its own frame is a template: its normals and its sphere are computed once, and it is placed
     many times.
-
-    Attributes:
-        corners: (T, 3, 3) corner points, metres; counter-clockwise seen from outside.
-        normals: (T, 3) unit vectors that point outwards.
-        albedo: (T, 3) linear RGB.
-        material: (T,) values of `Material`.
-        facade: (T,) row of `facades`; -1 for a triangle that is not part of a facade.
-        facades: (K, 16) descriptions of walls, made in `world.scenery`.
-        mesh_ranges: (M, 2) first triangle of each mesh, and one past its last.
-        mesh_objects: (M,) index of the annotated object that the mesh belongs to; -1 for none.
-        mesh_spheres: (M, 4) bounding spheres: centre x, y, z and radius, metres.
     """
 
-    corners: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    material: NDArray[np.uint8]
-    facade: NDArray[np.int32]
-    facades: NDArray[np.float32]
-    mesh_ranges: NDArray[np.int64]
-    mesh_objects: NDArray[np.int32]
-    mesh_spheres: NDArray[np.float32]
+    corners: NDArray[np.float32]  # (T, 3, 3) corner points, metres; counter-clockwise seen from outside
+    normals: NDArray[np.float32]  # (T, 3) unit vectors that point outwards
+    albedo: NDArray[np.float32]  # (T, 3) linear RGB
+    material: NDArray[np.uint8]  # (T,) values of `Material`
+    facade: NDArray[np.int32]  # (T,) row of `facades`; -1 for a triangle that is not part of a facade
+    facades: NDArray[np.float32]  # (K, 16) descriptions of walls, made in `world.scenery`
+    mesh_ranges: NDArray[np.int64]  # (M, 2) first triangle of each mesh, and one past its last
+    mesh_objects: NDArray[np.int32]  # (M,) index of the annotated object that the mesh belongs to; -1 for none
+    mesh_spheres: NDArray[np.float32]  # (M, 4) bounding spheres: centre x, y, z and radius, metres
 
     def __len__(self) -> int:
         return len(self.corners)

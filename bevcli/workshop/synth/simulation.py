@@ -9,13 +9,20 @@ from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.synth.assets.catalog import Assets, draw_body
-from bevcli.workshop.synth.assets.people import RIDDEN
-from bevcli.workshop.synth.world.city import STOP_LINE_M, CityPlan
-from bevcli.workshop.synth.world.pedestrians import Walker, crossers, strollers
-from bevcli.workshop.synth.world.roadside import Roadside, StandingActor
-from bevcli.workshop.synth.world.route import DIRECTIONS, Route, build_route, node_center, right_of, street_of
-from bevcli.workshop.synth.world.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
+from bevcli.workshop.synth.catalog import Assets, draw_body
+from bevcli.workshop.synth.city import (
+    DIRECTIONS,
+    STOP_LINE_M,
+    CityPlan,
+    Route,
+    build_route,
+    node_center,
+    right_of,
+    street_of,
+)
+from bevcli.workshop.synth.people import RIDDEN
+from bevcli.workshop.synth.roadside import Roadside, StandingActor, Walker, crossers, strollers
+from bevcli.workshop.synth.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
 
 Actor = DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
 TRAFFIC_MIX = {
@@ -106,15 +113,10 @@ EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle
 
 @dataclass(frozen=True)
 class EgoTrack:
-    """The motion of the ego vehicle's rear axle.
+    """The motion of the ego vehicle's rear axle."""
 
-    Attributes:
-        route: its route.
-        track: (3, T) times (seconds), route positions (metres), speeds (m/s).
-    """
-
-    route: Route
-    track: Array
+    route: Route  # its route
+    track: Array  # (3, T) times (seconds), route positions (metres), speeds (m/s)
 
     def pose(self, time_s: float) -> tuple[Array, float]:
         """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
@@ -153,14 +155,14 @@ class Simulation:
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
         """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
         near = self.city.around(point, reach_m)
-        found: list[Actor] = [*self._driving]
+        actors: list[Actor] = [*self._driving]
         for block in near.blocks:
-            found += [*self.roadside.block(*block), *self._strollers(*block)]
+            actors += [*self.roadside.block(*block), *self._strollers(*block)]
         for stretch in near.stretches:
-            found += self.roadside.stretch(*stretch)
+            actors += self.roadside.stretch(*stretch)
         for node in near.blocks:
-            found += self._crossers(node)
-        return found
+            actors += self._crossers(node)
+        return actors
 
     def _run(self) -> None:
         vehicles, start = [self._ego], self.span_s[0] - STEP_S

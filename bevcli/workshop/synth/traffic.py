@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.workshop.synth.assets.catalog import Body
-from bevcli.workshop.synth.assets.people import RIDDEN
-from bevcli.workshop.synth.world.city import CityPlan
-from bevcli.workshop.synth.world.route import JunctionPass, Route
+from bevcli.workshop.synth.catalog import Body
+from bevcli.workshop.synth.city import CityPlan, JunctionPass, Route
+from bevcli.workshop.synth.people import RIDDEN
 
 Light = Literal["red", "yellow", "green"]
 YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all directions
@@ -41,7 +40,6 @@ class Signals:
         return greens, starts, offset
 
     def _since_green(self, node: tuple[int, int], axis: int, time_s: float) -> float:
-        """Seconds since an axis last got green, at a time in seconds."""
         greens, starts, offset = self._cycle(node)
         return (time_s + offset - starts[axis]) % (sum(greens) + 2 * (YELLOW_S + CLEARING_S))
 
@@ -66,38 +64,23 @@ HARDEST = -3.4  # m/s², strongest deceleration
 
 @dataclass(frozen=True)
 class Unit:
-    """One part of a vehicle: the vehicle itself, its tractor or its trailer.
+    """One part of a vehicle: the vehicle itself, its tractor or its trailer."""
 
-    Attributes:
-        body: size and looks.
-        lag: distance from the vehicle's front to the front of this unit, metres.
-    """
-
-    body: Body
-    lag: float
+    body: Body  # size and looks
+    lag: float  # distance from the vehicle's front to the front of this unit, metres
 
 
 @dataclass(eq=False)
 class Vehicle:
-    """A vehicle on its route.
-
-    Attributes:
-        route: the route.
-        units: the vehicle, or tractor and trailer, from front to rear.
-        front: route position of the vehicle's front, metres.
-        speed: m/s.
-        liveliness: factor on the acceleration, about 1.
-        bicycle: whether it is a bicycle.
-        track: (time, front, speed) of every step since it appeared; seconds, metres, m/s.
-    """
+    """A vehicle on its route. Its track has every step since it appeared."""
 
     route: Route
-    units: tuple[Unit, ...]
-    front: float
-    speed: float
-    liveliness: float
+    units: tuple[Unit, ...]  # the vehicle, or tractor and trailer, from front to rear
+    front: float  # route position, metres
+    speed: float  # m/s
+    liveliness: float  # factor on the acceleration, about 1
     bicycle: bool = False
-    track: list[tuple[float, float, float]] = field(default_factory=list)
+    track: list[tuple[float, float, float]] = field(default_factory=list)  # time (s), front (m), speed (m/s)
 
     @cached_property
     def length(self) -> float:
@@ -189,18 +172,18 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
 
 @njit(nogil=True)
 def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
-    """(count, 2) evenly spaced points of a route from position start to end.
+    """(count, 2) evenly spaced points of a route from at start to end.
 
     points: (P, 2) of the route. positions: (P,) along it, metres.
     """
-    found = np.empty((count, 2))
+    result = np.empty((count, 2))
     for i in range(count):
-        place = start + (end - start) * i / (count - 1)
-        k = min(max(int(np.searchsorted(positions, place)) - 1, 0), len(positions) - 2)
-        w = min(max((place - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
-        found[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
-        found[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
-    return found
+        at = start + (end - start) * i / (count - 1)
+        k = min(max(int(np.searchsorted(positions, at)) - 1, 0), len(positions) - 2)
+        w = min(max((at - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
+        result[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
+        result[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
+    return result
 
 
 @njit(nogil=True)
@@ -233,39 +216,23 @@ _DIFFERENCE_S = 0.02  # half the interval of the central differences that give v
 
 @dataclass(frozen=True)
 class ActorState:
-    """An actor at one time.
+    """An actor at one time."""
 
-    Attributes:
-        body: size and looks.
-        position: (3,) middle of the bottom, world, metres.
-        yaw: world, radians.
-        attribute: nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes.
-        velocity: (2,) world, m/s.
-        pose: index of the mesh among the variant's poses; taken modulo their number.
-    """
-
-    body: Body
-    position: Array
-    yaw: float
-    attribute: str
-    velocity: Array = field(default_factory=lambda: np.zeros(2))
-    pose: int = 0
+    body: Body  # size and looks
+    position: Array  # (3,) middle of the bottom, world, metres
+    yaw: float  # world, radians
+    attribute: str  # nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes
+    velocity: Array = field(default_factory=lambda: np.zeros(2))  # (2,) world, m/s
+    pose: int = 0  # index of the mesh among the variant's poses; taken modulo their number
 
 
 @dataclass(frozen=True)
 class DrivingActor:
-    """One unit of a driving vehicle. Its axles are on the route.
+    """One unit of a driving vehicle. Its axles are on the route."""
 
-    Attributes:
-        vehicle: the vehicle, after the simulation.
-        unit: the unit.
-        track: (3, T) times of the simulation steps (seconds), route positions of the vehicle's front (metres), speeds
-            (m/s).
-    """
-
-    vehicle: Vehicle
+    vehicle: Vehicle  # after the simulation
     unit: Unit
-    track: Array
+    track: Array  # (3, T) seconds, route positions of the vehicle's front (metres), speeds (m/s)
 
     def state(self, time_s: float) -> ActorState | None:
         """The state at a time of the drive in seconds; None before the vehicle appears and after it leaves."""

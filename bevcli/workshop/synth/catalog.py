@@ -6,62 +6,53 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.workshop.synth.assets import people, roadworks, vehicles
-from bevcli.workshop.synth.assets.mesh import Mesh, joined, made
-from bevcli.workshop.synth.assets.paint import (
-    BUS_PAINTS,
-    CAR_PAINTS,
-    CLOTHES,
-    MACHINE_PAINTS,
-    TRUCK_PAINTS,
-    Color,
-    linear,
-)
-from bevcli.workshop.synth.assets.people import CYCLES, RIDDEN
-from bevcli.workshop.synth.assets.roadworks import MACHINES
-from bevcli.workshop.synth.assets.street_furniture import StreetFurniture
+from bevcli.workshop.synth import people, street_objects, vehicles
+from bevcli.workshop.synth.mesh import Color, Mesh, joined, linear, made
+from bevcli.workshop.synth.people import CYCLES, RIDDEN
+from bevcli.workshop.synth.street_objects import MACHINES, StreetFurniture
 
+# Colours to draw from.
+CAR_PAINTS: tuple[Color, ...] = (
+    (235, 236, 238), (196, 199, 203), (120, 124, 130), (62, 66, 72), (26, 28, 32), (170, 28, 30), (120, 22, 30),
+    (28, 60, 128), (52, 108, 176), (22, 40, 70), (34, 84, 62), (214, 178, 40), (204, 98, 32), (150, 132, 104),
+    (108, 80, 58), (92, 132, 142),
+)  # fmt: skip
+TRUCK_PAINTS: tuple[Color, ...] = (
+    (238, 238, 236), (228, 228, 224), (196, 40, 34), (30, 84, 160), (226, 168, 30), (44, 112, 72), (104, 108, 112),
+    (232, 120, 36),
+)  # fmt: skip
+BUS_PAINTS: tuple[Color, ...] = (
+    (224, 60, 44), (36, 98, 176), (240, 190, 40), (240, 240, 236), (48, 140, 92), (128, 52, 120), (52, 168, 178),
+)  # fmt: skip
+MACHINE_PAINTS: tuple[Color, ...] = ((236, 176, 24), (232, 140, 20), (222, 92, 28), (236, 200, 60), (188, 190, 60))
+CLOTHES: tuple[Color, ...] = (
+    (40, 42, 48), (70, 76, 88), (132, 136, 142), (204, 202, 196), (150, 40, 44), (40, 70, 130), (78, 112, 160),
+    (58, 96, 70), (188, 148, 60), (120, 72, 110), (196, 112, 92), (96, 76, 60),
+)  # fmt: skip
 OWN_PAINTS: dict[str, tuple[Color, ...]] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One look of a class.
+    """One look of a class."""
 
-    Attributes:
-        class_name: one of the ten nuScenes classes.
-        name: the look, such as "sedan" or "city_rider"; unique within the class.
-        poses: meshes of one size, shown in turn while the object moves.
-        size_lwh: (3,) usual length, width and height, metres.
-        paints: colours to draw from for PAINT faces.
-        dyes: colours to draw from for DYE faces.
-    """
-
-    class_name: str
-    name: str
-    poses: tuple[Mesh, ...]
-    size_lwh: NDArray[np.float64]
-    paints: tuple[Color, ...]
-    dyes: tuple[Color, ...]
+    class_name: str  # one of the ten nuScenes classes
+    name: str  # the look, such as "sedan" or "city_rider"; unique within the class
+    poses: tuple[Mesh, ...]  # meshes of one size, shown in turn while the object moves
+    size_lwh: NDArray[np.float64]  # (3,) usual length, width and height, metres
+    paints: tuple[Color, ...]  # colours to draw from for PAINT faces
+    dyes: tuple[Color, ...]  # colours to draw from for DYE faces
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """An individual of a variant, with its own size and colours.
+    """An individual of a variant, with its own size and colours."""
 
-    Attributes:
-        variant: the look.
-        size_lwh: (3,) length, width and height, metres; the mesh is stretched to it.
-        paint: (3,) linear RGB of PAINT faces.
-        dye: (3,) linear RGB of DYE faces.
-        instance: the ground truth instance name, unique in a drive.
-    """
-
-    variant: Variant
-    size_lwh: NDArray[np.float64]
-    paint: NDArray[np.float32]
-    dye: NDArray[np.float32]
-    instance: str
+    variant: Variant  # the look
+    size_lwh: NDArray[np.float64]  # (3,) length, width and height, metres; the mesh is stretched to it
+    paint: NDArray[np.float32]  # (3,) linear RGB of PAINT faces
+    dye: NDArray[np.float32]  # (3,) linear RGB of DYE faces
+    instance: str  # the ground truth instance name, unique in a drive
 
 
 def draw_body(
@@ -84,24 +75,19 @@ _CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Colo
     "construction_vehicle": (MACHINES, lambda look: made(MACHINES[look]), MACHINE_PAINTS, TRUCK_PAINTS),
     "bus": (vehicles.BUSES, vehicles.bus, BUS_PAINTS, BUS_PAINTS),
     "trailer": (vehicles.TRAILER_NAMES, vehicles.trailer, TRUCK_PAINTS, TRUCK_PAINTS),
-    "barrier": (roadworks.BARRIER_NAMES, roadworks.barrier, CAR_PAINTS, CLOTHES),
+    "barrier": (street_objects.BARRIER_NAMES, street_objects.barrier, CAR_PAINTS, CLOTHES),
     "motorcycle": (CYCLES["motorcycle"] + RIDDEN["motorcycle"], people.motorcycle, CAR_PAINTS, CLOTHES),
     "bicycle": (CYCLES["bicycle"] + RIDDEN["bicycle"], people.bicycle, CAR_PAINTS, CLOTHES),
-    "traffic_cone": (roadworks.CONE_NAMES, roadworks.traffic_cone, CAR_PAINTS, CLOTHES),
+    "traffic_cone": (street_objects.CONE_NAMES, street_objects.traffic_cone, CAR_PAINTS, CLOTHES),
 }
 
 
 @dataclass(frozen=True)
 class Assets:
-    """The meshes that all drives share. Build them once and pass them to every drive.
+    """The meshes that all drives share. Build them once and pass them to every drive."""
 
-    Attributes:
-        by_class: all variants of the annotated objects, by class.
-        furniture: the repeated objects without annotations.
-    """
-
-    by_class: Mapping[str, tuple[Variant, ...]]
-    furniture: StreetFurniture
+    by_class: Mapping[str, tuple[Variant, ...]]  # all variants of the annotated objects, by class
+    furniture: StreetFurniture  # the repeated objects without annotations
 
     @staticmethod
     def build() -> "Assets":
@@ -124,7 +110,6 @@ class Assets:
 
 
 def _person(name: str, *strides: int) -> Variant:
-    """A person with a pose for each stride."""
     poses = tuple(joined(people.person(name, stride)) for stride in strides)
     size = poses[0].extents * (0.68 if name == "child" else 1.0)
     return Variant("pedestrian", name if any(strides) else f"{name}_standing", poses, size, CLOTHES, CLOTHES)

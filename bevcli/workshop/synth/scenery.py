@@ -9,13 +9,33 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.synth.assets.mesh import Mesh, TriangleSoup, from_faces, joined, prism
-from bevcli.workshop.synth.assets.paint import Color, Finish, Material, darker, linear
-from bevcli.workshop.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
-from bevcli.workshop.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle, side_of
-from bevcli.workshop.synth.world.looks import Looks
-from bevcli.workshop.synth.world.route import DIRECTIONS, node_center, right_of, street_of
-from bevcli.workshop.synth.world.traffic import Signals
+from bevcli.workshop.synth.city import (
+    CORNER_M,
+    DIRECTIONS,
+    KERB_M,
+    Block,
+    CityPlan,
+    node_center,
+    right_of,
+    rounded_rectangle,
+    side_of,
+    street_of,
+)
+from bevcli.workshop.synth.looks import Looks
+from bevcli.workshop.synth.mesh import (
+    Color,
+    Finish,
+    Material,
+    Mesh,
+    TriangleSoup,
+    darker,
+    from_faces,
+    joined,
+    linear,
+    prism,
+)
+from bevcli.workshop.synth.street_objects import TREE_KINDS, StreetFurniture
+from bevcli.workshop.synth.traffic import Signals
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
 PLASTER: tuple[Color, ...] = (
@@ -28,27 +48,16 @@ ROOF: Color = (104, 98, 94)
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """The look of a wall.
+    """The look of a wall."""
 
-    Attributes:
-        wall: sRGB colour of the wall.
-        floor_m: height of a storey, metres.
-        pitch_m: distance between the middles of two windows, metres.
-        window_m: width and height of a window, metres.
-        shop_m: height of the ground floor, metres; below 1 it is a plinth instead of a shop front.
-        brick: contrast of the brick pattern, 0 to 1; 0 is plaster.
-        band: whether the windows of a storey form one horizontal band.
-        seed: seed of the random details, 0 to 4095.
-    """
-
-    wall: Color
-    floor_m: float
-    pitch_m: float
-    window_m: tuple[float, float]
-    shop_m: float
-    brick: float
-    band: bool
-    seed: int
+    wall: Color  # sRGB colour of the wall
+    floor_m: float  # height of a storey, metres
+    pitch_m: float  # distance between the middles of two windows, metres
+    window_m: tuple[float, float]  # width and height of a window, metres
+    shop_m: float  # height of the ground floor, metres; below 1 it is a plinth instead of a shop front
+    brick: float  # contrast of the brick pattern, 0 to 1; 0 is plaster
+    band: bool  # whether the windows of a storey form one horizontal band
+    seed: int  # seed of the random details, 0 to 4095
 
 
 def houses(city: CityPlan, land: Block) -> Iterator[TriangleSoup]:
@@ -138,7 +147,6 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
-    """Slanted awnings over some of the shop fronts."""
     colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
     for k in range(4):
         start, end = ground[k], ground[(k + 1) % 4]
@@ -181,12 +189,12 @@ class Scenery:
 
     def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
         """Meshes within `reach_m` metres of a world point (2,)."""
-        found = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
-        spheres = np.concatenate([mesh.mesh_spheres for mesh in found])
+        meshes = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
+        spheres = np.concatenate([mesh.mesh_spheres for mesh in meshes])
         distances = np.hypot(*(spheres[:, :2] - np.asarray(center, dtype=np.float64)).T)
         # Draw walls first, near ones before far ones: they hide most of the rest, which is then skipped.
-        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in found]])
-        return TriangleSoup.gather([found[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
+        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in meshes]])
+        return TriangleSoup.gather([meshes[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
 
     def _make_block(self, column: int, row: int) -> list[TriangleSoup]:
         land, use = self.city.block(column, row), self.city.landuse(column, row)
@@ -201,7 +209,6 @@ class Scenery:
         return meshes
 
     def _park(self, land: Block, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-        """Trees and bushes all over a block."""
         low, high = land.inside(1.5)
         count = int(np.prod(high - low) / 75)
         for point in low + rng.random((count, 2)) * (high - low):

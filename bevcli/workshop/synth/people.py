@@ -2,8 +2,26 @@
 
 import numpy as np
 
-from bevcli.workshop.synth.assets.mesh import Mesh, Row, ball, block, cone, crossbar, loft, made, rod, side_profile
-from bevcli.workshop.synth.assets.paint import HEADLAMP, PAINT, TAIL_LAMP, TRIM, Color, Finish, Material, Surface
+from bevcli.workshop.synth.mesh import (
+    HEADLAMP,
+    PAINT,
+    TAIL_LAMP,
+    TRIM,
+    Color,
+    Finish,
+    Material,
+    Mesh,
+    Row,
+    Surface,
+    ball,
+    block,
+    cone,
+    crossbar,
+    loft,
+    made,
+    rod,
+    side_profile,
+)
 
 SKIN: tuple[Color, ...] = ((224, 176, 146), (196, 144, 112), (142, 96, 70), (98, 66, 50))
 HAIR: tuple[Color, ...] = ((40, 32, 28), (92, 66, 42), (180, 146, 90), (120, 118, 116))
@@ -99,7 +117,6 @@ def rider(seat: Place, bars: Place, pedal: Place, helmet: Color) -> list[Mesh]:
 
 
 def _thin_wheel(x: float, radius: float, width: float) -> list[Mesh]:
-    """A wheel: a dark tyre around a lighter disc."""
     return [
         crossbar(x, radius, width / 2, radius, RUBBER, 14),
         crossbar(x, radius, width / 2 + 0.005, radius * 0.86, (150, 152, 156), 14),
