@@ -229,7 +229,7 @@ def _errors(failed: Sequence[Record]) -> str:
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], kind: str = "wide") -> str:
     """A table. rows: cells as HTML. numbers: columns with numbers. kind: "narrow" is only as wide as its cells."""
     lines = [("th", [escape(text) for text in head]), *(("td", row) for row in rows)]
-    classes = ["number" if place in numbers else "text" for place in range(len(head))]
+    classes = ["number" if column in numbers else "text" for column in range(len(head))]
     body = "".join(
         "<tr>" + "".join(f'<{tag} class="{c}">{text}</{tag}>' for c, text in zip(classes, row, strict=True)) + "</tr>"
         for tag, row in lines

@@ -159,7 +159,7 @@ def noisy(pixels_bgr: NDArray[np.uint8], deviation: float, random: np.random.Gen
 @cache
 def _quantiles() -> Array:
     """(4096,) equally likely values of the standard normal distribution."""
-    return np.array([NormalDist().inv_cdf((place + 0.5) / 4096) for place in range(4096)])
+    return np.array([NormalDist().inv_cdf((index + 0.5) / 4096) for index in range(4096)])
 
 
 @njit(nogil=True)
@@ -171,9 +171,9 @@ def _add_noise(pixels, levels, seed, out) -> None:  # type: ignore[no-untyped-de
         bits = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         bits ^= bits >> np.uint64(31)
-        for place in range(start, min(start + 5, len(pixels))):
-            pixel = np.int32(pixels[place]) + np.int32(levels[bits & np.uint64(4095)])
-            out[place] = np.uint8(min(max(pixel, np.int32(0)), np.int32(255)))
+        for index in range(start, min(start + 5, len(pixels))):
+            pixel = np.int32(pixels[index]) + np.int32(levels[bits & np.uint64(4095)])
+            out[index] = np.uint8(min(max(pixel, np.int32(0)), np.int32(255)))
             bits >>= np.uint64(12)
 
 
@@ -200,15 +200,15 @@ class BadConditions:
             self._corruption = corrupt, int(random.choice(levels))
         if random.random() < config.lost_cameras_share:
             self._lost, self._black = int(random.integers(1, MOST_LOST_CAMERAS + 1)), bool(random.random() < 0.5)
-        self._order: dict[str, int] = {}  # camera -> its place among those that are lost one after the other
+        self._order: dict[str, int] = {}  # camera -> its rank among those that are lost one after the other
 
     def __call__(self, frame: Frame) -> Frame:
         """A copy of the frame with its images corrupted, and some of them left out or black."""
         if self._corruption is None and not self._lost:
             return frame
         if not self._order:
-            places = self._random.permutation(len(frame.rig.names))
-            self._order = dict(zip(frame.rig.names, map(int, places), strict=True))
+            ranks = self._random.permutation(len(frame.rig.names))
+            self._order = dict(zip(frame.rig.names, map(int, ranks), strict=True))
         lost = min(self._lost, len(self._order) - 1)
         images = {}
         for name, image in frame.images.items():
@@ -336,8 +336,8 @@ def _convolved(x: Tensor, config: RandomisationConfig, generator: torch.Generato
     sizes = torch.randint(len(KERNEL_SIZES), (len(chosen),), generator=generator)
     shares = torch.rand(len(chosen), 1, 1, 1, generator=generator)
     y = x.clone()
-    for place, size in enumerate(KERNEL_SIZES):
-        of_size = (sizes == place).nonzero()[:, 0]
+    for index_of_size, size in enumerate(KERNEL_SIZES):
+        of_size = (sizes == index_of_size).nonzero()[:, 0]
         count = len(of_size)
         if not count:
             continue

@@ -91,7 +91,7 @@ def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
     gaps_s: list[Array] = []
     map_reaches: list[float] = []
     for drive in drives:
-        frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
+        frames = [drive.ground_truth_frame(index) for index in range(len(drive.stamps))]
         frames = [frame for frame in frames if frame.ground_truth is not None]
         if not frames:
             raise InputError(f"{drive.name}: has no ground truth boxes (expected for training): leave it out")

@@ -89,9 +89,9 @@ class Clip:
 
 
 def draw_clip(
-    drives: Drives, config: ClipConfig, seed: Items[int], place: int, *, with_gap: bool = True
+    drives: Drives, config: ClipConfig, seed: Items[int], index: int, *, with_gap: bool = True
 ) -> tuple[Clip, np.random.Generator]:
-    """The clip at a place of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
+    """The clip at an index of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
 
     It depends on no other clip, but all clips of a batch have the same length, and images that fit into one batch.
 
@@ -99,13 +99,13 @@ def draw_clip(
         seed: of the batch.
         with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
     """
-    of_batch, random = np.random.default_rng(seed), np.random.default_rng([*seed, place + 1])
+    of_batch, random = np.random.default_rng(seed), np.random.default_rng([*seed, index + 1])
     frames = config.frames
     if frames > 1 and of_batch.random() < config.short_share:
         frames = int(of_batch.integers(1, frames))
     first, shapes = int(of_batch.integers(len(drives))), drives.input_shapes
     alike = range(len(drives)) if shapes is None else _similar_drives(shapes, first)
-    drive = int(alike[random.integers(len(alike))]) if place else first
+    drive = int(alike[random.integers(len(alike))]) if index else first
     leave_out = with_gap and config.learn == "last"
     return Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)), random
 
@@ -301,12 +301,12 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def _targets(frame: Frame, drive: Sequence, place: int, config: ModelConfig) -> Targets:
-    """place: of the frame in the drive."""
+def _targets(frame: Frame, drive: Sequence, index: int, config: ModelConfig) -> Targets:
+    """index: of the frame in the drive."""
     boxes = ground_truth_boxes(frame)
     detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
     heads = own_heads(config)
-    truths = () if heads is None else (heads.truth(frame, drive, place, config),)
+    truths = () if heads is None else (heads.truth(frame, drive, index, config),)
     if "segmentation" not in config.heads:
         return Targets(detection, perspective, None, truths)
     masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
