@@ -122,11 +122,6 @@ def _is_other_drive(path: Path) -> bool:
     return is_drive(path) and format_of(path) is not NATIVE
 
 
-def _is_other_drive(path: Path) -> bool:
-    """True for a drive that is not a native folder, such as a bag."""
-    return is_drive(path) and format_of(path) is not NATIVE
-
-
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
     counts = np.bincount(coverage.counts.ravel())
     return {

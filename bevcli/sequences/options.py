@@ -127,7 +127,6 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
-
 @options("Input")
 class LabelOptions:
     """Ground truth from a file of labels."""
