@@ -142,6 +142,14 @@ class CityPlan:
             bool(rng.random() < 0.6),
         )  # fmt: skip
 
+    def street_at(self, node: tuple[int, int], direction: int) -> Street:
+        """The street through a junction (column, row) in a direction (index into DIRECTIONS)."""
+        return self.street(0, node[1]) if direction % 2 == 0 else self.street(1, node[0])
+
+    def node_center(self, node: tuple[int, int]) -> Array:
+        """Plan point (2,) at the centre of a junction (column, row)."""
+        return np.array([self.street(1, node[0]).position, self.street(0, node[1]).position])
+
     def block(self, column: int, row: int) -> Block:
         """The block east of street `column` of axis 1 and north of street `row` of axis 0."""
         west, east = self.street(1, column), self.street(1, column + 1)
@@ -262,16 +270,6 @@ class Route:
         return np.interp(np.asarray(position, dtype=np.float64), self.positions, self.yaws)
 
 
-def street_of(city: CityPlan, node: tuple[int, int], direction: int) -> Street:
-    """The street through a junction in a direction (index into DIRECTIONS)."""
-    return city.street(0, node[1]) if direction % 2 == 0 else city.street(1, node[0])
-
-
-def node_center(city: CityPlan, node: tuple[int, int]) -> Array:
-    """Plan point (2,) at the centre of a junction."""
-    return np.array([city.street(1, node[0]).position, city.street(0, node[1]).position])
-
-
 def right_of(direction: int) -> Array:
     """Unit vector (2,) to the right of a direction (index into DIRECTIONS)."""
     return DIRECTIONS[(direction - 1) % 4]
@@ -305,16 +303,16 @@ def build_route(
     length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn,
     where it is not a bicycle. bicycle: whether it keeps right of the lanes, and never turns left.
     """
-    street = street_of(city, node, direction)
+    street = city.street_at(node, direction)
     offset = street.lane_offset(lane, bicycle)
-    at = node_center(city, node) - DIRECTIONS[direction] * before + right_of(direction) * offset
+    at = city.node_center(node) - DIRECTIONS[direction] * before + right_of(direction) * offset
     corners, marks, travelled = [at[None]], [], 0.0
     while travelled < length:
         turn = _draw_turn(rng, street, lane, straight_on, bicycle)
-        center, cross = node_center(city, node), street_of(city, node, direction + 1)
+        center, cross = city.node_center(node), city.street_at(node, direction + 1)
         after = (direction + turn) % 4
         following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
-        street = street_of(city, following, after)
+        street = city.street_at(following, after)
         lane = min(lane, street.lanes - 1) if turn == 0 else (0 if turn > 0 else street.lanes - 1)
         new_offset = street.lane_offset(lane, bicycle)
         corner = center + right_of(direction) * offset
@@ -323,7 +321,7 @@ def build_route(
         radius = cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
-        across = street_of(city, node, after + 1)
+        across = city.street_at(node, after + 1)
         leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_M[1])
         marks.append((node, direction, turn, stop, leave))
         piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])

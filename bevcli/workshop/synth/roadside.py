@@ -17,11 +17,9 @@ from bevcli.workshop.synth.city import (
     Street,
     along,
     distances_along,
-    node_center,
     points_at,
     rounded_rectangle,
     side_of,
-    street_of,
 )
 from bevcli.workshop.synth.people import CYCLES, PERSON_NAMES
 from bevcli.workshop.synth.traffic import MOVING_M_S, ActorState, Signals
@@ -126,10 +124,10 @@ def _crosser(
     begin: start of the walk, seconds. index: number of the crosser at this junction; neighbours keep apart.
     """
     arm = int(rng.integers(4))
-    street, cross = street_of(city, node, arm), street_of(city, node, arm + 1)
+    street, cross = city.street_at(node, arm), city.street_at(node, arm + 1)
     side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
     sideways = DIRECTIONS[(arm + 1) % 4] * side
-    spot = node_center(city, node) + DIRECTIONS[arm] * (
+    spot = city.node_center(node) + DIRECTIONS[arm] * (
         cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
     )
     reach = street.half_width + ALONG_PAVEMENT_M

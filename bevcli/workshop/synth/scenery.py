@@ -15,11 +15,9 @@ from bevcli.workshop.synth.city import (
     KERB_M,
     Block,
     CityPlan,
-    node_center,
     right_of,
     rounded_rectangle,
     side_of,
-    street_of,
 )
 from bevcli.workshop.synth.looks import Looks
 from bevcli.workshop.synth.mesh import (
@@ -254,8 +252,8 @@ class Scenery:
         """
         city = self.city
         for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
-            street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
+            street, cross = city.street_at(node, direction), city.street_at(node, direction + 1)
             ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
-            spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
+            spot = city.node_center(node) + ahead + right_of(direction) * (street.half_width + 0.9)
             template = self.furniture.signals[signals.light(node, direction % 2, time_s)]
             yield self._put(template, spot, city.heading(spot, -DIRECTIONS[direction]))

@@ -10,16 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth.catalog import Assets, draw_body
-from bevcli.workshop.synth.city import (
-    DIRECTIONS,
-    STOP_LINE_M,
-    CityPlan,
-    Route,
-    build_route,
-    node_center,
-    right_of,
-    street_of,
-)
+from bevcli.workshop.synth.city import DIRECTIONS, STOP_LINE_M, CityPlan, Route, build_route, right_of
 from bevcli.workshop.synth.people import RIDDEN
 from bevcli.workshop.synth.roadside import Roadside, StandingActor, Walker, crossers, strollers
 from bevcli.workshop.synth.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
@@ -44,8 +35,8 @@ class VehicleSpawner:
         """The ego vehicle, on the approach to junction (0, 0)."""
         rng = self.city.stream("ego")
         direction = int(rng.integers(4))
-        lane = int(rng.integers(street_of(self.city, (0, 0), direction).lanes))
-        edge = street_of(self.city, (0, 0), direction + 1).half_width + STOP_LINE_M
+        lane = int(rng.integers(self.city.street_at((0, 0), direction).lanes))
+        edge = self.city.street_at((0, 0), direction + 1).half_width + STOP_LINE_M
         before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
         route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
@@ -68,11 +59,11 @@ class VehicleSpawner:
         direction = axis + 2 * int(rng.integers(2))
         following = self.city.below(1 - axis, at) + (direction < 2)
         node = (following, street.index) if axis == 0 else (street.index, following)
-        before = float((node_center(self.city, node) - street.point(at)) @ DIRECTIONS[direction])
+        before = float((self.city.node_center(node) - street.point(at)) @ DIRECTIONS[direction])
         lane = int(rng.integers(street.lanes))
         units = self._units(bicycle)
         length = units[-1].lag + float(units[-1].body.size_lwh[0])
-        cross = street_of(self.city, node, direction + 1)
+        cross = self.city.street_at(node, direction + 1)
         if before < cross.half_width + STOP_LINE_M + 1:
             return None
         point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
