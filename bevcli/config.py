@@ -55,9 +55,9 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
-    meshes = {name: one.mesh and str(Path(file).parent / one.mesh) for name, one in config.class_settings.items()}
-    settings_from_here = {name: replace(one, mesh=meshes[name]) for name, one in config.class_settings.items()}
-    return replace(config, class_settings=settings_from_here)
+    classes, folder = config.class_settings.items(), Path(file).parent
+    from_here = {name: replace(item, mesh=item.mesh and str(folder / item.mesh)) for name, item in classes}
+    return replace(config, class_settings=from_here)
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:

@@ -43,17 +43,15 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
+        from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
         from bevcli.cli.stop_signals import StopSignals
-        from bevcli.inference.load import load_model
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.runs.run_into_folder import run_into_folder
         from bevcli.sequences.open import open_sequence
 
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
-    fetch_if_asked(model)
-    loaded = load_model(options=model)
+    loaded = load_with_bar(model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = open_sequence(sequence, reading, **format_options)
     for step in first:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError
@@ -18,6 +17,7 @@ from bevcli.model.pillar_projection import Pillars
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
+from bevcli.model.tensors import without_autocast
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -59,7 +59,7 @@ class Network(TemporalModel):
     def detect(self, bev: Tensor) -> ModelOutputs:
         """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:

@@ -20,7 +20,6 @@ from bevcli.runs.options import RunOptions
 from bevcli.runs.state import START_ANEW, RunState, RunWriter, run_facts, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
 from bevcli.sequences.images import no_image_error
-from bevcli.workshop.engines.in_engine import in_engine
 
 Step = tuple[Frame, Prediction, RunnerState[Any]]
 
@@ -63,7 +62,7 @@ def run_into_folder(
             the run to resume was another one.
     """
     options = RunOptions() if options is None else options
-    model = in_engine(model, sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
+    model = model.in_engine(sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
     commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")

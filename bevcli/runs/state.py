@@ -19,13 +19,13 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bevcli._version import __version__
+from bevcli.checkpoints import read_safetensors
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.load import Model, hash_of
 from bevcli.inference.runner import Memory, RunnerState
 from bevcli.model.tensors import tensors_in
 from bevcli.parsing.files import read_bytes
-from bevcli.parsing.pth import read_safetensors
 from bevcli.runs.files import FilesState, RunFiles
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts, RunSummary

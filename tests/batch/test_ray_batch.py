@@ -18,7 +18,7 @@ from small_fleet import results_of, write_drive, write_fleet
 
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.native_writer import NativeWriter
-from bevcli.workshop.synth.export import render
+from bevcli.workshop.synth.drive import render
 
 OPTIONS = ("--model", "mini.toml", "--untrained", "--rate", "all", "--score", "0", "--device", "cpu")
 # One thread, as of the single runs: sums in another order are rounded otherwise.

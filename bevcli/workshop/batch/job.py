@@ -27,6 +27,7 @@ from bevcli.inference.load import Model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, read_text
+from bevcli.published import weights_folder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
@@ -35,7 +36,6 @@ from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.user_folders import user_cache
-from bevcli.weights.cache import weights_folder
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
@@ -227,9 +227,9 @@ class Job:
     evaluate: bool = False
     retries: int = 2
 
-    def load_model(self, device: str | None = None) -> Model:
-        """The model with its weights. device: another one than the job's. Raises BevcliError."""
-        return load_model(options=self.model if device is None else replace(self.model, device=device))
+    def load_model(self) -> Model:
+        """The model with its weights. Raises BevcliError."""
+        return load_model(options=self.model)
 
     def own_of(self, kind: type[Own]) -> Own:
         """The own options of a format. kind: their dataclass."""

@@ -21,7 +21,7 @@ from bevcli.workshop.batch.command import SOME_FAILED, load_for_batch, run_with_
 from bevcli.workshop.batch.options import ReproduceOptions, Workers
 
 if TYPE_CHECKING:
-    from bevcli.weights.cache import NamedWeights
+    from bevcli.published import NamedWeights
 
 PANEL = "Score"
 VALIDATION_FRAMES = 6019  # of the nuScenes validation split
@@ -50,7 +50,7 @@ def reproduce(
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
     question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
-    from bevcli.weights.cache import named_weights
+    from bevcli.published import named_weights
     from bevcli.workshop.batch.job import Job, all_own_options, find_drives, with_absolute_paths
     from bevcli.workshop.batch.report import METRICS
 
@@ -94,12 +94,11 @@ def reproduce(
 def _get(named: "NamedWeights", model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.weights.fetch import by_hand
 
     if named.here is not None:
         return
     if named.file is None:
-        raise WeightsError(f"{named.name}: {by_hand(named)}")
+        raise WeightsError(f"{named.name}: {named.by_hand}")
     size = "size unknown" if named.size is None else f"{named.size / 1e6:.1f} MB"
     what = f"the weights {named.name} are not here: {named.source.url or named.source.source} ({size})"
     if not model.fetch and not sys.stdin.isatty():

@@ -35,7 +35,7 @@ def export_onnx(
     from bevcli.inference.load import load_model
     from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.benchmark.exported import check_exported, difference_lines
+    from bevcli.workshop.engines.differences import check_exported, difference_lines
     from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
 
     loaded = load_model(model, options=replace(model_options, device="cpu"))

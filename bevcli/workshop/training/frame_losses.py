@@ -16,12 +16,12 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.inference.load import weights_file
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelInputs, ModelOutputs
-from bevcli.weights.fetch import weights_file
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.clip_steps import clip_steps
 from bevcli.workshop.training.detection_loss import (

@@ -11,13 +11,13 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from bevcli.errors import OutputError
 from bevcli.inference.background import read_ahead
 from bevcli.model.config import ModelConfig
 from bevcli.workshop.synth.drives import Drives
-from bevcli.workshop.synth.workers import blocked_interrupts
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.samples import Batch, ClipConfig, draw_clip, joined, load_batch
 
@@ -202,3 +201,14 @@ class _Pickler(pickle.Pickler):
 
 def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
     return torch.from_numpy(array).permute(np.argsort(order).tolist())
+
+
+@contextmanager
+def blocked_interrupts() -> Iterator[None]:
+    """Processes that start in the block never see Ctrl-C: it reaches their parent, which ends them."""
+    resource_tracker.ensure_running()  # it would be started with the first process, and unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

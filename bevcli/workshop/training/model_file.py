@@ -24,8 +24,8 @@ from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.synth.splits import read_split
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.options import Preset
 from bevcli.workshop.training.samples import ClipConfig, ground_truth_boxes

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 
-import torch
 from torch import Tensor
 
 from bevcli.frame import BevMap, FrameResult
@@ -11,6 +10,7 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.network import STAGES
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import ModelOutputs
+from bevcli.model.tensors import without_autocast
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
@@ -47,7 +47,7 @@ class VAD(BEVFormer):
 
     def detect(self, bev: Tensor) -> VADOutputs:
         """The outputs for a BEV map (B, Y·X, C)."""
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             class_logits, box_codes, features = self.decoder(bev.float(), self.detection_head)
             lines, motion, plan = self.further(bev.float(), box_codes[-1], features)
         return VADOutputs(bev, class_logits, box_codes, lines=lines, motion=motion, plan=plan)
