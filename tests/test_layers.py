@@ -219,7 +219,8 @@ def test_only_a_download_uses_libcurl_and_http():
 
 def test_importing_the_core_loads_no_workshop():
     """Beside its names. `bevcli.calibrate` and `bevcli.render` are texts, imported when they are used."""
-    core = [module for module in FILES if not module.startswith("bevcli.workshop") and module != "bevcli.__main__"]
+    left_out = ("bevcli.workshop", "bevcli.__main__", "bevcli.model.kernels.triton_")  # Triton may be missing
+    core = [module for module in FILES if not module.startswith(left_out)]
     code = (
         f"import importlib, sys\nfor name in {core}:\n    importlib.import_module(name)\n"
         "print(*(name for name in sys.modules if name.startswith('bevcli.workshop.')))"

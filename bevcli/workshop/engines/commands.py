@@ -101,11 +101,10 @@ def quantize(
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.inference.preprocess import calibration_images
     from bevcli.sequences.open import open_sequence
     from bevcli.workshop.engines.differences import check_exported, difference_lines
     from bevcli.workshop.engines.engine import load_exported
-    from bevcli.workshop.engines.export_onnx import quantize as write_quantized
+    from bevcli.workshop.engines.export_onnx import calibration_images, quantize as write_quantized
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
