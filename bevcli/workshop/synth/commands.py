@@ -36,8 +36,8 @@ def demo(options: DemoOptions) -> None:
 
     The demo model was trained on rendered drives only.
     """
+    from bevcli.cli.commands import viz
     from bevcli.cli.run import run
-    from bevcli.cli.viz import viz
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
