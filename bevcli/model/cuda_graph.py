@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from bevcli.model import upload
-from bevcli.model.tensors import exchanged, tensors_in
+from bevcli.model.upload import exchanged, tensors_in
 
 KEPT_GRAPHS = 8  # of one function: for other numbers and sizes of images, with and without history
 Function = Callable[..., Any]

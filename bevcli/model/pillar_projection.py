@@ -1,4 +1,15 @@
-"""Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3)."""
+"""Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3).
+
+      bev frame                                   image of a camera (u, v), 0 to 1
+      z ^   o  Z points above each of               +---------------+
+        |   o  the Y·X cells                        |      x        |   camera sees the cell: a point is inside,
+        |   o    (x, y, z, 1)                       |      x        |   and in front of it (d > 0)
+        +---+---+---> x, y     -------------->      +------x--------+
+            cell                image_from_bev             x            outside: not visible
+                                = (u d, v d, d, 1)
+
+`PillarHits` lists the pairs of a camera and a cell that it sees; only for these attention is computed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,15 @@
-"""The window of a BEVFormerV2: the frames that a step sees, and the image features that are kept for the next steps."""
+r"""The window of a BEVFormerV2: the frames that a step sees, and the image features that are kept for the next steps.
+
+A window [-2, -1, 0] at frame 1, the second of its scene; frame -1 does not exist:
+
+    images           (none)     frame 0      frame 1        each passes the backbone once
+    image features   (none)     kept         new            `FeatureWindow` keeps frame 0 and 1 for frame 2
+                                  |            |            `seen_from`: frame 0's cameras in frame 1's bev frame
+    BEV encoder                   |            |            the same weights, grid of frame 1, no history
+    BEV map          frame 0's  frame 0's    frame 1's      `fill_window`: that of the nearest frame towards 0
+                        \_________|____________/
+                               BevFusion                    -> the BEV map of frame 1
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -10,7 +10,7 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.network import STAGES
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import FrameTruth, ModelOutputs
-from bevcli.model.tensors import without_autocast
+from bevcli.model.upload import without_autocast
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
