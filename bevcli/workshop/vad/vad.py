@@ -1,6 +1,6 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 from torch import Tensor
 
@@ -9,12 +9,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.network import STAGES
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
-from bevcli.model.step import FrameTruth, ModelOutputs
+from bevcli.model.step import ModelOutputs
 from bevcli.model.upload import without_autocast
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
-from bevcli.workshop.vad.losses import head_losses
 from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
 from bevcli.workshop.vad.official_keys import OFFICIAL_NAMES
 from bevcli.workshop.vad.planner import Planner
@@ -74,12 +73,6 @@ class VAD(BEVFormer):
         yield decode_futures(outputs, self.config)
         yield decode_lines(outputs, self.config)
         yield decode_plan(outputs, self.config)
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        assert isinstance(outputs, VADOutputs)
-        return head_losses(outputs, truths, matches, self.config)
 
 
 def fix_first_attentions(model: VAD) -> None:
