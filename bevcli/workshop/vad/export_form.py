@@ -8,9 +8,9 @@ from torch import Tensor
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.engines.export_form import Port, RecurrentForm
 from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.decoding import VADOutputs
 from bevcli.workshop.vad.line_decoder import LineOutputs
 from bevcli.workshop.vad.motion_head import MotionOutputs
+from bevcli.workshop.vad.vad import VADOutputs
 
 
 class VADForm(RecurrentForm):
