@@ -44,28 +44,28 @@ def upload_together(value: Value, device: torch.device) -> Value:
         moved = iter(unpacked(upload(packed(missing), device), missing))
     else:
         moved = iter([tensor.to(device) for tensor in missing])
-    found: Value = exchanged(value, (x if x.device.type == device.type else next(moved) for x in tensors))
-    return found
+    uploaded: Value = exchanged(value, (x if x.device.type == device.type else next(moved) for x in tensors))
+    return uploaded
 
 
 def packed(tensors: Sequence[Tensor]) -> Tensor:
     """The bytes of tensors of one device, which one copy moves."""
-    return torch.cat([tensors[place].reshape(-1).view(torch.uint8) for place in _order(tensors)])
+    return torch.cat([tensors[index].reshape(-1).view(torch.uint8) for index in _order(tensors)])
 
 
 def unpacked(memory: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
     """The tensors in the bytes of `packed`, with the shapes and types of those that were packed."""
     order = _order(like)
-    parts = memory.split([like[place].nbytes for place in order])
-    found = {
-        place: part.view(like[place].dtype).view(like[place].shape) for place, part in zip(order, parts, strict=True)
+    parts = memory.split([like[index].nbytes for index in order])
+    by_index = {
+        index: part.view(like[index].dtype).view(like[index].shape) for index, part in zip(order, parts, strict=True)
     }
-    return [found[place] for place in range(len(like))]
+    return [by_index[index] for index in range(len(like))]
 
 
 def _order(tensors: Sequence[Tensor]) -> list[int]:
     """Those with the longest numbers first, so that each number lies at a multiple of its length."""
-    return sorted(range(len(tensors)), key=lambda place: -tensors[place].itemsize)
+    return sorted(range(len(tensors)), key=lambda index: -tensors[index].itemsize)
 
 
 def pinned(tensor: Tensor) -> Tensor:

@@ -96,10 +96,10 @@ class FeatureWindow:
 
 
 def frames_at(
-    frames: Sequence[FrameFeatures], places: Sequence[int], current: PreparedFrame
+    frames: Sequence[FrameFeatures], indices: Sequence[int], current: PreparedFrame
 ) -> list[WindowFrame | None]:
-    """The frames at these places, seen from the current one; None where there is no frame."""
-    return [frames[place].seen_from(current) if 0 <= place < len(frames) else None for place in places]
+    """The frames at these indices, seen from the current one; None where there is no frame."""
+    return [frames[index].seen_from(current) if 0 <= index < len(frames) else None for index in indices]
 
 
 def kept(frames: Sequence[FrameFeatures], current: int, past_frames: int) -> FeatureWindow:
@@ -118,9 +118,9 @@ def fill_window(frames: Sequence[int], exists: Sequence[bool]) -> list[int]:
     """
     current = list(frames).index(0)
     sources = list(range(len(frames)))
-    for place in (*range(current - 1, -1, -1), *range(current + 1, len(frames))):
-        if not exists[place]:
-            sources[place] = sources[place + (1 if place < current else -1)]
+    for index in (*range(current - 1, -1, -1), *range(current + 1, len(frames))):
+        if not exists[index]:
+            sources[index] = sources[index + (1 if index < current else -1)]
     return sources
 
 

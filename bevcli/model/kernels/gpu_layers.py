@@ -133,9 +133,9 @@ class MapOnDevice(SegmentationHead):
 
     def forward(self, bev: Tensor, position: Tensor) -> SegmentationOutputs:
         """As `SegmentationHead.forward`, for a batch of one, with map layers."""
-        found = super().forward(bev, position)
-        masks, classes = found.mask_logits[-1, 0].float(), found.class_logits[-1, 0].float()
-        return replace(found, map_layers=map_layers(masks, classes, self.config, self.grid))
+        outputs = super().forward(bev, position)
+        masks, classes = outputs.mask_logits[-1, 0].float(), outputs.class_logits[-1, 0].float()
+        return replace(outputs, map_layers=map_layers(masks, classes, self.config, self.grid))
 
 
 class PaddedPillars(Pillars):
@@ -177,8 +177,8 @@ def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, i
     read = matrices, points.float().contiguous().numpy(), has_image.cpu().flatten().numpy(), size
     written = cells, reference_points, counts
     in_threads(partial(find_hits, *read, np.float32(MIN_DEPTH), *written), images, min_range=1)
-    found = [cells[image, :count] + image // cameras * total for image, count in enumerate(counts)]
-    cell = np.concatenate(found)
+    cells_of_images = [cells[image, :count] + image // cameras * total for image, count in enumerate(counts)]
+    cell = np.concatenate(cells_of_images)
     return PillarHits(
         cell=torch.from_numpy(cell),
         reference_points=torch.from_numpy(

@@ -66,8 +66,8 @@ def motion_losses(
         queries, true, known = queries[known[:, 0]], true[known[:, 0]].nan_to_num(), known[known[:, 0]]
         modes = best_modes(outputs.offsets[element, queries], true, known)
         mode_targets[element, queries, modes] = 1
-        found = outputs.offsets[element, queries, modes]
-        errors = errors + (F.l1_loss(found, true, reduction="none") * known[..., None]).sum()
+        predicted = outputs.offsets[element, queries, modes]
+        errors = errors + (F.l1_loss(predicted, true, reduction="none") * known[..., None]).sum()
         number += len(queries)
     classes = (focal_loss(outputs.mode_logits, mode_targets) * counted).sum()
     return {"futures": weights.future * errors / max(number, 1), "modes": weights.mode * classes / max(number, 1)}
@@ -270,14 +270,14 @@ def _layer_loss(
     logits: Tensor, points: Tensor, targets: Sequence[LineTargets], weights: LossWeights, extent_m: Tensor
 ) -> Tensor:
     """(3,) losses of one decoder layer. logits: (B, N, classes). points: (B, N, P, 2)."""
-    class_targets, found, true = torch.zeros_like(logits), [], []
+    class_targets, matched, true = torch.zeros_like(logits), [], []
     for element, truth in enumerate(targets):
         costs, best = matching_costs(logits[element], points[element], truth, weights)
         queries, lines = hungarian_matching(costs)
         class_targets[element, queries, truth.labels[lines]] = 1
-        found.append(points[element, queries])
+        matched.append(points[element, queries])
         true.append(truth.orders[lines, best[queries, lines]])
-    at, wanted = torch.cat(found), torch.cat(true)  # (K, P, 2)
+    at, wanted = torch.cat(matched), torch.cat(true)  # (K, P, 2)
     classes = weights.line_class * focal_loss(logits, class_targets).sum()
     distances = weights.line_points * F.l1_loss(at, wanted, reduction="sum")
     segments, true_segments = (each.diff(dim=1) * extent_m for each in (at, wanted))

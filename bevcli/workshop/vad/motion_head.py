@@ -103,9 +103,9 @@ class MotionHead(nn.Module):
         position = self.agent_position(positions).repeat_interleave(self.config.modes, dim=1)
         modes = self.agent_attention(modes, position, modes, position)
         modes = modes.unflatten(1, (-1, self.config.modes))  # (B, Q, M, C)
-        found = torch.cat([modes, self._attend_to_lines(modes, positions, lines)], dim=-1)  # (B, Q, M, 2 C)
-        offsets = self.trajectory_branch(found).unflatten(-1, (self.config.steps, 2))
-        return MotionOutputs(offsets, self.mode_branch(found)[..., 0], self.agent_fusion(found.flatten(2)))
+        attended = torch.cat([modes, self._attend_to_lines(modes, positions, lines)], dim=-1)  # (B, Q, M, 2 C)
+        offsets = self.trajectory_branch(attended).unflatten(-1, (self.config.steps, 2))
+        return MotionOutputs(offsets, self.mode_branch(attended)[..., 0], self.agent_fusion(attended.flatten(2)))
 
     def _attend_to_lines(self, modes: Tensor, positions: Tensor, lines: MapTokens) -> Tensor:
         """(B, Q, M, C): each object attends to its own lines, at their positions relative to it."""
@@ -114,14 +114,14 @@ class MotionHead(nn.Module):
         values = features[:, None].expand(-1, positions.shape[1], -1, -1)
         # As in the released code, the object itself is at the origin.
         own = self.line_position(positions.new_zeros(1, 1, 2))
-        found = self.line_attention(
+        attended = self.line_attention(
             modes.flatten(0, 1),
             own,
             values.flatten(0, 1),
             self.line_position(relative).flatten(0, 1),
             masked.flatten(0, 1),
         )
-        return found.unflatten(0, modes.shape[:2])
+        return attended.unflatten(0, modes.shape[:2])
 
     def lines_in_reach(self, positions: Tensor, lines: MapTokens) -> tuple[Tensor, Tensor]:
         """Relative positions (B, Q, N + 1, 2) of the lines, and masks (B, Q, N + 1) of those not attended to.
