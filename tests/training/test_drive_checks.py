@@ -18,11 +18,10 @@ from bevcli.errors import BevcliError, ConfigError, InputError
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.changes import with_changes
-from bevcli.workshop.training.drive_checks import check_scored_drives, check_training_drives
-from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
+from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.validation import check_scored_drives, check_training_drives
 
 CPU = torch.device("cpu")
 SETTINGS = {"clips.frames": "2", "clips.batch": "1", "held_out": "1", "steps": "1"}

@@ -9,11 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bevcli.frame import Prediction
+from bevcli.frame import FrameStamp, Prediction
+from bevcli.geometry.transforms import Pose
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
-from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
+from bevcli.model.bevformer_v2.window import FeatureWindow
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
@@ -81,6 +83,17 @@ class Version:
         self.queries = torch.cat([codes[:, :2], codes[:, 4:5]], dim=-1), outputs.class_logits[-1, 0].sigmoid()
 
 
+def with_past(memory: FeatureWindow, past: Sequence[tuple[FrameStamp, Pose]]) -> FeatureWindow:
+    """A memory as if the model had seen earlier frames too, with copies of the image features.
+
+    past: their stamps and world_from_ego.
+    """
+    if not memory.frames:
+        return memory  # nothing of one frame is kept for the next
+    seen = memory.frames[-1]
+    return FeatureWindow((*(replace(seen, stamp=stamp, pose=pose) for stamp, pose in past), seen))
+
+
 def wait_for(device: torch.device) -> None:
     """Returns when a GPU has finished all queued work; at once on a CPU."""
     if device.type == "cuda":
@@ -121,7 +134,7 @@ def textbook_version(model: Network, device: torch.device) -> Network:
     return textbook
 
 
-class PaddedSampling(nn.Module):
+class PaddedSampling(GridSampling):
     """`grid_sample` of all maps at once; the queries of every map are padded to the longest list."""
 
     def forward(

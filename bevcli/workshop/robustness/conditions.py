@@ -16,7 +16,7 @@ from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequen
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics, motion_during
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.sequences.selection import select
+from bevcli.sequences.open import select
 from bevcli.workshop.robustness.options import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels

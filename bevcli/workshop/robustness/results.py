@@ -10,7 +10,7 @@ import msgspec
 
 from bevcli.errors import InputError
 from bevcli.evaluation.detection import known_mean
-from bevcli.evaluation.scores_report import finite
+from bevcli.evaluation.evaluate import finite
 from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group

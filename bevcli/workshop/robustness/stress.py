@@ -17,7 +17,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
-from bevcli.sequences.selection import scenes_of, select
+from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
 from bevcli.workshop.robustness.conditions import KEPT_BYTES, Condition, KeptFrames, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import BevMap, CameraImage, DriveFacts, Frame, FrameStamp, MapLines
+from bevcli.frame import BevMap, CameraImage, DriveFacts, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
@@ -40,6 +40,7 @@ from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, r
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Simulation
 from bevcli.workshop.synth.traffic import ActorState
+from bevcli.workshop.vad.map_lines import MapLines
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
@@ -343,7 +344,7 @@ def _encoded(drive: RenderedDrive, quality: int) -> Iterator[Frame]:
         yield Frame(
             rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
             motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
-            ground_truth_map=rendered.bev_map, ground_truth_lines=rendered.lines,
+            ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
         )  # fmt: skip
 
 

@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from shapely import LineString, Polygon, union_all
 from shapely.geometry.base import BaseGeometry
 
-from bevcli.frame import LINE_CLASSES, MAP_CLASSES, BevMap, MapLines
+from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
 from bevcli.workshop.synth.city import CORNER_M, CROSSING_M, STOP_LINE_M, CityPlan, Street, along, rounded_rectangle
 from bevcli.workshop.synth.looks import tiling_noise
 from bevcli.workshop.synth.mesh import Color, linear
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
 from bevcli.workshop.vad.true_lines import lines_in_area
 
 WHITE: Color = (222, 222, 216)
