@@ -44,7 +44,7 @@ WINGS: dict[str, set[str]] = {
     "calibration": set(),
     "engines": set(),
     "formats": set(),
-    "robustness": {"calibration", "scores", "synth"},
+    "robustness": {"calibration", "synth"},
     "synth": {"formats", "vad"},
     "scores": set(),
     "training": {"synth"},
