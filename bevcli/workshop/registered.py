@@ -69,7 +69,7 @@ OWN: dict[Group, dict[str, str]] = {
         "bench": "bevcli.workshop.benchmark.command:bench",
         "calibrate": "bevcli.workshop.calibration.command:calibrate",
         "convert": "bevcli.workshop.formats.convert_command:convert",
-        "demo": "bevcli.workshop.synth.command:demo",
+        "demo": "bevcli.workshop.synth.demo_command:demo",
         "export-onnx": "bevcli.workshop.engines.export_command:export_onnx",
         "quantize": "bevcli.workshop.engines.quantize_command:quantize",
         "render": "bevcli.workshop.synth.command:render",

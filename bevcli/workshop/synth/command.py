@@ -1,19 +1,13 @@
-"""`bevcli render`: a drive through a rendered city; `bevcli demo`: run the model on one, without other data."""
+"""`bevcli render`: a drive through a rendered city as a sequence folder with ground truth."""
 
 from pathlib import Path
 from typing import Annotated
 
 from bevcli.cli.bridge import argument
-from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import OutputOptions, RunOptions
-from bevcli.sequences.options import SequenceOptions
-from bevcli.viewer.options import ViewOptions
-from bevcli.workshop.synth.options import DemoOptions, RenderOptions
+from bevcli.workshop.synth.options import RenderOptions
 
 PANEL = "Start"
-DEMO_RESOLUTION = (800, 450)
 
 
 def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
@@ -29,18 +23,3 @@ def render(out: Annotated[Path, argument("The sequence folder to write.", reads=
         summary = render_sequence(out, options, progress=lambda frame: progress.advance())
     size = f"{counted(summary.frames, 'frames')}, {counted(len(summary.cameras), 'cameras')}"
     say(f"{summary.folder}: {size}, {summary.weather}, seed {summary.seed}")
-
-
-def demo(options: DemoOptions) -> None:
-    """Render a short drive, run BEVFormer on it and open the recording.
-
-    The demo model was trained on rendered drives only.
-    """
-    from bevcli.cli.run import run
-    from bevcli.cli.viz import viz
-
-    drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
-    render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
-    if options.view:
-        viz(options.out / "results/recording.rrd", ViewOptions())
