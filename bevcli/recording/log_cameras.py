@@ -154,32 +154,23 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
 
     Returns the centres of the labels (L, 2), pixels, and the boxes (L,) that they belong to.
     """
+    boxes, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
+    lows = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
+    highs = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
+    rectangles = zip(boxes.tolist(), lows, highs, strict=True)
     taken: list[tuple[float, float, float, float]] = []
     centers, owners = [], []
-    for owner, low, high in _by_height(lines):
+    for owner, low, high in sorted(rectangles, key=lambda item: item[1][1] - item[2][1]):
         if high[1] - low[1] < LOWEST_LABELLED * height:
             break
         half = len(texts[owner]) * LETTER_WIDTH * width / 2
         middle = float(np.clip((low[0] + high[0]) / 2, half, width - half))
-        area = (middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1])
-        if not any(_overlap(area, other) for other in taken):
-            taken.append(area)
+        left, top, right, bottom = middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1]
+        if not any(left < other[2] and other[0] < right and top < other[3] and other[1] < bottom for other in taken):
+            taken.append((left, top, right, bottom))
             centers.append((middle, low[1] - LETTER_HEIGHT * height / 2))
             owners.append(owner)
     return np.array(centers).reshape(-1, 2), np.array(owners, dtype=np.int64)
-
-
-def _by_height(lines: ImageLines) -> list[tuple[int, Array, Array]]:
-    """Each box in the image with its bounding rectangle's corners (2,), (2,), the highest rectangle first."""
-    owners, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
-    low = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
-    high = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
-    around = list(zip(owners.tolist(), low, high, strict=True))
-    return sorted(around, key=lambda item: item[1][1] - item[2][1])
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 @dataclass(frozen=True)
