@@ -49,16 +49,11 @@ class ImageLines:
     owners: NDArray[np.int64]
 
 
-def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> ImageLines:
-    """The edges and the front diagonals of boxes in a camera's image, cut to the part inside the image.
-
-    camera_from_boxes: (4, 4) from the boxes' frame to the camera frame at the image's time.
-    """
-    return lines_in_images(boxes, [camera], [camera_from_boxes])[0]
-
-
 def lines_in_images(boxes: Boxes3D, cameras: Sequence[Camera], cameras_from_boxes: Sequence[Array]) -> list[ImageLines]:
-    """As `lines_in_image`, in the image of each of C cameras."""
+    """The edges and the front diagonals of boxes in the images of C cameras, cut to the parts inside the images.
+
+    cameras_from_boxes: (4, 4) each, from the boxes' frame to the camera frame at the image's time.
+    """
     corners = boxes.corners()
     of_cameras = np.stack([apply(camera_from_boxes, corners) for camera_from_boxes in cameras_from_boxes])
     camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1))
@@ -250,19 +245,19 @@ class CameraImages:
     def log(self, camera: str, image: CameraImage | None) -> None:
         """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
         if image is not None:
-            written = self._video_image(camera, image) if self._as_video else _encoded(image)
-            self._stream.log(entities.image(camera), written)
+            if not self._as_video:
+                self._stream.log(entities.image(camera), _encoded(image))
+                return
+            if camera not in self._encoders:
+                height, width = image.pixels_bgr.shape[:2]
+                self._encoders[camera] = Av1Encoder(width, height)
+            data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
+            sample = rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
+            self._stream.log(entities.image(camera), sample)
             return
         self._stream.log(entities.image(camera), rr.Clear(recursive=False))
         if camera in self._encoders:
             self._encoders.pop(camera).close()
-
-    def _video_image(self, camera: str, image: CameraImage) -> rr.VideoStream:
-        if camera not in self._encoders:
-            height, width = image.pixels_bgr.shape[:2]
-            self._encoders[camera] = Av1Encoder(width, height)
-        data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
-        return rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
 
     def close(self) -> None:
         """Ends all video streams."""
