@@ -35,6 +35,11 @@ _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+CSV_BYTES = 256 << 20
+NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
+UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
+LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
 
 class _YamlLoader(_SafeLoader):
@@ -197,13 +202,6 @@ def without_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-LARGEST_BYTES = 256 << 20
-NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
-UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
-LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
-_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
-
-
 def cell_of(name: str) -> str:
     """The cell of a name from outside, with an apostrophe in front of what would be a formula."""
     return f"'{name}" if _FORMULA.match(name) else name
@@ -268,7 +266,7 @@ def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = 
     Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
     has another number of cells than the header, or there are no rows.
     """
-    text = read_text(path, LARGEST_BYTES).removeprefix("\ufeff")
+    text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
     try:
         reader = csv.reader(io.StringIO(text, newline=""))
         lines = [(reader.line_num, cells) for cells in reader if cells]

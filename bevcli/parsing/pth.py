@@ -41,6 +41,30 @@ _CODES = {name: ord(getattr(pickle, name)) for name in _OPCODES}
 _PICKLE_DAMAGE = (
     pickle.UnpicklingError, EOFError, LookupError, AttributeError, TypeError, ValueError, OverflowError, struct.error
 )  # fmt: skip
+LARGEST_PICKLE = 32 << 20
+LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
+MOST_DIMENSIONS = 16
+MOST_ARGUMENTS = 16  # of a call that is read
+LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
+_OLD_FORMAT = 0x1950A86A20F9469CFC6C  # the first number in a file of the older format
+_DTYPES = {
+    "FloatStorage": torch.float32,
+    "DoubleStorage": torch.float64,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "ByteStorage": torch.uint8,
+    "BoolStorage": torch.bool,
+    "ComplexFloatStorage": torch.complex64,
+    "ComplexDoubleStorage": torch.complex128,
+}
+# Modules whose functions run programs or code. Nothing of a file is ever called, but such a file is an attack.
+_ATTACKS = frozenset(("os", "posix", "nt", "subprocess", "sys", "pty", "runpy", "importlib", "shutil", "socket"))
+_ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__import__", "open", "input"))
+_Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
 
 
 class PickleError(Exception):
@@ -162,34 +186,8 @@ def _is_plain(key: Any) -> bool:
     return isinstance(key, str | float | bytes | None)
 
 
-LARGEST_PICKLE = 32 << 20
-LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
-MOST_DIMENSIONS = 16
-MOST_ARGUMENTS = 16  # of a call that is read
-LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
 # The exceptions of Python's zip reader for a damaged archive, and of this package for a damaged pickle.
 _DAMAGE = (PickleError, zipfile.BadZipFile, RuntimeError, KeyError, ValueError, OSError, EOFError, struct.error)
-_OLD_FORMAT = 0x1950A86A20F9469CFC6C  # the first number in a file of the older format
-_DTYPES = {
-    "FloatStorage": torch.float32,
-    "DoubleStorage": torch.float64,
-    "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16,
-    "LongStorage": torch.int64,
-    "IntStorage": torch.int32,
-    "ShortStorage": torch.int16,
-    "CharStorage": torch.int8,
-    "ByteStorage": torch.uint8,
-    "BoolStorage": torch.bool,
-    "ComplexFloatStorage": torch.complex64,
-    "ComplexDoubleStorage": torch.complex128,
-}
-# Modules whose functions run programs or code. Nothing of a file is ever called, but such a file is an attack.
-_ATTACKS = frozenset(("os", "posix", "nt", "subprocess", "sys", "pty", "runpy", "importlib", "shutil", "socket"))
-_ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__import__", "open", "input"))
-
-
-_Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
 
 
 @dataclass(frozen=True, eq=False)

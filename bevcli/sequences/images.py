@@ -33,6 +33,14 @@ CONTAINERS = (
 )  # fmt: skip
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
+DECODING_THREADS = 6
+READING_TIMEOUT_S = 120.0
+LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
+# The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
+DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 class VideoReader:
@@ -112,16 +120,6 @@ def count_and_rate(path: Path) -> tuple[int, float]:
     if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
         raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
     return int(count), rate
-
-
-DECODING_THREADS = 6
-READING_TIMEOUT_S = 120.0
-LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
-# The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
-DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 @dataclass(frozen=True)

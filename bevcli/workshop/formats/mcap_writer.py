@@ -51,6 +51,12 @@ SHORT = {
     **{name: f"foxglove_msgs/{name}" for name in FOXGLOVE},
 }
 NAME, ARRAY, SEQUENCE = 2, 3, 4  # kinds of fields in rosbags
+Fields = dict[str, Any]  # of a message of ROS 2 or Foxglove
+WORLD, EGO, BEV = "map", "base_link", "bev"
+FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
+FONT_M = 0.6
+DELETE_ALL = 1  # SceneEntityDeletion.type
+LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # number of Brown-Conrady coefficients
 
 
 class Messages:
@@ -100,14 +106,6 @@ def _long(field: str) -> str:
 
 def _full(kind: str) -> str:
     return kind.replace("/", "/msg/")
-
-
-Fields = dict[str, Any]  # of a message of ROS 2 or Foxglove
-WORLD, EGO, BEV = "map", "base_link", "bev"
-FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
-FONT_M = 0.6
-DELETE_ALL = 1  # SceneEntityDeletion.type
-LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # number of Brown-Conrady coefficients
 
 
 class McapWriter:

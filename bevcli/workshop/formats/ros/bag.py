@@ -40,6 +40,17 @@ LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 MOST_INVALID = 1000  # messages of a topic before the first valid one
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 _Value = TypeVar("_Value")
+# Parts of a topic's name that do not name a camera.
+GENERIC = re.compile(
+    r"(image|img)?_?(raw|rect|rectified|color|colour|rgb|bgr|mono|compressed|image|img|video|h264|h265|stream|_)*"
+)
+# Parts of names of images that no camera took, or not in the visible spectrum.
+NOT_A_CAMERA = re.compile(
+    r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
+)
+RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
+PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
+GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
 
 
 @contextmanager
@@ -181,19 +192,6 @@ def spread(count: int, wanted: int) -> Indices[int]:
     """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
     indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)).tolist()
     return indices
-
-
-# Parts of a topic's name that do not name a camera.
-GENERIC = re.compile(
-    r"(image|img)?_?(raw|rect|rectified|color|colour|rgb|bgr|mono|compressed|image|img|video|h264|h265|stream|_)*"
-)
-# Parts of names of images that no camera took, or not in the visible spectrum.
-NOT_A_CAMERA = re.compile(
-    r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
-)
-RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
-PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
-GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
 
 
 @dataclass(frozen=True)
