@@ -59,7 +59,7 @@ docs: $(WRITER)
 	$(BIN)/sphinx-build --fail-on-warning --quiet -c docs/site -d build/doctrees -b html . build/site
 
 bench: $(DEVELOPER)
-	$(BIN)/bevcli bench --table docs/speed.md
+	$(BIN)/python docs/site/speed_table.py docs/speed.md
 
 gpu-check: $(DEVELOPER)
 	$(BIN)/python tests/benchmark/gpu_check.py --device $(or $(DEVICE),auto)

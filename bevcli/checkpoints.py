@@ -7,16 +7,17 @@ from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 
+import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
 
 from bevcli.config import known_models, load_config
-from bevcli.errors import WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
 from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
-from bevcli.parsing.pth import Placeholder, StoredTensor, read_pth, read_safetensors
+from bevcli.parsing.files import open_regular
 from bevcli.writing import check_output, write_whole
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
@@ -24,7 +25,6 @@ FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
 PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
 AVERAGES = r"ema_|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
-_TENSOR = (StoredTensor, type(None))
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,21 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)
 
 
+def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors by name, on the CPU, and the metadata.
+
+    error: kind of exception for a file that is missing, damaged or no regular file.
+    """
+    open_regular(path, error=error).close()  # the library would wait for the writer of a pipe
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, dict(file.metadata() or {})
+    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
+        reason = " ".join(str(failure).split())
+        raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None
+
+
 def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str, Tensor]:
     """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
     kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
@@ -180,10 +195,14 @@ def expected_state(config: ModelConfig) -> dict[str, Tensor]:
 
 
 def _read_pth(path: Path, left_out: list[str]) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
+    from bevcli.parsing.pth import Placeholder, StoredTensor, read_pth
+
     file = read_pth(path)
     contents = state = file.contents
     if isinstance(contents, dict):
-        wrapper = next((key for key in ("state_dict", "model") if not isinstance(contents.get(key), _TENSOR)), "")
+        wrapper = next(
+            (key for key in ("state_dict", "model") if not isinstance(contents.get(key), StoredTensor | None)), ""
+        )
         state = contents[wrapper] if wrapper else contents
         left_out += ['everything but "model"'] if wrapper == "model" else []
     named = state if isinstance(state, dict) else {"": state}

@@ -55,9 +55,9 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
-    meshes = {name: one.mesh and str(Path(file).parent / one.mesh) for name, one in config.class_settings.items()}
-    settings_from_here = {name: replace(one, mesh=meshes[name]) for name, one in config.class_settings.items()}
-    return replace(config, class_settings=settings_from_here)
+    classes, folder = config.class_settings.items(), Path(file).parent
+    from_here = {name: replace(item, mesh=item.mesh and str(folder / item.mesh)) for name, item in classes}
+    return replace(config, class_settings=from_here)
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
@@ -127,9 +127,7 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(kind)
     for key in table.keys() - fields.keys():
-        renamed: Mapping[str, str] = getattr(kind, "RENAMED_KEYS", {})
-        hint = renamed[key] if key in renamed else _nearest(key, list(fields))
-        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
     values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

@@ -99,12 +99,16 @@ class FrameResult:
             run, "classes" with the names among them) and `resume_at`. Its method `write(ground, result)` adds a frame;
             the result is None where the model was not run.
         takes_command: its names are commands of the driver, see `with_command`.
+        true_file: of its ground truth in a native sequence folder, which `writer` makes; "" without.
+        true_names: of its ground truth.
     """
 
     kind: ClassVar[str]
     file_name: ClassVar[str]
     writer: ClassVar[Callable[..., Any]]
     takes_command: ClassVar[bool] = False
+    true_file: ClassVar[str] = ""
+    true_names: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def legend(cls, names: tuple[str, ...]) -> dict[str, Color]:

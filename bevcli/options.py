@@ -45,9 +45,6 @@ class Option:
             a missing one before anything slow is imported.
         hidden: whether only Python has the option.
         is_argument: whether it is an argument of the command and no flag.
-        old: earlier spellings, which work for one more release, with a note; `--help` does not show them. "" for an
-            option that was an argument.
-        retired: what to use in place of an option that works for one more release, with this note; "" for others.
     """
 
     help: str
@@ -63,8 +60,6 @@ class Option:
     reads: Reads | None = None
     hidden: bool = False
     is_argument: bool = False
-    old: tuple[str, ...] = ()
-    retired: str = ""
 
 
 def option(

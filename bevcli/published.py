@@ -1,21 +1,31 @@
-"""The table of published weights: sources.toml of the package, extended by the user's own file."""
+"""Published weights by name: where each is published, and the file on this machine.
+
+The table of sources is sources.toml of the package, extended by the user's own file. Downloaded files lie in one
+folder, with the hashes that were computed at their first download.
+"""
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
 import msgspec
 
-from bevcli.errors import ConfigError
+from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
-from bevcli.parsing.files import read_text
-from bevcli.user_folders import user_folder
+from bevcli.parsing.files import MIB, read_bytes, read_text
+from bevcli.user_folders import user_cache, user_folder
+from bevcli.writing import write_whole
+
+FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
+HASHES = "hashes.json"
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
+DownloadReport = Callable[[int, int | None, str], None]  # bytes done, of how many or None, name and URL
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -57,10 +67,10 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
         Files of the Hugging Face Hub are served under stable addresses, by a mirror where HF_ENDPOINT names one.
         """
-        found = _HUB.fullmatch(self.source)
-        if found:
+        match = _HUB.fullmatch(self.source)
+        if match:
             hub = (os.environ.get("HF_ENDPOINT") or "https://huggingface.co").rstrip("/")
-            return f"{hub}/{found[1]}/resolve/{found[2] or 'main'}/{found[3]}"
+            return f"{hub}/{match[1]}/resolve/{match[2] or 'main'}/{match[3]}"
         return self.source if "://" in self.source else ""
 
     @property
@@ -74,6 +84,74 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return Path(os.path.expanduser(self.source)) if self.source and not self.url else None
 
 
+class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file as it was at its first download: its SHA-256, hexadecimal, and its size."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class NamedWeights:
+    """A name of the table of sources, on this machine.
+
+    Attributes:
+        name: such as "tiny".
+        source: where it is published.
+        folder: the folder of all downloaded weights.
+    """
+
+    name: str
+    source: Source
+    folder: Path
+
+    @property
+    def model(self) -> str:
+        """Name or TOML file of the model that the weights fit."""
+        return self.source.model or self.name
+
+    @property
+    def file(self) -> Path | None:
+        """The file, which may not be there yet; None where there is no source."""
+        if self.source.path is not None:
+            return self.source.path
+        return self.folder / self.name / self.source.file_name if self.source.url else None
+
+    @property
+    def here(self) -> Path | None:
+        """The file if it is on this machine, and whole if it was downloaded."""
+        file = self.file
+        if file is None or not file.is_file():
+            return None
+        whole = self.source.path is not None or self.known is None or file.stat().st_size == self.known.bytes
+        return file if whole else None
+
+    @property
+    def known(self) -> Known | None:
+        """The file as it was at the first download from its source; None before. Raises WeightsError."""
+        return _read_hashes(self.folder).get(self.source.source)
+
+    @property
+    def size(self) -> int | None:
+        """Bytes of the file; None if it is not known."""
+        here = self.here
+        return self.source.bytes if here is None else here.stat().st_size
+
+    @property
+    def by_hand(self) -> str:
+        """How to get weights that have no source, for messages."""
+        return (
+            f"can only be downloaded by hand, from {self.source.page or 'its publisher'}: run the model with "
+            f"`weights=FILE`, or state the file as `source` of [{self.name}] in {own_table()}"
+        )
+
+    def store_hash(self, known: Known) -> None:
+        """Store the hash of a file that was downloaded. Raises OutputError."""
+        hashes = {**_read_hashes(self.folder), self.source.source: known}
+        content = msgspec.json.format(msgspec.json.encode(hashes), indent=1)
+        write_whole(self.folder / HASHES, content + b"\n", parents=True, shared=True)
+
+
 def own_table() -> Path:
     """The file in which a user adds sources, $XDG_CONFIG_HOME/bevcli/weights.toml (default ~/.config)."""
     return user_folder("XDG_CONFIG_HOME", ".config") / "weights.toml"
@@ -82,20 +160,49 @@ def own_table() -> Path:
 def read_sources() -> dict[str, Source]:
     """All sources by name; those of the user's own file replace those of the package. Raises ConfigError."""
     text = resources.files("bevcli").joinpath("weights", "sources.toml").read_text(encoding="utf-8")
-    found = _parse(text, "sources.toml")
+    sources = _parse(text, "sources.toml")
     own = own_table()
     if own.is_file():
-        found |= _parse(read_text(own, TOML_BYTES, error=ConfigError), str(own))
-    return found
+        sources |= _parse(read_text(own, TOML_BYTES, error=ConfigError), str(own))
+    return sources
+
+
+def weights_folder(chosen: Path | None = None) -> Path:
+    """The folder of downloaded weights: the chosen one, $BEVCLI_WEIGHTS_DIR, or ~/.cache/bevcli/weights."""
+    named = os.environ.get(FOLDER_VARIABLE)
+    return chosen or (Path(named) if named else user_cache() / "weights")
+
+
+def all_weights(folder: Path | None = None) -> dict[str, NamedWeights]:
+    """Every name of the table of sources. folder: of `weights_folder`. Raises ConfigError."""
+    return {name: NamedWeights(name, source, weights_folder(folder)) for name, source in read_sources().items()}
+
+
+def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
+    """A name of the table of sources. Raises WeightsError for another one."""
+    known = all_weights(folder)
+    if name not in known:
+        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(known)})')
+    return known[name]
 
 
 def _parse(text: str, file: str) -> dict[str, Source]:
-    found = {}
+    sources = {}
     for name, table in parse_toml(text, file, ConfigError).items():
         if not _NAME.fullmatch(name):
             raise ConfigError(f"{file}: [{name:.60}]: expected a name of letters, digits and - . + _")
         try:
-            found[name] = msgspec.convert(table, Source)
+            sources[name] = msgspec.convert(table, Source)
         except msgspec.ValidationError as error:
             raise ConfigError(f"{file}: [{name}]: {error}") from None
-    return found
+    return sources
+
+
+def _read_hashes(folder: Path) -> dict[str, Known]:
+    path = folder / HASHES
+    if not path.exists():
+        return {}
+    try:
+        return msgspec.json.decode(read_bytes(path, MIB, error=WeightsError), type=dict[str, Known])
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise WeightsError(f"{path}: broken ({error}): remove it, and the hashes are computed anew") from None

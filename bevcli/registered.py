@@ -9,13 +9,17 @@ from typing import Literal
 Group = Literal[
     "bevcli.models",
     "bevcli.results",
+    "bevcli.model_uses",
     "bevcli.sequences",
     "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
+    "bevcli.scores",
+    "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",
+    "bevcli.extensions",
 ]
 
 # Group -> name -> "module:attribute".
@@ -25,6 +29,11 @@ OWN: dict[Group, dict[str, str]] = {
         "BEVFormerV2": "bevcli.model.bevformer_v2.bevformer_v2:BEVFormerV2",
     },
     "bevcli.results": {},
+    # What others need to know of a model, by its class or a base class: see `bevcli.registry.for_model`.
+    "bevcli.model_uses": {
+        "constant_parts BEVFormer": "bevcli.model.prepare:fix_first_attention",
+        "constant_parts BEVFormerV2": "bevcli.model.bevformer_v2.constant_parts:fix_attentions",
+    },
     "bevcli.sequences": {
         "native": "bevcli.sequences.native.format:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes.format:FORMAT",

@@ -7,11 +7,11 @@ from source_code import ROOT, trees
 # Calls that wait without a limit, by file.
 ALLOWED = {
     (
-        "workshop/batch/drives.py",
+        "workshop/batch/job.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "workshop/batch/find_like.py",
+        "workshop/batch/report.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (

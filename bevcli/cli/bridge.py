@@ -1,15 +1,15 @@
 """Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
 
-import ast
 import dataclasses
 import difflib
 import glob
 import os
 import re
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, dataclass
+from functools import partial
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -20,8 +20,11 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults, option_of
 from bevcli.printing import one_line, say
+from bevcli.registered import Group
+from bevcli.registry import entries, load
 from bevcli.sequences.format import option_classes
 
+EXTENSIONS: Group = "bevcli.extensions"
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _OTHER_ARGUMENT = re.compile(r"`([a-z]\w*)=\"?([^`\"]*)\"?`")
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
@@ -53,13 +56,39 @@ class Part:
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
+        classes: makes the list of the dataclasses whose options are in `FormatValues`.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    classes: Callable[[], list[type[Any]]] = option_classes
 
     def __contains__(self, name: str) -> bool:
         return name not in self.without and (not self.only or name in self.only)
+
+
+@dataclass(frozen=True)
+class Extension:
+    """Options and a step that a package adds to a command: the entry COMMAND.NAME of the group "bevcli.extensions".
+
+    Attributes:
+        options: the dataclass of the options.
+        apply: called with the options, and an argument of the command. That of `run` is the drive, and it returns the
+            drive to use. That of `project-debug` is a function that opens the drive, and it returns findings.
+    """
+
+    options: type[Any]
+    apply: Callable[[Any, Any], Any]
+
+
+Steps = tuple[Callable[[Any], Any], ...]  # a parameter with the steps of all extensions of a command
+
+
+@dataclass(frozen=True)
+class ExtensionsOf:
+    """The command whose extensions a parameter gets, in an annotation: `Annotated[Steps, ExtensionsOf("run")]`."""
+
+    command: str
 
 
 @dataclass(frozen=True)
@@ -72,7 +101,6 @@ class _Flag:
         kind: type of the value.
         default: `Parameter.empty` if it is required.
         panel: heading in `--help`.
-        replaced_by: the option of which this is an earlier form; None for a present one.
     """
 
     name: str
@@ -80,7 +108,6 @@ class _Flag:
     kind: Any
     default: Any
     panel: str | None
-    replaced_by: "_Flag | None" = None
 
     @property
     def spellings(self) -> list[str]:
@@ -93,13 +120,6 @@ class _Flag:
         """Spelling without that of the opposite."""
         return self.spellings[0].partition("/")[0]
 
-    @property
-    def earlier(self) -> Iterator["_Flag"]:
-        """The earlier forms of the option, each with a parameter of its own."""
-        for text in self.option.old:
-            form = replace(self.option, flag=text, is_argument=not text, old=())
-            yield replace(self, name=f"{self.name}_{text.strip('-').replace('-', '_')}", option=form, replaced_by=self)
-
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
         stated, kind, default = self.option, _plain(self.kind), self.default
@@ -110,12 +130,9 @@ class _Flag:
             kind = types.GenericAlias(list, (kind,)) if stated.repeatable else kind
             if default is not Parameter.empty:
                 kind, default = kind | None, None
-        if self.replaced_by is not None:
-            kind, default = (bool, False) if kind is bool else (kind | None, None)
         settings: dict[str, Any] = {
             "help": _with_flags(stated.help, flags),
             "metavar": stated.metavar or self._metavar(kind),
-            "hidden": bool(stated.retired or self.replaced_by),
         }
         if stated.is_argument:
             info = typer.Argument(**settings)
@@ -134,8 +151,6 @@ class _Flag:
 
     def value(self, given: Any) -> Any:
         """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
-        if self.option.retired and given != self.default:
-            print_note(f"{self.yes} ends with this release: {self.option.retired}")
         if self.option.flag_value is not None:
             return self.option.flag_value if given else MISSING
         if self.option.parse is None and not self.option.repeatable:
@@ -146,18 +161,6 @@ class _Flag:
             return tuple(given) if self.option.parse is None else self.option.parse(given)
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint=self.yes) from None
-
-    def move(self, given: dict[str, Any], defaults: Mapping[str, Any]) -> None:
-        """Give the value of an earlier form to the option, with a note. Raises click's usage error."""
-        value, now, spelling = given.pop(self.name), self.replaced_by, self.option.flag
-        assert now is not None
-        if value in (None, [], ()) or value is False:
-            return
-        if given[now.name] != defaults[now.name]:
-            raise typer.BadParameter(f"is given twice, also as {spelling or value}", param_hint=now.yes)
-        new = now.yes if spelling else f"{now.yes} {value}"
-        print_note(f"{spelling or f'the argument {value}'} is now {new}; the old form ends with this release")
-        given[now.name] = value
 
 
 _flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
@@ -183,13 +186,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         flags |= found
         parts += found.values()
     stated = [part for part in parts if isinstance(part, _Flag)]
-    inputs, old = [flag for flag in stated if flag.option.reads], [form for flag in stated for form in flag.earlier]
+    inputs = [flag for flag in stated if flag.option.reads]
 
     def called(**given: Any) -> None:
         before = _flags.set(flags)
         try:
-            for earlier in old:
-                earlier.move(given, known)
             read = [(given[flag.name], flag) for flag in inputs]
             for parameter, (make, found) in makers.items():
                 values = {name: flag.value(given.pop(name)) for name, flag in found.items()}
@@ -204,8 +205,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             _flags.reset(before)
 
     called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
-    made = [part.parameter(flags) if isinstance(part, _Flag) else part for part in (*parts, *old)]
-    known = {each.name: each.default for each in made}
+    made = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
     called.__signature__ = Signature(made)  # type: ignore[attr-defined]
     return called
 
@@ -282,19 +282,16 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
     """The flag with a value that a text of the library states as Python."""
     if value is None:
         return flag.yes
-    try:
-        literal = ast.literal_eval(value)
-    except (ValueError, SyntaxError):
-        literal = value
-    if literal is False:
+    if value == "False":
         return flag.spellings[0].partition("/")[2] or f"no {flag.yes}"
     if flag.kind is bool or flag.option.flag_value is not None:
         return flag.yes
-    if isinstance(literal, dict):
-        return " ".join(f"{flag.yes} {key}={each}" for key, each in literal.items())
-    if isinstance(literal, tuple | list):
-        literal = ",".join(map(str, literal))
-    return f"{flag.yes} {literal}"
+    if value.startswith("{"):
+        value = re.sub("[{}'\"]", "", value).replace(": ", "=")
+    elif value.startswith("("):
+        value = value.strip("()").replace(", ", ",")
+    quoted = re.fullmatch(r"([\"'])(.*)\1", value)
+    return f"{flag.yes} {quoted[2] if quoted else value}"
 
 
 def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
@@ -302,11 +299,17 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     marks = getattr(hint, "__metadata__", ())
     hint = get_args(hint)[0] if marks else hint
     part = next((each for each in marks if isinstance(each, Part)), Part())
-    own = hint == FormatValues
-    if not own and not dataclasses.is_dataclass(hint):
+    extended = next((each.command for each in marks if isinstance(each, ExtensionsOf)), None)
+    make: Callable[..., Any] = hint
+    classes: list[type[Any]] = [hint]
+    if extended is not None:
+        extensions = [load(EXTENSIONS, name) for name in entries(EXTENSIONS) if name.startswith(f"{extended}.")]
+        make, classes = partial(_steps, extensions), [each.options for each in extensions]
+    elif hint == FormatValues:
+        make, classes = dict, part.classes()
+    elif not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
-    classes: Iterable[type[Any]] = option_classes() if own else [hint]
     for kind in classes:
         kinds, known = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
@@ -315,7 +318,17 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
                 default = known.get(name, Parameter.empty)
                 found.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
     assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
-    return (dict if own else hint), found
+    return make, found
+
+
+def _steps(extensions: list[Extension], **values: Any) -> Steps:
+    """The steps of extensions with their options. values: of all options, by name."""
+    steps = []
+    for each in extensions:
+        names = {field.name for field in dataclasses.fields(each.options)}
+        options = each.options(**{name: value for name, value in values.items() if name in names})
+        steps.append(partial(each.apply, options))
+    return tuple(steps)
 
 
 def _plain(hint: Any) -> Any:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from bevcli.frame import Sequence
     from bevcli.inference.load import Model
-    from bevcli.weights.cache import NamedWeights
+    from bevcli.published import DownloadReport, NamedWeights
     from bevcli.weights.fetch import FetchedWeights
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
@@ -93,9 +93,9 @@ class Progress:
         """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
         if self.done == self.skipped:
             return f"{self.done}/{self.total} {self.unit}"
-        each = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
-        pace = f"{1 / each:.2f} per second" if each <= SLOW_S else f"{each:.1f} s each"
-        left = f"{duration((self.total - self.done) * each)} left"
+        unit_s = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
+        pace = f"{1 / unit_s:.2f} per second" if unit_s <= SLOW_S else f"{unit_s:.1f} s each"
+        left = f"{duration((self.total - self.done) * unit_s)} left"
         return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, left, self.detail)))
 
     def _line_is_due(self, count: int) -> bool:
@@ -143,42 +143,47 @@ def engine_bar() -> Iterator[Callable[[int, int, str], None]]:
 
 
 def in_engine_with_bar(model: "Model", drive: "Sequence", parts: str = "") -> "Model":
-    """The model in the engine that the options choose, see `in_engine`."""
-    from bevcli.workshop.engines.in_engine import in_engine
-
+    """The model in the engine that the options choose, see `Model.in_engine`."""
     with engine_bar() as show:
-        return in_engine(model, drive.rig, drive, parts=parts, report=show)
+        return model.in_engine(drive.rig, drive, parts=parts, report=show)
 
 
-def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
-    """The file of weights, downloaded if it is not there. Ctrl-C ends the command; what has come is kept."""
-    from bevcli.weights.fetch import fetch_weights
+@contextmanager
+def download_bar() -> "Iterator[DownloadReport]":
+    """Shows a download: the bytes that are there, of how many or None, and what is downloaded.
 
+    The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
+    """
     bar: Progress | None = None
 
-    def show(done: int, total: int | None) -> None:
-        """The bar starts when the size is known; total is None if the server does not state it."""
+    def show(done: int, total: int | None, what: str) -> None:
         nonlocal bar
         if bar is None:
-            note = f"{weights.name}: {weights.source.url}"
-            bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [note]))
+            bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [what]))
             bar.skip(done // MB)
         bar.reach(done // MB)
 
     with ExitStack() as shown:
         try:
-            return fetch_weights(weights, show, force=force)
+            yield show
         except KeyboardInterrupt:
+            if bar is None:
+                raise
             say("stopped; the same command goes on from here", err=True)
             raise typer.Exit(STOPPED) from None
 
 
-def fetch_if_asked(options: ModelOptions) -> None:
-    """Download the weights of a model, where `fetch` asks for it and they are not there."""
-    if not options.fetch or options.weights is not None or options.untrained:
-        return
-    from bevcli.weights.cache import all_weights
+def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
+    """The file of weights, downloaded if it is not there."""
+    from bevcli.weights.fetch import fetch_weights
 
-    named = all_weights(options.weights_dir).get(str(options.model))
-    if named is not None and named.here is None:
-        fetch_with_bar(named)
+    with download_bar() as show:
+        return fetch_weights(weights, show, force=force)
+
+
+def load_with_bar(options: ModelOptions) -> "Model":
+    """The model of the options, whose weights are downloaded where `fetch` asks for it and they are not there."""
+    from bevcli.inference.load import load_model
+
+    with download_bar() as show:
+        return load_model(options=options, report=show)

@@ -2,18 +2,16 @@
 
 import textwrap
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags
+from bevcli.cli.bridge import ExtensionsOf, FormatValues, Json, Part, Steps, argument, as_flags
 from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.options import SequenceOptions
-
-if TYPE_CHECKING:
-    from bevcli.rig.check_calibration import CalibrationCheck
 
 PANEL = "Look"
 ERRORS_FOUND = 3
@@ -24,6 +22,7 @@ def project_debug(
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
     format_options: Annotated[FormatValues, Part(only=("topics", "topics_file"))],
     options: CheckOptions,
+    further: Annotated[Steps, ExtensionsOf("project-debug")],
     as_json: Json = False,
 ) -> None:
     """Find mistakes in a calibration.
@@ -38,14 +37,18 @@ def project_debug(
     from bevcli.config import load_config
     from bevcli.inference.training_rigs import rig_notes
     from bevcli.rig.check_calibration import check_calibration
-    from bevcli.rig.rig_report import INDENT, WIDTH
+    from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
+    from bevcli.sequences.open import open_sequence
 
     given = {name: value for name, value in format_options.items() if value}
     check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
-    if options.motion and not check.errors:
+    if not check.errors:
         if options.sequence is not None:
             given["calibration"] = calibration
-        check = _with_motion(check, options.sequence or calibration, source.allow_outside, given)
+        how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
+        open_drive = partial(open_sequence, options.sequence or calibration, **how)
+        findings = [finding for step in further for finding in step(open_drive)]
+        check = replace(check, report=with_findings(check.report, findings))
     written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")
     if as_json:
         say(check.to_json())
@@ -57,19 +60,3 @@ def project_debug(
         say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
-
-
-def _with_motion(
-    check: "CalibrationCheck", path: Path, allow_outside: bool, given: dict[str, Any]
-) -> "CalibrationCheck":
-    """The check with the findings of a calibration from motion, where `path` is a drive with ego-motion."""
-    from bevcli.errors import InputError
-    from bevcli.rig.rig_report import with_findings
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.calibration.calibrate import motion_findings
-
-    try:
-        drive = open_sequence(path, ground_truth=False, allow_outside=allow_outside, **given)
-    except InputError:  # a calibration alone, or a drive without ego-motion: the check has said so
-        return check
-    return replace(check, report=with_findings(check.report, motion_findings(drive)))

@@ -4,17 +4,16 @@ import gc
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, InputDrive, as_flags
+from bevcli.cli.bridge import ExtensionsOf, FormatValues, InputDrive, Steps, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.calibration.options import CalibrateFirstOptions
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
@@ -29,7 +28,7 @@ def run(
     run_options: RunOptions,
     recording: RecordingOptions,
     source: SequenceOptions,
-    first: CalibrateFirstOptions,
+    first: Annotated[Steps, ExtensionsOf("run")],
     output: OutputOptions,
     format_options: FormatValues,
 ) -> None:
@@ -44,21 +43,19 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
+        from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
         from bevcli.cli.stop_signals import StopSignals
-        from bevcli.inference.load import load_model
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.runs.run_into_folder import run_into_folder
         from bevcli.sequences.open import open_sequence
 
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
-    fetch_if_asked(model)
-    loaded = load_model(options=model)
+    loaded = load_with_bar(model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = open_sequence(sequence, reading, **format_options)
-    if first.calibrate:
-        drive = _calibrated(drive)
+    for step in first:
+        drive = step(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
     loaded = in_engine_with_bar(loaded, drive, "`probes`" if recording.probes else "")
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
@@ -92,21 +89,6 @@ def run(
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)
     say(f"next     bevcli viz {shlex.quote(str(out))}")
-
-
-def _calibrated(drive: "Sequence") -> "Sequence":
-    """The drive with the rig that it shows; what is corrected is printed."""
-    from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration.calibrate import STEPS, calibrate
-    from bevcli.workshop.calibration.estimates import change_text
-    from bevcli.workshop.calibration.result import CorrectedDrive
-
-    with Progress(STEPS, "steps of the calibration") as progress:
-        result = calibrate(drive, after_step=progress.advance)
-    for each in result.cameras:
-        reason = change_text(each) if each in result.corrected else each.reason
-        say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return CorrectedDrive(drive, result)
 
 
 def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:

@@ -29,7 +29,7 @@ def viz(
     with open_recording(recording) as file:
         if file != recording:
             say(f"note: {recording} is incomplete (its run was stopped or is still going)")
-        if options.summary or options.screenshot or options.video or options.export:
+        if options.summary or options.screenshot or options.video:
             _write(recording, file, options)
         else:
             _open(file, options)
@@ -39,7 +39,7 @@ def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
     """Write what the options name. read_from: the recording, or a repaired copy of it."""
     from bevcli.cli.progress import Progress
     from bevcli.viewer.native import take_screenshot
-    from bevcli.viewer.recording_reader import export_boxes, summarise
+    from bevcli.viewer.recording_reader import summarise
     from bevcli.viewer.video import frame_rate, write_video
 
     if options.summary:
@@ -52,9 +52,6 @@ def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
         with Progress(count, "frames") as progress:
             write_video(read_from, options.video, count, rate, progress.advance)
         say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
-    if options.export is not None:
-        frames, boxes = export_boxes(read_from, options.export)
-        say(f"{options.export}: {counted(boxes, 'boxes')} in {counted(frames, 'frames')}")
 
 
 def _open(recording: Path, options: ViewOptions) -> None:

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bevcli.cli.bridge import Json, Part, argument, command, model_option
-from bevcli.cli.help_text import PlainCommand
+from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, say
-from bevcli.workshop.engines.options import FileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
-    from bevcli.weights.cache import NamedWeights
+    from bevcli.published import NamedWeights
 
 PANEL = "Train"
 weights_app = typer.Typer(
@@ -36,14 +35,13 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     Each has the scores that are published for it (nuScenes validation split, in per cent), its size, its licence, and
     where it lies on this machine or is published. Connects to no other machine.
     """
-    from bevcli.published import own_table
-    from bevcli.weights.cache import all_weights
+    from bevcli.published import all_weights, own_table
 
-    found = list(all_weights(options.weights_dir).values())
+    weights = list(all_weights(options.weights_dir).values())
     if as_json:
-        say(json.dumps([_named_as_data(each) for each in found], indent=1))
+        say(json.dumps([_named_as_data(item) for item in weights], indent=1))
         return
-    say(_named_as_text(found))
+    say(_named_as_text(weights))
     say(f"\nthe weights of demo are in the package; your own names go into {own_table()}")
 
 
@@ -60,13 +58,13 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.weights.cache import named_weights
+    from bevcli.published import named_weights
 
-    found = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
+    fetched = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
     rows = [
-        ("weights", f"{found.path} ({found.known.bytes:,} bytes)"),
-        ("sha256", found.known.sha256),
-        ("checked", f"keys, shapes and size; of the hash: {found.checked}"),
+        ("weights", f"{fetched.path} ({fetched.known.bytes:,} bytes)"),
+        ("sha256", fetched.known.sha256),
+        ("checked", f"keys, shapes and size; of the hash: {fetched.checked}"),
         ("next", f"bevcli run SEQUENCE --model {name}"),
     ]
     say("\n".join(f"{title:<8} {text}" for title, text in rows))
@@ -119,15 +117,17 @@ def inspect(
 def convert(
     source: Annotated[Path, argument("An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, argument("The .safetensors to write.", reads=None)],
-    options: Annotated[FileOptions, Part(only=("force",))],
+    force: Annotated[bool, Option("Overwrite the file if it exists.")] = False,
 ) -> None:
     """Write SOURCE as .safetensors with our key names.
 
     It must fit one of our models.
     """
     from bevcli.checkpoints import convert as convert_file
+    from bevcli.writing import check_new
 
-    say(_as_text(convert_file(source, options.target(destination))))
+    check_new(destination, force=force)
+    say(_as_text(convert_file(source, destination)))
 
 
 def _named_as_data(weights: "NamedWeights") -> dict[str, object]:
@@ -144,14 +144,14 @@ def _named_as_data(weights: "NamedWeights") -> dict[str, object]:
     }
 
 
-def _named_as_text(found: "list[NamedWeights]") -> str:
+def _named_as_text(listed: "list[NamedWeights]") -> str:
     rows = [("name", "model", "published", "size", "licence", "file or source")]
-    for each in found:
-        scores = ", ".join(f"{name} {100 * value:.1f}" for name, value in list(each.source.published.items())[:2])
-        size = "unknown" if each.size is None else f"{each.size / 1e6:.1f} MB"
-        source = each.source.url or each.source.source or f"by hand: {each.source.page}"
-        place = source if each.here is None else f"here: {each.here}"
-        rows.append((each.name, each.model, scores, size, each.source.licence, place))
+    for weights in listed:
+        scores = ", ".join(f"{name} {100 * value:.1f}" for name, value in list(weights.source.published.items())[:2])
+        size = "unknown" if weights.size is None else f"{weights.size / 1e6:.1f} MB"
+        source = weights.source.url or weights.source.source or f"by hand: {weights.source.page}"
+        where = source if weights.here is None else f"here: {weights.here}"
+        rows.append((weights.name, weights.model, scores, size, weights.source.licence, where))
     return aligned(rows, left=range(6))
 
 

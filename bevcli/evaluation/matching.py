@@ -117,10 +117,10 @@ def match_class(
     """Match the boxes of one class that are inside the range of the class."""
     limit = config.class_ranges_m[name]
     truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
-    found = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
-    found = found[descending_scores(found.column("scores"))]
-    matched = match_greedily(truth, found, config.distances_m)
-    return ClassMatches(name, truth, found, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
+    predicted = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
+    predicted = predicted[descending_scores(predicted.column("scores"))]
+    matched = match_greedily(truth, predicted, config.distances_m)
+    return ClassMatches(name, truth, predicted, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
 
 
 def descending_scores(scores: Array) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 import math
 from contextlib import ExitStack
 from dataclasses import dataclass
+from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from bevcli.frame import AttentionView, CameraSamples, Probe
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.inference.preprocess import resize_shift
 from bevcli.model.config import ModelConfig
-from bevcli.model.encoder import EncoderLayer
+from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
@@ -72,10 +73,10 @@ class AttentionProbe:
             (self._layer, self._see_layer),
         ):
             self._hooks.enter_context(module.register_forward_hook(see))
-        # Without the fast way, which computes no sampling locations.
-        for attention in (temporal.attention, spatial.attention):
-            self._hooks.callback(setattr, attention, "sample_hits", attention.sample_hits)
-            attention.sample_hits = None
+        # As in the plain model: faster classes compute no sampling locations.
+        for part, kind in ((temporal, TemporalSelfAttention), (spatial, SpatialCrossAttention)):
+            vars(part)["sample"] = MethodType(vars(kind)["sample"], part)
+            self._hooks.callback(vars(part).pop, "sample")
         return self
 
     def __exit__(self, *_error: object) -> None:

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from bevcli.waiting import result_within
 
@@ -51,42 +51,47 @@ def read_ahead(
                 threaded.shutdown(wait=False, cancel_futures=True)
 
 
-def write_behind(work: Callable[[S], bool], items: Iterable[S], depth: int = QUEUE) -> None:
-    """Calls work(item) for every item, in order, in a background thread, until it returns False.
+class WriteBehind(Generic[S]):
+    """`with WriteBehind(work) as writer: writer.put(item)`: work(item) of every item, in order, in a background thread.
 
-    Meanwhile the next items are made, until `depth` of them wait. If making an item fails or is interrupted, those
-    before it are worked on first. After an exception in `work`, which is raised here, nothing more is done. Raises
-    WaitError if an item takes more than WRITING_TIMEOUT_S.
+    Nothing more is done once `work` has returned False or raised. `put` or the end of the block raises its exception.
+    The end of the block waits for all items, also after an error in the block.
+    Raises WaitError if an item takes more than WRITING_TIMEOUT_S.
     """
-    goes_on = True
-    pending: deque[Future[None]] = deque()
-    pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
 
-    def write(item: S) -> None:
-        nonlocal goes_on
+    def __init__(self, work: Callable[[S], bool], depth: int = QUEUE) -> None:
+        """depth: items that may wait, beside the one that is worked on."""
+        self._work, self._depth, self._goes_on = work, depth, True
+        self._pending: deque[Future[None]] = deque()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def put(self, item: S) -> bool:
+        """Add an item, and wait while too many of them are pending. False once `work` has returned False."""
+        self._pending.append(self._pool.submit(self._write, item))
+        self._finish(1 + self._depth)
+        return self._goes_on
+
+    def __exit__(self, *_error: object) -> None:
         try:
-            goes_on = goes_on and work(item)
+            self._finish(0)
+        finally:
+            for task in self._pending:
+                task.cancel()
+            wait(self._pending, WRITING_TIMEOUT_S)
+            self._pool.shutdown(wait=False)
+
+    def _write(self, item: S) -> None:
+        try:
+            self._goes_on = self._goes_on and self._work(item)
         except BaseException:
-            goes_on = False
+            self._goes_on = False
             raise
 
-    def finish(allowed: int) -> None:
-        """Wait until only so many items are unfinished; an exception of another one is raised."""
-        while pending and (len(pending) > allowed or pending[0].done()):
-            result_within(pending[0], WRITING_TIMEOUT_S, "writing a frame")
-            pending.popleft()
-
-    try:
-        try:
-            for item in items:
-                pending.append(pool.submit(write, item))
-                finish(1 + depth)
-                if not goes_on:
-                    break
-        finally:
-            finish(0)
-    finally:
-        for task in pending:
-            task.cancel()
-        wait(pending, WRITING_TIMEOUT_S)
-        pool.shutdown(wait=False)
+    def _finish(self, allowed: int) -> None:
+        """Wait until at most `allowed` items are pending. An exception of a finished item is raised."""
+        while self._pending and (len(self._pending) > allowed or self._pending[0].done()):
+            result_within(self._pending[0], WRITING_TIMEOUT_S, "writing a frame")
+            self._pending.popleft()

@@ -4,7 +4,8 @@ import copy
 import hashlib
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +15,11 @@ import torch
 from torch import Tensor
 
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
-from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
+from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
 from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
-from bevcli.inference.options import AUTO, TORCH, ModelOptions
+from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
@@ -26,14 +28,16 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.weights.cache import NamedWeights, all_weights, weights_folder
-from bevcli.weights.fetch import by_hand, fetch_weights
-from bevcli.workshop.engines.engine_choice import EngineChoice, engine_choice
-from bevcli.workshop.engines.exported import SUFFIX, load_exported
+from bevcli.published import DownloadReport, all_weights, named_weights, weights_folder
+from bevcli.registry import entries, load
 
 DEFAULT_MODEL = "demo"
-DEFAULT_ENGINE = "onnxruntime"  # of an exported file
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
+Report = Callable[[int, int, str], None]  # steps done, steps in all, what is done
+
+
+def _no_report(done: int, total: int | None, what: str) -> None:
+    pass
 
 
 @dataclass(frozen=True)
@@ -43,16 +47,16 @@ class Model:
     Attributes:
         network: the plain model, as in its paper, on the CPU; or an exported file.
         device: where it runs.
-        precision: of the image features; the rest of the network computes in float32. Only exported files have "int8".
+        precision: of the image features; the rest of the network computes in float32. Only other engines have "int8".
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
-        engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
+        engine: the program that computes it: "torch", or the name of another engine, such as "openvino".
         facts: metadata in the weights file.
-        file: the exported file; None for PyTorch.
-        choice: another engine than PyTorch that it is to run in: `in_engine` makes the file when the rig is known.
+        file: the exported file that another engine runs; None for PyTorch, and before `in_engine` has made it.
+        calibrate_with: drive whose first frames calibrate INT8; None for the drive that is run.
         engine_note: the differences of that file from PyTorch; "" for other models.
     """
 
@@ -64,10 +68,10 @@ class Model:
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
-    engine: str = "torch"
+    engine: str = TORCH
     facts: Mapping[str, str] = field(default_factory=dict)
     file: Path | None = None
-    choice: EngineChoice | None = None
+    calibrate_with: Path | None = None
     engine_note: str = ""
 
     @property
@@ -88,14 +92,18 @@ class Model:
     @property
     def is_exported(self) -> bool:
         """The network is an exported file, whose parts cannot be observed, trained or exported again."""
-        return self.engine != "torch"
+        return self.file is not None
+
+    @property
+    def needs_export(self) -> bool:
+        """The model is to run in another engine, and `in_engine` has not made its file yet."""
+        return self.engine != TORCH and not self.is_exported
 
     def require_parts(self, what: str) -> None:
-        """Raises BevcliError for an exported file. what: needs the network's parts, such as "`probes`"."""
-        if self.choice is not None and self.choice.engine != AUTO:
-            raise BevcliError(f"{what}: not available in {self.choice.engine}: use `engine=torch`")
-        if self.choice is not None and self.choice.precision == "int8":
-            raise BevcliError(f"{what}: not available in INT8, which PyTorch does not have: leave out `precision=int8`")
+        """Raises BevcliError for another engine than PyTorch. what: needs the network's parts, such as "`probes`"."""
+        if self.needs_export:
+            given = "`precision=int8`" if self.precision == "int8" else f"`engine={self.engine}`"
+            raise BevcliError(f"{what}: not available in {self.engine}, but in PyTorch: leave out {given}")
         if self.is_exported:
             raise BevcliError(f"{what}: not available for {self.file}, an exported file: use {self.name} by its name")
 
@@ -125,14 +133,40 @@ class Model:
         """SHA-256 of names, types, shapes and values of all weights."""
         return hash_of(self.network.state_dict().items())
 
+    def in_engine(
+        self, rig: CameraRig, drive: Sequence | None = None, *, parts: str = "", report: Report = _no_report
+    ) -> "Model":
+        """The model in the engine that it was loaded for; one in PyTorch or an exported one is returned as it is.
+
+        The first call exports the model for the number of cameras and the image size of the rig, calibrates INT8 on the
+        first frames of a drive, and compares the boxes with those in PyTorch. The file is kept in the user's cache.
+
+        Args:
+            rig: that it is to run on.
+            drive: whose first frames are used; None where there are no frames yet.
+            parts: what looks into the network, such as "`probes`", which only PyTorch has.
+            report: called before the first step of the work, and after each.
+
+        Raises:
+            BevcliError: `parts` are asked for in another engine, or the engine is not installed.
+            InputError: there are no frames to calibrate with, or a frame cannot be read.
+            OutputError: the cache cannot be written.
+        """
+        if parts:
+            self.require_parts(parts)
+        if not self.needs_export:
+            return self
+        exported: Model = load("bevcli.engines", self.engine).export(self, rig, drive, report)
+        return exported
+
     @cached_property
     def prepared(self) -> TemporalModel:
         """The network on its device, made ready for inference on the first use: same results, faster.
 
         Raises BevcliError for a model that is to run in another engine, before `in_engine`.
         """
-        if self.choice is not None:
-            raise BevcliError(f"`engine={self.choice.engine}`: needs a drive: pass the model to `bevcli.run`")
+        if self.needs_export:
+            raise BevcliError(f"`engine={self.engine}`: needs a drive: pass the model to `bevcli.run`")
         if self.is_exported:
             return self.network
         assert self.precision != "int8"
@@ -145,17 +179,19 @@ class Model:
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:
     """SHA-256 of names, types, shapes and numbers, in this order."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, tensor in tensors:
-        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
+        digest.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def load_model(
     model: str | Path | None = None,
     weights: str | Path | None = None,
     options: ModelOptions | None = None,
+    *,
+    report: DownloadReport = _no_report,
     **changes: Any,
 ) -> Model:
     """Load a model and its weights.
@@ -169,6 +205,7 @@ def load_model(
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
+        report: called during a download with the bytes that are there, the size of the file or None, and name and URL.
         changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a
             torch.device), `precision`, `untrained`, `engine`, `calibrate_with`, `fetch` (download missing weights) and
             `weights_dir`. In another `engine` than "torch", or in "int8", the model is exported when it first meets a
@@ -182,61 +219,71 @@ def load_model(
     """
     given = {name: value for name, value in (("model", model), ("weights", weights)) if value is not None}
     chosen = gather(ModelOptions, options, given | changes)
-    return _load_exported(chosen) if str(chosen.model).endswith(SUFFIX) else _load_network(chosen)
-
-
-def _load_network(options: ModelOptions) -> Model:
-    """The model of a TOML file with its weights."""
-    name, weights, untrained = options.model, options.weights, options.untrained
-    if weights is not None and untrained:
-        raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
-    if name is None:
-        name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    named = all_weights(options.weights_dir).get(str(name))
-    config = load_config(name)
-    tracker = _tracker(load_table(name, TRACKING, TrackerConfig), config, str(name))
-    wanted = weights is None and not untrained
-    bundled = bundled_weights(str(name)) if wanted else None
-    file = weights or bundled
-    if file is None and wanted:
-        file = _named_file(config.name, named, options)
-    target = choose_device(options.device)
-    choice = engine_choice(options, config, target)
-    if choice is not None:
-        target = torch.device("cpu")
+    if str(chosen.model).endswith(EXPORTED_SUFFIX):
+        if chosen.engine == TORCH:
+            raise BevcliError(f"`engine=torch`: {chosen.model} is an exported file: use its model by its name")
+        engine = chosen.engine or FILE_ENGINE
+        opened: Model = _engine(engine).open_model(engine, chosen)
+        return opened
+    if chosen.weights is not None and chosen.untrained:
+        raise WeightsError(f"`weights={chosen.weights}` and `untrained` exclude each other: pass one of them")
+    name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
+    contents, file = read_model_file(name)
+    config = config_of_table(contents, file)
+    tracker = tracker_of_table(contents, config, file)
+    path = chosen.weights
+    if path is None and not chosen.untrained:
+        path = _weights_of(name, chosen, report, ", or pass `untrained=True` to try the program with random weights")
+    engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network = build_model(config)
-    loaded = None if file is None else load_weights(file, network, str(name))
+    loaded = None if path is None else load_weights(path, network, name)
     return Model(
         network.eval(),
-        target,
-        "fp32" if choice is not None else choose_precision(options.precision, target),
-        file,
-        bundled=bundled is not None,
+        device,
+        precision,
+        path,
+        bundled=path is not None and chosen.weights is None and path == bundled_weights(name),
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
+        engine=engine,
         facts={} if loaded is None else loaded.facts,
-        choice=choice,
+        calibrate_with=chosen.calibrate_with,
     )
 
 
-def _named_file(model: str, named: NamedWeights | None, options: ModelOptions) -> Path:
-    """The downloaded weights of a model. Raises WeightsError where there are none."""
-    if named is not None and named.file is not None:
-        if named.here is not None:
-            return named.here
-        if options.fetch:
-            return fetch_weights(named).path
-        how = f"run {_fetch_command(named.name, options)}, which downloads them"
-    elif named is not None:
-        how = f"they {by_hand(named)}"
-    else:
+def weights_file(path_or_name: Path) -> Path:
+    """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
+    name = str(path_or_name)
+    if path_or_name.suffix or path_or_name.is_file():
+        return path_or_name
+    if name not in known_models():
+        named_weights(name)  # raises WeightsError that lists the names
+    return _weights_of(name, ModelOptions(), _no_report)
+
+
+def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherwise: str = "") -> Path:
+    """The weights of a name: those of the package, downloaded ones, or with `fetch` ones that are downloaded now.
+
+    otherwise: ends the message of the WeightsError where there are none.
+    """
+    bundled, named = bundled_weights(name), all_weights(options.weights_dir).get(name)
+    here = bundled or (None if named is None else named.here)
+    if here is not None:
+        return here
+    if named is None:
         how = "pass `weights=FILE` (the official .pth or a .safetensors)"
-    raise WeightsError(
-        f"model {model} has no weights: {how}, or pass `untrained=True` to try the program with random weights"
-    )
+    elif named.file is None:
+        how = f"they {named.by_hand}"
+    elif options.fetch:
+        from bevcli.weights.fetch import fetch_weights
+
+        return fetch_weights(named, report).path
+    else:
+        how = f"run {_fetch_command(name, options)}, which downloads them"
+    raise WeightsError(f"model {name} has no weights: {how}{otherwise}")
 
 
 def _fetch_command(name: str, options: ModelOptions) -> str:
@@ -245,42 +292,52 @@ def _fetch_command(name: str, options: ModelOptions) -> str:
     return f"`bevcli weights fetch {name} --weights-dir {shlex.quote(str(options.weights_dir))}`"
 
 
-def _tracker(stated: TrackerConfig, config: ModelConfig, file: str) -> TrackerConfig:
-    """The tracker's parameters for the classes of a model. Raises ConfigError."""
+def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -> TrackerConfig:
+    """The tracker's parameters in the contents of a model's file, for its classes. Raises ConfigError."""
+    stated = settings_of_table(contents, TRACKING, TrackerConfig, file)
     try:
         return stated.for_classes(config.object_classes)
     except ValueError as error:
         raise ConfigError(f"{file}: [{TRACKING}]: {error}") from None
 
 
-def _load_exported(options: ModelOptions) -> Model:
-    """The model of a file of `bevcli export-onnx` or `bevcli quantize`."""
-    file, engine = Path(str(options.model)), DEFAULT_ENGINE if options.engine in (None, AUTO) else options.engine
-    if engine == TORCH:
-        raise BevcliError(f"`engine=torch`: {file} is an exported file: use its model by its name")
-    if options.weights is not None or options.untrained:
-        option = "`untrained`" if options.untrained else f"`weights={options.weights}`"
-        raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
-    if options.precision is not None:
-        raise BevcliError(
-            f"`precision={options.precision}`: {file} has a fixed precision: leave out the option "
-            "(bevcli quantize writes files with INT8)"
-        )
-    if str(options.device) not in ("auto", "cpu"):
-        raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
-    network = load_exported(file, engine)
-    found = network.metadata
-    stated = settings_of_table(found.contents, TRACKING, TrackerConfig, str(file))
-    return Model(
-        network,
-        torch.device("cpu"),
-        found.precision,
-        None if found.untrained else file,
-        bundled=found.bundled,
-        tracker=_tracker(stated, found.config, str(file)),
-        engine=engine,
-        file=file,
-    )
+def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torch.device, Precision | Literal["int8"]]:
+    """The engine, device and precision that the options ask for; by default PyTorch, or for INT8 one that has it.
+
+    Raises BevcliError for what is not there, does not fit the model, or excludes each other.
+    """
+    engine, device, is_int8 = options.engine, choose_device(options.device), options.precision == "int8"
+    if options.calibrate_with is not None and not is_int8:
+        raise BevcliError("`calibrate_with`: is for `precision=int8`")
+    if is_int8 and engine == TORCH:
+        raise BevcliError("`precision=int8`: PyTorch has no INT8 here: choose another `engine`, or leave it out")
+    if is_int8 and engine is None:
+        engine = next(iter(installed_engines()), None)
+        if engine is None:
+            raise BevcliError("`precision=int8`: no engine is installed: run pip install 'bevcli[openvino]'")
+    if engine in (None, TORCH):
+        return TORCH, device, choose_precision(options.precision, device)
+    _engine(engine).check_options(engine, options, config)
+    return engine, torch.device("cpu"), options.precision or "fp32"
+
+
+def _engine(name: str) -> Any:
+    """The class of another engine than PyTorch, see `bevcli.workshop.engines.engine.Engine`. Raises BevcliError."""
+    known = list(entries("bevcli.engines"))
+    if name not in known:
+        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *known))})")
+    return load("bevcli.engines", name)
+
+
+def installed_engines() -> dict[str, Any]:
+    """The engines whose packages are installed, the one with the lowest rank first."""
+    engines = {}
+    for name in entries("bevcli.engines"):
+        with suppress(BevcliError):  # not installed, or a broken package of somebody else
+            engine = load("bevcli.engines", name)
+            engine.require_packages()
+            engines[name] = engine
+    return dict(sorted(engines.items(), key=lambda item: item[1].rank))
 
 
 def _model_of(weights: Path) -> str:

@@ -6,7 +6,8 @@ from typing import Literal
 from bevcli.options import option, options
 from bevcli.registry import entries, known_models
 
-AUTO, TORCH = "auto", "torch"  # values of `engine` beside the registered engines
+TORCH = "torch"  # the value of `engine` beside the registered engines
+EXPORTED_SUFFIX, FILE_ENGINE = ".onnx", "onnxruntime"  # of exported files, and the engine that runs them by default
 
 
 def complete_model(incomplete: str) -> list[str]:
@@ -48,11 +49,10 @@ class ModelOptions:
     )
     engine: str | None = option(
         default=None,
-        help="Program that computes the model: torch, openvino, onnxruntime, that of an installed package, or auto, "
-        "the fastest one by `bevcli bench --engines`, else torch (openvino with int8). A named model is exported once. "
-        "Default: torch; onnxruntime for a FILE.onnx.",
-        metavar="auto|torch|NAME",
-        complete=lambda incomplete: [AUTO, TORCH, *entries("bevcli.engines")],
+        help="Program that computes the model: torch, openvino, onnxruntime, or that of an installed package. A named "
+        "model is exported once. Default: torch; openvino with int8 if it is installed; onnxruntime for a FILE.onnx.",
+        metavar="torch|NAME",
+        complete=lambda incomplete: [TORCH, *entries("bevcli.engines")],
     )
     precision: Literal["fp32", "bf16", "fp16", "int8"] | None = option(
         default=None,
@@ -65,5 +65,4 @@ class ModelOptions:
         help="Drive whose first frames give the ranges of numbers for int8. Default: the first drive that is run.",
         metavar="SEQUENCE",
         flag="--int8-drive",
-        old=("--calibrate-with",),
     )

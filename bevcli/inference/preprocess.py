@@ -22,7 +22,6 @@ from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import PreparedFrame
 from bevcli.printing import counted
-from bevcli.workshop.engines.export_form import pad_value_bgr
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
@@ -60,25 +59,26 @@ class Preprocessor:
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
-        known = self._facts_of(frame.rig)
-        frame = frame if frame.rig is known.model_rig else replace(frame, rig=known.model_rig)
-        image, names = known.image, known.assignment.cameras
+        rig_facts = self._facts_of(frame.rig)
+        frame = frame if frame.rig is rig_facts.model_rig else replace(frame, rig=rig_facts.model_rig)
+        image, assignment = rig_facts.image, rig_facts.assignment
+        names = assignment.cameras
         width, height = image.padded_size
         # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
         # here, and where it has more threads than there are processors, those of the model no longer spin.
         empty = np.zeros((1, len(names), height, width, 3), self._dtype)
         if self.pixels:
-            empty[:] = pad_value_bgr(self.config)
+            empty[:] = self.config.image.pad_bgr
         images = torch.from_numpy(empty).movedim(-1, 2)
 
-        def write(place: int, name: str) -> None:
+        def write(camera: int, name: str) -> None:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
-            self._write(pixels, image, images[0, place].numpy())
+            self._write(pixels, image, images[0, camera].numpy())
 
-        present = [(place, name) for place, name in enumerate(names) if name in frame.images]
+        present = [(camera, name) for camera, name in enumerate(names) if name in frame.images]
         if self._threads is None:
-            for place, name in present:
-                write(place, name)
+            for camera, name in present:
+                write(camera, name)
         else:
             for task in wait([self._threads.submit(write, *each) for each in present]).done:
                 task.result()
@@ -86,11 +86,11 @@ class Preprocessor:
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(
             frame=frame,
-            assignment=known.assignment,
+            assignment=assignment,
             scales=scales,
             images=images,
             image_from_bev=torch.from_numpy(np.stack(projections))[None],
-            camera_index=torch.tensor([self.config.cameras.index(name) for name in known.assignment.embeddings]),
+            camera_index=torch.tensor([self.config.cameras.index(name) for name in assignment.embeddings]),
             has_image=torch.tensor([[name in frame.images for name in names]]),
             pixels=self.pixels,
         )
@@ -179,8 +179,8 @@ def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: 
     left, top, right, bottom = image.crop_box
     resize_and_normalize(
         pixels_bgr,
-        resize_taps(height, round(height * scale), method)[top:bottom],
-        resize_taps(width, round(width * scale), method)[left:right],
+        pixel_weights(height, round(height * scale), method)[top:bottom],
+        pixel_weights(width, round(width * scale), method)[left:right],
         np.asarray(image.mean, dtype=np.float32),
         np.asarray(image.std, dtype=np.float32),
         out,
@@ -233,7 +233,7 @@ SMALLEST_OVERLAP = 1e-3  # pixels; OpenCV leaves out what overlaps less with the
 
 
 @dataclass(frozen=True)
-class Taps:
+class PixelWeights:
     """The pixels of a row (or column) that each of the n pixels of the resized one is a weighted mean of.
 
     Attributes:
@@ -244,21 +244,21 @@ class Taps:
     first: NDArray[np.int64]
     weights: NDArray[np.float32]
 
-    def __getitem__(self, chosen: slice) -> "Taps":
-        """The taps of some of the n pixels."""
-        return Taps(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
+    def __getitem__(self, chosen: slice) -> "PixelWeights":
+        """The weights of some of the n pixels."""
+        return PixelWeights(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
 
 
 @lru_cache(maxsize=64)
-def resize_taps(length: int, new_length: int, method: Literal["linear", "area"]) -> Taps:
-    """The taps of a row of `length` pixels that is resized to `new_length`, as OpenCV's INTER_LINEAR or INTER_AREA."""
-    scale, places = length / new_length, np.arange(new_length)[:, None]
-    center = np.clip((places + 0.5) * scale - 0.5, 0, length - 1)
+def pixel_weights(length: int, new_length: int, method: Literal["linear", "area"]) -> PixelWeights:
+    """The weights that resize a row of `length` pixels to `new_length`, as OpenCV's INTER_LINEAR or INTER_AREA."""
+    scale, index = length / new_length, np.arange(new_length)[:, None]
+    center = np.clip((index + 0.5) * scale - 0.5, 0, length - 1)
 
     def weigh(pixels: NDArray[np.int64]) -> Array:
         if method == "linear":
             return np.clip(1 - np.abs(pixels - center), 0, None)
-        overlap = np.minimum(pixels + 1, (places + 1) * scale) - np.maximum(pixels, places * scale)
+        overlap = np.minimum(pixels + 1, (index + 1) * scale) - np.maximum(pixels, index * scale)
         return np.where(overlap > SMALLEST_OVERLAP, overlap / scale, 0)
 
     reach = int(np.ceil(scale / 2)) + 1
@@ -267,13 +267,13 @@ def resize_taps(length: int, new_length: int, method: Literal["linear", "area"])
     first, count = np.take_along_axis(near, used.argmax(1)[:, None], 1), used.sum(1).max()
     first = np.minimum(first, length - count)
     weights = weigh(first + np.arange(count)).astype(np.float32)
-    return Taps(first[:, 0], np.ascontiguousarray(weights.T))
+    return PixelWeights(first[:, 0], np.ascontiguousarray(weights.T))
 
 
 def resize_and_normalize(
     pixels: NDArray[np.uint8],
-    rows: Taps,
-    columns: Taps,
+    rows: PixelWeights,
+    columns: PixelWeights,
     mean: NDArray[np.float32],
     std: NDArray[np.float32],
     out: NDArray[np.float32],
@@ -305,13 +305,13 @@ def _resample(lines, first_row, row_weights, first_column, column_weights, mean,
                     mixed[i] += weight * np.float32(line[i])
         for x in range(len(first_column)):
             first = second = third = np.float32(0)
-            place = 3 * first_column[x]
+            i = 3 * first_column[x]
             for k in range(len(column_weights)):
                 weight = column_weights[k, x]
-                first += weight * mixed[place]
-                second += weight * mixed[place + 1]
-                third += weight * mixed[place + 2]
-                place += 3
+                first += weight * mixed[i]
+                second += weight * mixed[i + 1]
+                third += weight * mixed[i + 2]
+                i += 3
             planes[0, y, x] = (first - mean[0]) / std[0]
             planes[1, y, x] = (second - mean[1]) / std[1]
             planes[2, y, x] = (third - mean[2]) / std[2]

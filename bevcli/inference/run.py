@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.commands import read_commands
 from bevcli.inference.load import Model
-from bevcli.workshop.engines.in_engine import in_engine
 
 
 def run(
@@ -43,7 +42,7 @@ def run(
         InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
             attention of an exported file is asked for.
     """
-    model = in_engine(model, sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
+    model = model.in_engine(sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
     asked = {"ask_attention": attention or bool(probes), "probes": tuple(probes)}
     runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
     steps = runner.run(sequence, range(len(sequence.stamps)), runner.preprocessor(cameras))

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from bevcli.frame import Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.frame import BevMap, Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
@@ -20,6 +20,7 @@ from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.config import ImageConfig
+from bevcli.model.network import Network
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
@@ -78,7 +79,7 @@ class Runner:
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
         """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
-        return Preprocessor(self.config, cameras, pixels=self.model.takes_pixels)
+        return Preprocessor(self.config, cameras, pixels=getattr(self.model, "takes_pixels", False))
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
@@ -95,75 +96,75 @@ class Runner:
             upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
                 or without images are not used.
         """
-        state, prediction = self._step_model(state or RunnerState(), prepared, upcoming)
-        if self.options.tracker is None or self.tracks:
-            return state, prediction
-        tracks, prediction = track(self.options.tracker, state.tracks, prediction)
-        return replace(state, tracks=tracks), prediction
-
-    @torch.inference_mode()
-    def _step_model(
-        self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Items[PreparedFrame]
-    ) -> tuple[RunnerState[Any], Prediction]:
-        frame = prepared.frame
+        state, frame = state or RunnerState(), prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
             state = self._restarted(state)
         if not frame.images:
             return state, self._prediction(prepared, started_anew, skipped=True)
-        probe = self._probe()
-        with self.clock:
-            precision = self.options.precision
-            autocast = torch.autocast(self.device.type, DTYPES[precision], enabled=precision != "fp32")
+        probe, precision = self._probe(), self.options.precision
+        autocast = torch.autocast(self.device.type, DTYPES[precision], enabled=precision != "fp32")
+        with torch.inference_mode(), self.clock:
             with autocast, probe or contextlib.nullcontext():
                 later = self._usable(prepared, upcoming)
                 outputs, memory = self.model.step(prepared, state.memory, later)
-                found, is_finite = read_back(outputs, prepared.images)
-                if not is_finite:
-                    where = origin(self.model, lambda: self.model.step(prepared, state.memory, later))
-                    return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
-            self.clock.waited()
-            boxes = self.model.decode_boxes(found)
-            if self.config.has_tracks and not self.tracks:
-                boxes = without_identities(boxes)
-            self.clock.mark("box_decoding")
-            results = self.model.decode_results(found)
-            results = with_command(results, self.options.commands, frame.stamp.index)
-            segmentation = self.model.decode_map(found)
-            if segmentation is not None:
+                last_layers, is_finite = read_back(outputs, prepared.images)
+                place = "" if is_finite else origin(self.model, lambda: self.model.step(prepared, state.memory, later))
+            if is_finite:
+                after = RunnerState(memory, frame.stamp)
+                fields = {"bev": outputs.bev[0], **self._decoded(last_layers, frame.stamp.index)}
+                fields["attention"] = None if probe is None else attention_view(probe, prepared, self.config)
+                fields["stage_seconds"] = self.clock.read()
+            else:
+                after, fields = self._restarted(state), {"not_finite": place}
+        tracks, prediction = state.tracks, self._prediction(prepared, started_anew, **fields)
+        if self.options.tracker is not None and not self.tracks:
+            tracks, prediction = track(self.options.tracker, tracks, prediction)
+        return replace(after, tracks=tracks), prediction
+
+    def _decoded(self, last_layers: ModelOutputs, frame: int) -> dict[str, Any]:
+        """The fields of a prediction that are decoded from the outputs of the last layers, on the CPU."""
+        self.clock.waited()
+        boxes, segmentation, results = Boxes3D.empty(), None, []
+        for decoded in self.model.decode(last_layers):
+            if isinstance(decoded, Boxes3D):
+                boxes = without_identities(decoded) if self.config.has_tracks and not self.tracks else decoded
+                self.clock.mark("box_decoding")
+            elif isinstance(decoded, BevMap):
+                segmentation = decoded
                 self.clock.mark("map_merging")
-        prediction = self._prediction(
-            prepared,
-            started_anew,
-            boxes=boxes,
-            bev=outputs.bev[0],
-            segmentation=segmentation,
-            attention=None if probe is None else attention_view(probe, prepared, self.config),
-            stage_seconds=self.clock.read(),
-            results=results,
-        )
-        return RunnerState(memory, frame.stamp, state.tracks), prediction
+            else:
+                results.append(decoded)
+        shown = with_command(tuple(results), self.options.commands, frame)
+        return {"boxes": boxes, "results": shown, "segmentation": segmentation}
 
-    def run(
-        self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
-    ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
-        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance.
+    def frames(
+        self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor
+    ) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
+        """Yields `prepared` and `upcoming` of `step` for these frames of a sequence, read and prepared in advance.
 
-        A model that looks ahead sees the later ones of these places.
+        A model that looks ahead sees the later ones of these frames.
         """
         ahead = self.config.later_frames if self.options.temporal else 0
         prepare = self.preparation(preprocessor)
         if self.device.type == "cuda":
             depth, threads = frames_ahead(self.config.image, len(sequence.rig.cameras), os.cpu_count() or 1)
-            source = read_ahead(prepare, places, depth, threads, load=sequence.load)
+            source = read_ahead(prepare, indices, depth, threads, load=sequence.load)
         else:  # the processor is busy with the model: one thread for both keeps up
-            source = read_ahead(lambda place: prepare(sequence.load(place)), places)
+            source = read_ahead(lambda index: prepare(sequence.load(index)), indices)
         waiting = deque(islice(source, ahead + 1))
         while waiting:
             prepared = waiting.popleft()
-            state, prediction = self.step(state, prepared, tuple(waiting))
-            yield prepared.frame, prediction, state
+            yield prepared, tuple(waiting)
             waiting.extend(islice(source, 1))
+
+    def run(
+        self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
+    ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
+        """Yields frame, prediction and state after each of these frames of a sequence."""
+        for prepared, upcoming in self.frames(sequence, indices, preprocessor):
+            state, prediction = self.step(state, prepared, upcoming)
+            yield prepared.frame, prediction, state
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
@@ -206,13 +207,13 @@ class Runner:
         return usable
 
     def _probe(self) -> AttentionProbe | None:
-        if not self.options.ask_attention or not self.model.has_parts:
+        if not self.options.ask_attention or not isinstance(self.model, Network):
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
 
-    def _prediction(self, prepared: PreparedFrame, started_anew: NewStart | None, **found: Any) -> Prediction:
-        """The prediction for a frame. found: the fields that the model computed; by default it has no boxes."""
+    def _prediction(self, prepared: PreparedFrame, started_anew: NewStart | None, **fields: Any) -> Prediction:
+        """The prediction for a frame. fields: those that the model computed; by default it has no boxes."""
         frame, assignment = prepared.frame, prepared.assignment
         return Prediction(
             stamp=frame.stamp,
@@ -221,7 +222,7 @@ class Runner:
             grid=self.config.bev_grid,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
-            **{"boxes": Boxes3D.empty(), "bev": None, **found},
+            **{"boxes": Boxes3D.empty(), "bev": None, **fields},
         )
 
 

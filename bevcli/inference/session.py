@@ -16,7 +16,6 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
-from bevcli.workshop.engines.in_engine import in_engine
 
 ColorOrder = Literal["bgr", "rgb"]
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
@@ -81,7 +80,7 @@ class Session:
                 f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
                 "choose another model, or pass `temporal=False`"
             )
-        model = in_engine(model, rig)
+        model = model.in_engine(rig)
         self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order

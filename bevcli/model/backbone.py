@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 from torch import Tensor, nn
 
@@ -40,7 +40,6 @@ class Backbone(nn.Module):
     """Images to feature maps of the configured output stages. A subclass makes `conv1`, `bn1` and the stages.
 
     Attributes:
-        by_image: on a CPU it is fastest on one image at a time, whose maps fit into the caches.
         output_stages: the stages, from 1, whose maps are returned.
         conv1: the convolution of the stem.
         bn1: the batch norm after it.
@@ -50,7 +49,6 @@ class Backbone(nn.Module):
             that keeps their weights.
     """
 
-    by_image: ClassVar[bool] = False
     conv1: nn.Conv2d
     bn1: nn.BatchNorm2d
     stages: nn.ModuleList

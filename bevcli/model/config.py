@@ -89,6 +89,11 @@ class ImageConfig:
         return (0, 0, *self.size) if self.crop is None else self.crop
 
     @property
+    def pad_bgr(self) -> tuple[float, ...]:
+        """The pixels (B, G, R) outside the resized image: the mean, which normalisation turns into zero."""
+        return self.mean[::-1] if self.color_order == "rgb" else self.mean
+
+    @property
     def padded_size(self) -> tuple[int, int]:
         """(width, height) of the network's input, pixels."""
         left, top, right, bottom = self.crop_box

@@ -1,9 +1,14 @@
-"""Deformable attention (Zhu et al. 2021): each query samples a few values instead of attending to all of them."""
+"""Deformable attention (Zhu et al. 2021): each query samples a few values instead of attending to all of them.
+
+query -> sampling_offsets  -> + reference point -> P locations (x) in each level    . . x . .
+      -> attention_weights -> softmax           -> P weights, sum 1                 . x o . .
+tokens -> value_projection -> values (H, W), sampled bilinearly at the x            . . . x .
+sum of weights · samples of each head -> output_projection -> result     o: the reference point
+"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -13,24 +18,6 @@ from bevcli.model.upload import upload
 
 LevelShapes = tuple[tuple[int, int], ...]
 """(height, width) of each feature level, fine to coarse."""
-
-
-@dataclass(frozen=True)
-class Hits:
-    """The M pairs of a value map and a query that samples it, ordered by map.
-
-    Attributes:
-        query: (M,) int64, index of the query in B·Q.
-        reference_points: (M, Z, 2) float32, x and y, 0 to 1 over the map; sample p lies around point p mod Z.
-        hits_per_map: G counts, of sum M.
-        prediction: (M,) int64, which of the predictions of its query belongs to the map: an index in the axis "maps" of
-            `DeformableAttention.predict`.
-    """
-
-    query: Tensor
-    reference_points: Tensor
-    hits_per_map: Sequence[int]
-    prediction: Tensor
 
 
 @dataclass(frozen=True)
@@ -56,18 +43,10 @@ class DeformableAttention(nn.Module):
     A query predicts where each head samples (offsets from reference points, in cells) and the weight of each sample.
 
     Attributes:
-        sampling: computes the weighted sums, without parameters; a faster module can take its place.
-        sample_hits: the weighted sums (M, C) float32 of hits, from the values, the level shapes, the hits, and what
-            `predict` returns, without tables of locations and weights. None: locations and weights are computed first.
-        level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
-        softmax: over the last axis; a faster function can take its place.
-        value_dtype: data type of the value projection, where it is not that of the tokens.
+        sampling: the module that makes the weighted sums; it has no parameters.
     """
 
-    value_dtype: torch.dtype | None = None
-    sample_hits: Callable[[Tensor, LevelShapes, Hits, Tensor, Tensor], Tensor] | None = None
-    level_sizes: Callable[[LevelShapes, torch.device], Tensor]
-    softmax: Callable[[Tensor], Tensor]
+    sampling: "GridSampling"
 
     def __init__(
         self, channels: int, query_channels: int, heads: int, points: int, levels: int = 1, maps: int = 1
@@ -89,9 +68,7 @@ class DeformableAttention(nn.Module):
         self.attention_weights = nn.Linear(query_channels, samples)
         self.value_projection = nn.Linear(channels, channels)
         self.output_projection = nn.Linear(channels, channels)
-        self.sampling: nn.Module = GridSampling()
-        self.level_sizes = level_sizes
-        self.softmax = partial(torch.softmax, dim=-1)
+        self.sampling = GridSampling()
         self._initialize()
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,11 +85,12 @@ class DeformableAttention(nn.Module):
 
     def weights(self, logits: Tensor) -> Tensor:
         """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
-        return self.softmax(logits.flatten(-2)).view_as(logits)
+        return self.sampling.softmax(logits.flatten(-2)).view_as(logits)
 
     def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
         """Reference points plus predicted offsets; see `sampling_locations`."""
-        return sampling_locations(reference_points, offsets, self.level_sizes(level_shapes, offsets.device))
+        sizes = self.sampling.level_sizes(level_shapes, offsets.device)
+        return sampling_locations(reference_points, offsets, sizes)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values (B, Q, C) of queries that sample one map each.
@@ -144,11 +122,12 @@ class DeformableAttention(nn.Module):
         queries_per_map: Sequence[int],
     ) -> Tensor:
         """Projects tokens (G, S, C) to values and samples them; see `GridSampling`. Returns (M, C) float32."""
-        return self.sampling(self.values(tokens), level_shapes, locations, weights, queries_per_map)
+        sampled: Tensor = self.sampling(self.values(tokens), level_shapes, locations, weights, queries_per_map)
+        return sampled
 
     def values(self, tokens: Tensor) -> Tensor:
         """The values (G, S, heads, C / heads) of tokens (G, S, C)."""
-        return self.value_projection(tokens.to(self.value_dtype or tokens.dtype)).unflatten(-1, (self.shape[0], -1))
+        return self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))
 
     def _initialize(self) -> None:
         """As published: heads sample in a ring of directions, farther with each point, all with the same weight."""
@@ -170,6 +149,14 @@ class DeformableAttention(nn.Module):
 
 class GridSampling(nn.Module):
     """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another."""
+
+    def softmax(self, logits: Tensor) -> Tensor:
+        """Over the last axis."""
+        return logits.softmax(-1)
+
+    def level_sizes(self, level_shapes: LevelShapes, device: torch.device) -> Tensor:
+        """See the function `level_sizes`."""
+        return level_sizes(level_shapes, device)
 
     def forward(
         self,

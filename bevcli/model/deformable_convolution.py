@@ -1,13 +1,8 @@
 """Modulated deformable convolution, DCNv2 (Zhu et al. 2019), with one deformable group."""
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-Convolve = Callable[[Tensor, Tensor, Tensor, Tensor | None, int], Tensor]
-"""A function with the arguments and the result of `predicted_deformable_convolution`."""
 
 
 class ModulatedDeformableConvolution(nn.Module):
@@ -15,11 +10,9 @@ class ModulatedDeformableConvolution(nn.Module):
 
     Attributes:
         bias: (O,), None until a batch norm is folded into the convolution.
-        convolve: computes the result from x and what is predicted; a faster function can take its place.
     """
 
     bias: nn.Parameter | None
-    convolve: Convolve
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
@@ -27,14 +20,13 @@ class ModulatedDeformableConvolution(nn.Module):
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3))
         self.register_parameter("bias", None)
         self.offset_and_mask = nn.Conv2d(in_channels, 27, 3, stride, padding=1)
-        self.convolve = predicted_deformable_convolution
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
         nn.init.zeros_(self.offset_and_mask.weight)
         nn.init.zeros_(self.offset_and_mask.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, out_channels, H', W')."""
-        return self.convolve(x, self.offset_and_mask(x), self.weight, self.bias, self.stride)
+        return predicted_deformable_convolution(x, self.offset_and_mask(x), self.weight, self.bias, self.stride)
 
 
 def predicted_deformable_convolution(

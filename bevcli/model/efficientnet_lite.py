@@ -84,8 +84,6 @@ class EfficientNetLiteConfig:
 class EfficientNetLite(Backbone):
     """See `EfficientNetLiteConfig`. Images are RGB, with mean 127 and standard deviation 128 where it is pretrained."""
 
-    by_image = True  # depthwise convolutions wait for memory
-
     def __init__(self, config: EfficientNetLiteConfig) -> None:
         super().__init__(config.output_stages)
         self.conv1 = SameConvolution(3, STEM_CHANNELS, 3)

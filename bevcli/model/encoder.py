@@ -1,14 +1,12 @@
 """The BEV encoder: layers of temporal self-attention, spatial cross-attention and a feed-forward network."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, Hits, LevelShapes
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
@@ -161,19 +159,19 @@ class TemporalSelfAttention(nn.Module):
     def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, logits: Tensor) -> Tensor:
         """The attended values (B, Y·X, C) for given offsets and logits of the samples; see `forward`."""
         batch, cells = offsets.shape[:2]
-        maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
+        maps = bev_maps.shape[1]
+        reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
+        locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+        locations = locations.movedim(3, 1).flatten(0, 2)
+        weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
         queries_per_map = [2 * cells // maps] * (maps * batch)
-        if self.attention.sample_hits is not None:
-            hits = temporal_hits(reference_points.expand(batch, -1, -1, -1), queries_per_map)
-            predicted = offsets.flatten(0, 1), logits.flatten(0, 1)
-            sampled = self.attention.sample_hits(self.attention.values(tokens), self.level_shapes, hits, *predicted)
-        else:
-            reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-            locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
-            locations = locations.movedim(3, 1).flatten(0, 2)
-            weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
-            sampled = self.attention.sample(tokens, self.level_shapes, locations, weights, queries_per_map)
-        of_history, of_current = sampled.unflatten(0, (batch, 2, cells)).unbind(1)  # (B, Y·X, C) each
+        tokens = bev_maps.flatten(0, 1)
+        sampled = self.attention.sample(tokens, self.level_shapes, locations, weights, queries_per_map)
+        return self.mean(sampled.unflatten(0, (batch, 2, cells)))
+
+    def mean(self, sampled: Tensor) -> Tensor:
+        """The attended values (B, Y·X, C) of what was sampled in the two maps (B, 2, Y·X, C)."""
+        of_history, of_current = sampled.unbind(1)
         return self.dropout(self.attention.output_projection((of_history + of_current) / 2))
 
 
@@ -194,39 +192,21 @@ class SpatialCrossAttention(nn.Module):
 
         query: (B, Y·X, C). image_features: tokens of B·N images. hits: the M pairs of a camera and a cell that it sees.
         """
-        sampled = self._sample(query, image_features, hits)  # (M, C)
+        sampled = self.sample(query, image_features, hits)  # (M, C)
         summed = sampled.new_zeros(query.shape).flatten(0, 1).index_add(0, hits.cell, sampled)
         mean = summed / hits.cameras_per_cell.clamp(min=1)[:, None]
         return self.dropout(self.attention.output_projection(mean.view_as(query)))
 
-    def _sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
-        """The weighted sums (M, C) of the hits."""
+    def sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
+        """The weighted sums (M, C) of the hits; see `forward`."""
         # A cell has the same offsets and logits in every camera, so they are predicted once for each cell.
-        predicted = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, …) each
+        offsets, logits = (part[:, :, 0] for part in self.attention.predict(query.flatten(0, 1)))  # (B·Y·X, heads, …)
         tokens, level_shapes = image_features.tokens, image_features.level_shapes
-        if self.attention.sample_hits is not None:
-            found = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
-            return self.attention.sample_hits(self.attention.values(tokens), level_shapes, found, *predicted)
-        offsets, logits = (part[:, :, 0] for part in predicted)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.weights(logits)))
         locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
         return self.attention.sample(tokens, level_shapes, locations, weights, hits.hits_per_camera)
-
-
-def temporal_hits(reference_points: Tensor, queries_per_map: Sequence[int]) -> Hits:
-    """The hits of the BEV cells in the history and the current map. reference_points: (B, 2, Y·X, 2)."""
-    batch, maps, cells, _ = reference_points.shape
-    query, prediction = map_queries(batch, maps, cells, reference_points.device)
-    return Hits(query, reference_points.reshape(-1, 1, 2), queries_per_map, prediction)
-
-
-@cache
-def map_queries(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """`Hits.query` and `Hits.prediction` of maps that all cells sample. They are kept: CUDA graphs hold addresses."""
-    query = torch.arange(batch * cells, device=device).view(batch, 1, cells).expand(-1, maps, -1).flatten()
-    return query, torch.arange(maps, device=device)[None, :, None].repeat(batch, 1, cells).flatten()
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

@@ -1,24 +1,23 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bevcli.errors import BevcliError
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.config import ModelConfig
-from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead, ObjectQueries
+from bevcli.model.decoder import Decoder, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.pillar_projection import PillarHits, Pillars
+from bevcli.model.pillar_projection import Pillars
 from bevcli.model.segmentation import SegmentationHead
-from bevcli.model.step import ClipInputs, FrameTruth, ModelOutputs
+from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
+from bevcli.model.tensors import without_autocast
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -31,7 +30,6 @@ class Network(TemporalModel):
     """
 
     stages: Mapping[str, str] = STAGES
-    has_parts = True
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__(config)
@@ -61,96 +59,12 @@ class Network(TemporalModel):
     def detect(self, bev: Tensor) -> ModelOutputs:
         """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return ModelOutputs(bev, class_logits, box_codes, segmentation)
-
-    @property
-    def image_parts(self) -> tuple[nn.Module, ...]:
-        return self.backbone, self.neck
-
-    def exchange_parts(self) -> None:
-        """See `TemporalModel`: the object queries attend to each other before they look at the frame."""
-        first = self.decoder.layers[0]
-        first.self_attention = ConstantSelfAttention(first, self.decoder.object_queries(batch=1))
-
-    def remember(self, clip: ClipInputs, place: int, memory: Any) -> Any:
-        """The memory after a frame of training clips that is history only; called without gradient.
-
-        place: index of the frame in the clips. memory: after the frame before; None at the start.
-        """
-        raise NotImplementedError
-
-    def learn(self, clip: ClipInputs, place: int, memory: Any) -> tuple[ModelOutputs, Any]:
-        """The outputs for a frame of training clips, and the memory after it, which has no gradient."""
-        raise NotImplementedError
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        """The weighted scalar losses, by name, of heads that make `ModelConfig.results`; by default none.
-
-        Args:
-            outputs: of B frames.
-            truths: B, with places at `ModelConfig.future_times_s`.
-            matches: of each frame the queries that the detection loss matches to boxes, and the indices of these.
-        """
-        return {}
-
-    def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
-        """Run the parts whose operations `bevcli bench` counts, for a frame with history; return the BEV map.
-
-        images: (1, N, 3, H, W) on the device "meta" like the network. camera_index: (N,). hits: as in a real frame.
-        """
-        raise NotImplementedError
-
-    @property
-    def class_keys(self) -> tuple[str, ...]:
-        """Keys of the tensors that have a row for each class."""
-        layers = [
-            f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
-            for branch, modules in self.detection_head.class_branches.named_children()
-        ]
-        return tuple(f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias"))
-
-    @classmethod
-    def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
-        yield "backbone: stem", "backbone.conv1", "backbone.bn1"
-        for stage, name in enumerate(config.backbone.stage_names()):
-            yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
-        yield "neck (FPN)", "neck"
-        yield "level embeddings", "image_tokens.level_embedding"
-        yield "camera embeddings", "image_tokens.camera_embedding"
-        yield "calibration embedding", "calibration_embedding"
-        yield "BEV queries", "bev_queries.embedding"
-        yield "position embedding, rows", "bev_queries.row_embedding"
-        yield "position embedding, columns", "bev_queries.column_embedding"
-        yield "can-bus MLP", "bev_queries.can_bus_embedding"
-        attentions = {
-            "temporal_self_attention": "temporal self-attention",
-            "spatial_cross_attention": "spatial cross-attention",
-        }
-        yield from _layer_names("encoder", config.encoder.layers, attentions)
-        yield "object queries (position, content)", "decoder.query_embedding"
-        yield "object queries: reference points", "decoder.reference_points"
-        attentions = {"self_attention": "self-attention", "cross_attention": "cross-attention to BEV"}
-        yield from _layer_names("decoder", config.decoder.layers, attentions)
-        yield f"detection head: {config.decoder.layers} class branches", "detection_head.class_branches"
-        yield f"detection head: {config.decoder.layers} box branches", "detection_head.box_branches"
-        yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
-        yield "segmentation: location decoder", "segmentation_head.location_decoder"
-        for layer in range(config.segmentation.mask_layers):
-            yield f"segmentation: mask decoder layer {layer}", f"segmentation_head.mask_layers.{layer}"
-
-
-def _layer_names(part: str, layers: int, attentions: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """The parts of each layer of encoder or decoder. attentions: module -> name."""
-    for layer in range(layers):
-        for module, name in {**attentions, "feed_forward": "feed-forward network", "norms": "norms"}.items():
-            yield f"{part} layer {layer}: {name}", f"{part}.layers.{layer}.{module}"
 
 
 def build_network(config: ModelConfig) -> Network:
@@ -159,22 +73,3 @@ def build_network(config: ModelConfig) -> Network:
     if not isinstance(model, Network):
         raise BevcliError(f"{config.name}: a {config.architecture} can run only; it lacks the parts of a BEVFormer")
     return model
-
-
-class ConstantSelfAttention(nn.Module):
-    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
-
-    attended: Tensor
-
-    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
-        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
-        super().__init__()
-        assert isinstance(first, DecoderLayer)
-        with torch.no_grad():
-            key = queries.content + queries.position
-            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
-        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
-
-    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
-        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
-        return self.attended.expand_as(value), None

@@ -1,19 +1,43 @@
 """Translates the key names of the official weights files to ours."""
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from torch import Tensor
 
-from bevcli.model.temporal_model import TemporalModel
 from bevcli.registry import entries, load
+
+Renames = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
+
+
+@dataclass(frozen=True)
+class OfficialNames:
+    """The names of tensors in the released files of a model, beside those that all models share.
+
+    Attributes:
+        mark: pattern of a key that only these files have; "" for a model with shared names only.
+        renames: pattern of the official name, and ours, in the order of use.
+        unused: pattern of the keys without effect at inference, which are left out.
+        unused_text: those in words, with their `count` and the `first` of them.
+    """
+
+    mark: str = ""
+    renames: Renames = ()
+    unused: str = ""
+    unused_text: str = "{count} keys, such as {first}"
+
+    def without_unused(self, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+        """The state dict without the unused keys, and these in words."""
+        unused = [key for key in state if self.unused and re.match(self.unused, key)]
+        text = self.unused_text.format(count=len(unused), first=unused[0]) if unused else ""
+        return {key: tensor for key, tensor in state.items() if key not in unused}, text
+
 
 _PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
 
-# Pattern of the official name, and ours, of the parts that models share. All rules are applied to every key, in their
-# order, after those of `TemporalModel.official_names`.
-_RENAMES = (
+# Of the parts that models share. All rules are applied to every key, in their order, after those of the model.
+_RENAMES: Renames = (
     (r"^img_backbone\.layer(\d)\.", lambda m: f"backbone.stages.{int(m[1]) - 1}."),
     (r"^img_backbone\.", "backbone."),
     (r"\.conv_offset\.", ".offset_and_mask."),
@@ -42,8 +66,10 @@ _RENAMES = (
     (r"\.ffns\.0\.layers\.1\.", ".feed_forward.reduce."),
 )
 
-# In the official files, but used in training only.
+# In the official files, but used in training only: weights of the loss, and further groups of object queries.
 _TRAINING_ONLY = ("pts_bbox_head.code_weights",)
+_OBJECT_QUERIES = "pts_bbox_head.query_embedding.weight"
+_QUERIES_OF_A_GROUP = 900
 
 
 def is_official(state: Mapping[str, Tensor]) -> bool:
@@ -56,23 +82,40 @@ def from_official(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
 
     A key that no rule matches stays unchanged.
     """
-    left_out = []
-    models: list[type[TemporalModel]] = [load("bevcli.models", name) for name in entries("bevcli.models")]
-    for model in models:
-        state, parts = model.without_training_parts(state)
-        left_out += [parts] if parts else []
-    names = [*(rule for model in models for rule in model.official_names), *_RENAMES]
-    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in state)
-    found = {_our_name(key, first_extra, names): x for key, x in state.items() if key not in _TRAINING_ONLY}
-    return found, " and ".join(left_out)
+    names = _names_of(state)
+    left, unused = names.without_unused(state)
+    left, groups = _first_group(left)
+    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in left)
+    renames = [*names.renames, *_RENAMES]
+    ours = {_our_name(key, first_extra, renames): x for key, x in left.items() if key not in _TRAINING_ONLY}
+    return ours, " and ".join(filter(None, (unused, groups)))
 
 
-def _our_name(key: str, first_extra: int, names: Sequence[tuple[str, Any]]) -> str:
+def _names_of(state: Mapping[str, Tensor]) -> OfficialNames:
+    """The names of the model whose mark the state dict has; shared names only where it has none."""
+    for name in entries("bevcli.models"):
+        names: OfficialNames = load("bevcli.models", name).official_names
+        if names.mark and any(re.match(names.mark, key) for key in state):
+            return names
+    return OfficialNames()
+
+
+def _first_group(state: dict[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """The state dict with the first group of object queries only, and the others in words."""
+    queries = state.get(_OBJECT_QUERIES)
+    groups, rest = (1, 0) if queries is None or queries.ndim != 2 else divmod(len(queries), _QUERIES_OF_A_GROUP)
+    if queries is None or groups < 2 or rest:
+        return state, ""
+    first = {**state, _OBJECT_QUERIES: queries[:_QUERIES_OF_A_GROUP].clone()}
+    return first, f"{groups - 1} of {groups} groups of object queries"
+
+
+def _our_name(key: str, first_extra: int, renames: Renames) -> str:
     output = re.match(r"^img_neck\.fpn_convs\.(\d+)\.conv\.(weight|bias)$", key)
     if output:
         level = int(output[1])
         part = f"output.{level}" if level < first_extra else f"extra.{level - first_extra}"
         return f"neck.{part}.{output[2]}"
-    for pattern, replacement in names:
+    for pattern, replacement in renames:
         key = re.sub(pattern, replacement, key)
     return key

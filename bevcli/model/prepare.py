@@ -1,34 +1,37 @@
 """A trained model prepared for inference: the same results, faster.
 
-The plain model knows nothing of this. A prepared model is a copy whose parts are exchanged for faster ones.
+The plain model knows nothing of this. A prepared model is a copy, some of whose parts are of faster classes with the
+same interface.
 """
 
 import atexit
 import copy
 import threading
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.model.backbone import Backbone
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.cuda_graph import Captured
-from bevcli.model.decoder import DecoderLayer
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
+from bevcli.model.decoder import DecoderLayer, ObjectQueries
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton, in_place_of
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.cuda_layers import FusedBottleneck, MapOnDevice, TokensInOnePass, attention_by_products
+from bevcli.model.kernels.cuda_layers import AttentionByProducts, FusedBottleneck, MapOnDevice, TokensInOnePass
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
+from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.segmentation import MaskDecoderLayer, SegmentationHead
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.registry import for_model
 
 Precision = Literal["fp32", "bf16", "fp16"]
 TOKENS_OF_A_BLOCK = 1024  # the sums of a block stay in the cache
@@ -41,8 +44,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
-    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `LastCall`). On a
-    CUDA GPU, `TemporalModel.device_parts` are replayed as CUDA graphs.
+    Results that do not change from frame to frame are computed once ("constant_parts" of the model, `LastCall`). On a
+    CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -51,95 +54,130 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
     """
     network = copy.deepcopy(model).eval().requires_grad_(False)
-    network.exchange_parts()
-    for module in network.modules() if device.type != "cpu" else ():
-        if isinstance(module, Pillars):
-            add_to_class(module, PaddedPillars)
-            vars(module).update(points_on_cpu=module.points, sizes={})
+    for fix_constant_parts in for_model("constant_parts", type(network))[:1]:
+        fix_constant_parts(network)
+    points_on_cpu = {name: module.points for name, module in network.named_modules() if isinstance(module, Pillars)}
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
-    if device.type == "cuda":
-        _use_cuda_layers(network, device)
-    dtype = DTYPES[precision]
-    for part in network.image_parts:
-        part.to(dtype)
-        if isinstance(part, Backbone) and part.by_image and device.type == "cpu":
-            add_to_class(part, ImageByImage)
-    for part in network.image_parts[:1]:
-        part.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
-    rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
-    rounds_attention = rounds or (precision != "fp32" and device.type == "cuda")
-    rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
+    kinds = faster_kinds(device)
     for name, module in list(network.named_modules()):
-        if isinstance(module, Pillars | CalibrationEmbedding):
-            add_to_class(module, LastCall)
-        if (
-            rounds_attention
-            and isinstance(module, DecoderLayer)
-            and isinstance(module.self_attention, nn.MultiheadAttention)
-        ):
-            network.set_submodule(f"{name}.self_attention", RoundedAttention(module.self_attention, dtype))
-        if isinstance(module, rounded):
-            module.attention.value_projection.to(dtype)
-            module.attention.value_dtype = dtype
-        if isinstance(module, ImageTokens) and device.type == "cpu":
-            add_to_class(module, TokensInBlocks)
+        if kind := kinds.get(type(module)):
+            network.set_submodule(name, in_place_of(module, kind))
+    for name, module in network.named_modules():
+        if isinstance(module, KeptPaddedPillars):
+            module.points_on_cpu, module.sizes = points_on_cpu[name], {}
+        if isinstance(module, FusedBottleneck):
+            module.fuse()
+        if isinstance(module, MapOnDevice):
+            module.config, module.grid = network.config.segmentation, network.config.bev_grid
+    dtype = DTYPES[precision]
+    if isinstance(network, Network):
+        network.backbone.to(dtype)
+        network.neck.to(dtype)
+        network.backbone.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
+    rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
+    round_attentions(network, dtype, temporal=rounds, queries=rounds or (precision != "fp32" and device.type == "cuda"))
     _check_finite(network)
     if device.type == "cuda":
-        network.stages = {"": "model"} if network.device_parts else network.stages  # a graph has no stages
-        for name in network.device_parts:
+        for name in methods_on_device(type(network)):
+            network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)
-        loaded = threading.Event()
-        for name, module in list(network.named_modules()):
-            if isinstance(module, ResNet):
-                network.set_submodule(f"{name}.pool", CompiledPool(module.pool, loaded))
-        # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
-        # copying of the model.
-        loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
-        loading.start()
-        atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
+        load_loops(network, dtype)
     return network
 
 
-def _use_cuda_layers(network: TemporalModel, device: torch.device) -> None:
-    """Exchanges layers, in place, for those of `cuda_layers` and of the Triton kernels."""
-    for module in network.modules():
-        if isinstance(module, Bottleneck) and torch.version.hip is None:  # cuDNN is NVIDIA's
-            add_to_class(module, FusedBottleneck)
-            cast(FusedBottleneck, module).fuse()
-        elif isinstance(module, ResNet) and has_triton(device):
-            from bevcli.model.kernels.triton_stem import FusedStem  # only where Triton is installed
+def faster_kinds(device: torch.device) -> dict[type[nn.Module], type[nn.Module]]:
+    """The classes that take the place of plain ones on a device, beside those of `choose_kernels`."""
+    if device.type == "cpu":
+        return {
+            Pillars: KeptPillars,
+            CalibrationEmbedding: KeptCalibrationEmbedding,
+            EfficientNetLite: EfficientNetLiteByImage,
+            ImageTokens: TokensInBlocks,
+        }
+    kinds: dict[type[nn.Module], type[nn.Module]] = {
+        Pillars: KeptPaddedPillars,
+        CalibrationEmbedding: KeptCalibrationEmbedding,
+    }
+    if device.type == "cuda":
+        kinds |= {ImageTokens: TokensInOnePass, MaskDecoderLayer: AttentionByProducts, SegmentationHead: MapOnDevice}
+        kinds |= {Bottleneck: FusedBottleneck} if torch.version.hip is None else {}  # cuDNN is NVIDIA's
+    if has_triton(device):
+        from bevcli.model.kernels.triton_stem import FusedStem  # only where Triton is installed
 
-            add_to_class(module, FusedStem)
-        elif type(module) is DeformableAttention and has_triton(device):
-            from bevcli.model.kernels.triton_attention import AttentionByHits  # only where Triton is installed
-
-            add_to_class(module, AttentionByHits)
-        elif isinstance(module, ImageTokens):
-            add_to_class(module, TokensInOnePass)
-        elif isinstance(module, MaskDecoderLayer):
-            module.attend = attention_by_products
-        elif isinstance(module, SegmentationHead):
-            add_to_class(module, MapOnDevice)
-            vars(module).update(config=network.config.segmentation, grid=network.config.bev_grid)
-
-
-def add_to_class(module: nn.Module, addition: type[nn.Module]) -> None:
-    """Puts the methods of an addition before those of this one module, in place; its other parts stay as they are."""
-    module.__class__ = type(type(module).__name__, (addition, type(module)), {})
+        kinds |= {ResNet: FusedStem}
+    return kinds
 
 
-class ImageByImage(nn.Module):
-    """Added to a backbone that runs on one image at a time."""
+def round_attentions(network: nn.Module, dtype: torch.dtype, *, temporal: bool, queries: bool) -> None:
+    """Gives attentions, in place, parts that compute in the data type of the images.
+
+    Those are the values of the image features, with `temporal` those of the BEV maps, and with `queries` the attention
+    of object queries to each other.
+    """
+    for module in list(network.modules()):
+        if isinstance(module, SpatialCrossAttention) or (temporal and isinstance(module, TemporalSelfAttention)):
+            projection = module.attention.value_projection
+            module.attention.set_submodule("value_projection", RoundedLinear(projection, dtype))
+        if queries and isinstance(module, DecoderLayer) and isinstance(module.self_attention, nn.MultiheadAttention):
+            module.set_submodule("self_attention", RoundedAttention(module.self_attention, dtype))
+
+
+def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
+    """Loads the compiled loops in a thread, beside the first frame's backbone, which needs no Python.
+
+    Started any earlier, the thread would slow down the copying of the model.
+    """
+    loaded = threading.Event()
+    for name, module in list(network.named_modules()):
+        if isinstance(module, ResNet):
+            network.set_submodule(f"{name}.pool", CompiledPool(module.pool, loaded))
+    loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
+    loading.start()
+    atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
+
+
+def methods_on_device(kind: type) -> list[str]:
+    """Names of the methods of a class that are marked by `on_device`."""
+    return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
+
+
+def fix_first_attention(model: Network) -> None:
+    """The object queries attend to each other before they see the frame: computed once, for the first decoder layer."""
+    first = model.decoder.layers[0]
+    first.self_attention = ConstantSelfAttention(first, model.decoder.object_queries(batch=1))
+
+
+class ConstantSelfAttention(nn.Module):
+    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
+        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
+        super().__init__()
+        assert isinstance(first, DecoderLayer)
+        with torch.no_grad():
+            key = queries.content + queries.position
+            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
+        return self.attended.expand_as(value), None
+
+
+class EfficientNetLiteByImage(EfficientNetLite):
+    """An `EfficientNetLite` that runs on one image at a time: depthwise convolutions wait for memory."""
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """As `Backbone.forward`."""
-        each = [super(ImageByImage, self).forward(image) for image in images.split(1)]
-        return [torch.cat(maps) for maps in zip(*each, strict=True)]
+        by_image = [super(EfficientNetLiteByImage, self).forward(image) for image in images.split(1)]
+        return [torch.cat(maps) for maps in zip(*by_image, strict=True)]
 
 
 def _check_finite(model: nn.Module) -> None:
@@ -150,6 +188,19 @@ def _check_finite(model: nn.Module) -> None:
                 f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
                 f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32`"
             )
+
+
+class RoundedLinear(nn.Module):
+    """A linear layer that computes in a half precision, whatever the precision of its input."""
+
+    def __init__(self, linear: nn.Module, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.linear, self.dtype = linear.to(dtype), dtype
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (..., in) -> (..., out)."""
+        rounded: Tensor = self.linear(x.to(self.dtype))
+        return rounded
 
 
 class RoundedAttention(nn.Module):
@@ -166,7 +217,7 @@ class RoundedAttention(nn.Module):
 
 
 class TokensInBlocks(ImageTokens):
-    """Added to the image tokens on a CPU: the same sums, block by block, without a copy of all tokens after each."""
+    """`ImageTokens` on a CPU: the same sums, block by block, without a copy of all tokens after each."""
 
     def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `ImageTokens.forward`."""
@@ -187,7 +238,7 @@ class TokensInBlocks(ImageTokens):
 
 
 class LastCall(nn.Module):
-    """Added to a part that sees only calibration, poses and sizes: it keeps the result of the last call.
+    """Of a part that sees only calibration, poses and sizes: it keeps the result of the last call.
 
     It computes again only where its arguments are not those of that call. The comparison needs no wait for a GPU where
     the tensors are on the CPU.
@@ -202,6 +253,18 @@ class LastCall(nn.Module):
             self._arguments = tuple(each.clone() if isinstance(each, Tensor) else each for each in arguments)
             self._result = super().forward(*arguments)
         return self._result
+
+
+class KeptPillars(LastCall, Pillars):
+    """`Pillars` that find the hits anew where the cameras have moved."""
+
+
+class KeptPaddedPillars(LastCall, PaddedPillars):
+    """`KeptPillars` for a GPU."""
+
+
+class KeptCalibrationEmbedding(LastCall, CalibrationEmbedding):
+    """A `CalibrationEmbedding` that computes anew where the cameras have moved."""
 
 
 def _equal(one: Any, other: Any) -> bool:

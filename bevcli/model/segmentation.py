@@ -163,17 +163,11 @@ class LocationDecoder(nn.Module):
 
 
 class MaskDecoderLayer(nn.Module):
-    """Multi-head attention of queries to all cells of the BEV map; a query's mask is made of its attention maps.
-
-    Attributes:
-        attend: the attention, of queries, keys and values (B, heads, …, C / heads); a faster function can take its
-            place.
-    """
+    """Multi-head attention of queries to all cells of the BEV map; a query's mask is made of its attention maps."""
 
     def __init__(self, channels: int, heads: int, feed_forward_width: int, dropout: float) -> None:
         super().__init__()
         self.heads = heads
-        self.attend: Callable[[Tensor, Tensor, Tensor], Tensor] = F.scaled_dot_product_attention
         self.query_projection = nn.Linear(channels, channels)
         self.key_projection = nn.Linear(channels, channels)
         self.value_projection = nn.Linear(channels, channels)
@@ -202,6 +196,10 @@ class MaskDecoderLayer(nn.Module):
         query = self.norms[0](query + self.dropout(self.output_projection(attended)))
         query = self.norms[1](query + self.feed_forward(query))
         return query, mask_logits, self.class_branch(query).squeeze(-1)
+
+    def attend(self, queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+        """The attention of queries to keys and values, (B, heads, …, C / heads) each."""
+        return F.scaled_dot_product_attention(queries, keys, values)
 
 
 def split_heads(tokens: Tensor, heads: int) -> Tensor:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -11,8 +11,7 @@ from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.transforms import Pose
 from bevcli.model.camera_assignment import CameraAssignment
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import ego_motion_inputs
@@ -113,61 +112,6 @@ class ModelOutputs:
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()
         logits, codes = self.class_logits[-1:], self.box_codes[-1:]
         return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
-
-
-class ClipInputs(Protocol):
-    """The inputs of B training clips of T frames each."""
-
-    @property
-    def inputs(self) -> Sequence[ModelInputs]:
-        """T inputs, one a frame of the clips."""
-
-    @property
-    def world_from_bev(self) -> Tensor:
-        """(T, B, 4, 4) float64, the pose of each frame's bev frame."""
-
-
-@dataclass(frozen=True)
-class FrameTruth:
-    """The ground truth of one frame, bev frame.
-
-    Attributes:
-        boxes: the G boxes to be found, each with one future of T steps; NaN from the step on in which the object is
-            not there.
-        lines: of the map.
-        driven: (T, 2) places where the vehicle was at the same times, metres; NaN after the end of the scene.
-        command: the driver's command that the driven path follows; "" where no place is known.
-    """
-
-    boxes: Boxes3D
-    lines: Any  # MapLines of VAD
-    driven: Array
-    command: str
-
-
-@dataclass(frozen=True)
-class SceneAttention:
-    """Attention to Q objects and N lines, the mean over heads. Places are in metres, bev frame.
-
-    Attributes:
-        objects: one box for each object query, with its best class.
-        object_weights: (Q,), which sum to 1.
-        lines: of all line queries, each with its best class.
-        line_weights: (N,), which sum to 1 together with `no_line`.
-        paths: (K, T + 1, 2), that come of the attention: planned paths, or futures of the attending object.
-        best: index of the path that counts; None where it is not known.
-        no_line: weight of the entry that stands for no line; 0 for a part without one.
-        attending: index of the object that attends; None for the own vehicle.
-    """
-
-    objects: Boxes3D
-    object_weights: Array
-    lines: Any  # MapLines of VAD
-    line_weights: Array
-    paths: Array
-    best: int | None = None
-    no_line: float = 0.0
-    attending: int | None = None
 
 
 def model_inputs(

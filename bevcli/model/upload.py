@@ -1,7 +1,7 @@
 """Copies from the CPU to a device that the CPU does not wait for."""
 
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -9,6 +9,17 @@ from torch import Tensor
 from bevcli.model.tensors import exchanged, tensors_in
 
 Value = TypeVar("Value")
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def on_device(method: Method) -> Method:
+    """Marks a method of a model that is a pure function of tensors on the device.
+
+    It does not wait for the device, uploads nothing but its arguments, and no shape depends on a tensor's numbers. On a
+    CUDA GPU it becomes a CUDA graph (`bevcli.model.prepare`).
+    """
+    vars(method)["is_on_device"] = True
+    return method
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:

@@ -1,4 +1,4 @@
-"""Reads the tensors of a .safetensors file, and of a PyTorch file (.pth) in the zip format and in the older one.
+"""Reads the tensors of a PyTorch file (.pth) in the zip format and in the older one.
 
 A pickle is read as data: nothing that it names is imported, and nothing that it asks for is called. The unpickler is
 that of the standard library in its Python form, whose table of opcodes can be replaced. Only the opcodes that
@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
-import safetensors
 import torch
 from torch import Tensor
 
-from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.errors import WeightsError
 from bevcli.parsing.files import open_regular
 
 MOST_OPCODES = 2_000_000  # the checkpoint of the base model, optimizer included, has about 100,000
@@ -439,18 +438,3 @@ def _damaged(path: Path, reason: str) -> WeightsError:
         f"{path}: not a weights file that is safe to read (expected .safetensors, or a PyTorch file of tensors and "
         f"plain values): it is damaged, is another kind of file, or holds objects that could run code ({reason:.200})"
     )
-
-
-def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors by name, on the CPU, and the metadata.
-
-    error: kind of exception for a file that is missing, damaged or no regular file.
-    """
-    open_regular(path, error=error).close()  # the library would wait for the writer of a pipe
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return tensors, dict(file.metadata() or {})
-    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
-        reason = " ".join(str(failure).split())
-        raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None

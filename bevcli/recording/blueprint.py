@@ -14,6 +14,15 @@ from bevcli.recording.colors import BACKGROUND
 from bevcli.recording.log_static import Recorded, legend_entries, legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
+HIDDEN = rrb.EntityBehavior(visible=False)
+EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
+VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
+WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
+TITLE_HEIGHT = 24  # pixels of a view's title
+TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
+CAMERAS_WIDTH = WINDOW[0] * (1 - TEXTS_SHARE)
+LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
+MAP_ZOOM = 17.0
 
 
 def camera_rows(rig: CameraRig) -> tuple[tuple[str, ...], ...]:
@@ -48,17 +57,6 @@ def rows_by_yaw(yaws: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
     ahead = sorted((name for name, yaw in yaws.items() if abs(yaw) <= SIDEWAYS), key=lambda name: -yaws[name])
     back = sorted(yaws.keys() - set(ahead), key=lambda name: yaws[name] % (2 * np.pi))
     return tuple(tuple(row) for row in (ahead, back) if row)
-
-
-HIDDEN = rrb.EntityBehavior(visible=False)
-EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
-VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
-WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
-TITLE_HEIGHT = 24  # pixels of a view's title
-TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
-CAMERAS_WIDTH = WINDOW[0] * (1 - TEXTS_SHARE)
-LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
-MAP_ZOOM = 17.0
 
 
 class Layout(rrb.Blueprint):

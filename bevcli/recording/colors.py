@@ -40,7 +40,7 @@ BACKGROUND: Color = (18, 20, 25)
 
 def class_colors(classes: Iterable[ObjectClass]) -> dict[str, Color]:
     """The colours of a model's classes, in their order. A class without a colour takes one by its index."""
-    return {one.name: one.color or index_color(index) for index, one in enumerate(classes)}
+    return {object_class.name: object_class.color or index_color(index) for index, object_class in enumerate(classes)}
 
 
 def index_color(index: int) -> Color:

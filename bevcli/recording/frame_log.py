@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.components import any_values, components, packed
+from bevcli.recording.components import any_values, components
 from bevcli.recording.log_bev import BevColors, BevImages, future_lines, log_ground_lines
 from bevcli.recording.log_boxes import TrackHistory, log_tracks
 from bevcli.recording.log_cameras import CameraImages, PosedCamera, box_labels
@@ -51,7 +51,7 @@ class FrameLog:
         self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
-        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # positions (cells, Z, 3), and packed colours
+        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
         self._object_classes = recorded.model.config.object_classes
         self._images = CameraImages(stream, as_video=self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
@@ -193,8 +193,7 @@ class FrameLog:
     ) -> None:
         in_world = truth.transformed(world_from_bev)
         colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
-        log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
-        log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
+        log_boxes.log_ground_truth(self._stream, in_world, truth, found, colors)
         log_cameras.log_ground_truth_in_images(self._stream, cameras, in_world, colors)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
@@ -229,11 +228,10 @@ class FrameLog:
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            drawn = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
-            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, drawn)
-            self._pillars = drawn, packed(log_static.pillar_colors(prediction.grid, len(drawn)))
+            grid, all_cells = prediction.grid, self._options.level == "full"
+            self._pillars = log_static.log_pillars(self._stream, grid, prediction.ego_from_bev, all_cells=all_cells)
         pillars, colors = self._pillars
-        points = apply(self._world_from_bev(prediction), pillars.reshape(-1, 3))
+        points = apply(self._world_from_bev(prediction), pillars)
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)

@@ -23,6 +23,11 @@ Features = NDArray[np.float32]
 FITTED_ON = 2  # frames
 CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
 PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
+GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
+PROBE_COLOR: Color = (255, 80, 220)
+BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
+FUTURES_OPACITY, FUTURES_WIDTH = 230, 1.0  # of 255; points of the user interface
+ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
 
 
 @dataclass(frozen=True)
@@ -124,11 +129,6 @@ def _principal_components(centered: Features) -> Features:
     return basis * np.where(signs == 0, 1, signs).astype(np.float32)
 
 
-GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
-PROBE_COLOR: Color = (255, 80, 220)
-BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
-
-
 def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: BevGrid, ego_from_bev: Array) -> None:
     """Writes an image of the BEV features into the BEV view, and onto the ground of the scene.
 
@@ -203,10 +203,6 @@ class _Painted:
         )
 
 
-OPACITY, WIDTH = 230, 1.0  # of 255; points of the user interface
-ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
-
-
 def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
     """The futures of boxes in the recording's world: colours by class, opaque by score of the mode, faded in time."""
     if boxes.futures is None or not len(boxes):
@@ -224,8 +220,8 @@ def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
         piece = steps[box, mode, step : step + 2]
         if np.isfinite(piece).all():
             strips.append(piece)
-            colors.append((*map(int, of_class[box][:3]), round(OPACITY * fading[step] * share[box, mode])))
-    return GroundLines(strips, colors, WIDTH)
+            colors.append((*map(int, of_class[box][:3]), round(FUTURES_OPACITY * fading[step] * share[box, mode])))
+    return GroundLines(strips, colors, FUTURES_WIDTH)
 
 
 def log_ground_lines(
@@ -255,7 +251,7 @@ def _log_in_images(stream: rr.RecordingStream, kind: str, lines: GroundLines, ca
     counts = np.full(len(cameras), len(ends))
     parts = cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, [posed.camera for posed in cameras])
     own_colors, radii = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4), ui_points(lines.width)
-    for posed, found in zip(cameras, parts, strict=True):
-        colors = own_colors[found.owners]
-        strips = components(rr.LineStrips2D, strips=found.segments, colors=colors, radii=radii, draw_order=15)
+    for posed, visible in zip(cameras, parts, strict=True):
+        colors = own_colors[visible.owners]
+        strips = components(rr.LineStrips2D, strips=visible.segments, colors=colors, radii=radii, draw_order=15)
         stream.log(entities.overlay(posed.name, kind), strips)

@@ -33,6 +33,14 @@ from bevcli.recording.components import Components, any_values, components, line
 from bevcli.recording.log_cameras import labels_in_scene
 
 MATCH_DISTANCE_M = DetectionConfig().error_distance_m
+MOVING_M_S = 0.5  # slower objects get no velocity arrow
+THIN, THICK = ui_points(0.8), ui_points(1.6)
+PAST_S = 5.0  # length of a trail
+AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
+LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
+PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
+ABOVE_GROUND_M = 0.05
+TRAIL_WIDTH = ui_points(1.2)
 
 
 def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
@@ -94,10 +102,6 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     return is_true, is_found
 
 
-MOVING_M_S = 0.5  # slower objects get no velocity arrow
-THIN, THICK = ui_points(0.8), ui_points(1.6)
-
-
 def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
     """(N, 3) uint8 RGB: the colour of each box's class."""
     other = index_color(len(classes))
@@ -111,8 +115,8 @@ def log_boxes_3d(
 
     boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
-    places = {name: place for place, name in enumerate(classes, 1)}
-    ids = np.array([places.get(name, 0) for name in boxes.classes.tolist()])
+    ids_of_classes = {name: index for index, name in enumerate(classes, 1)}
+    ids = np.array([ids_of_classes.get(name, 0) for name in boxes.classes.tolist()])
     labels = labels_in_scene(boxes, ego_xy)
     row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
     scored = boxes if boxes.scores is not None else replace(boxes, scores=np.ones(len(boxes)))
@@ -150,17 +154,6 @@ def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
-def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the recording's world) into the scene; found and missed ones are two entities.
-
-    found: (M,) bool. colors: (M, 3) uint8.
-    """
-    pale = _with_alpha(colors[found], 150)
-    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
-        row = components(rr.Boxes3D, **_shape(truth[chosen]), colors=color, radii=THIN)
-        stream.log(entity, row, any_values(name=_texts(truth.classes[chosen])))
-
-
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, classes)
@@ -179,11 +172,20 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, clas
         stream.log(entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
-def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
+def log_ground_truth(
+    stream: rr.RecordingStream, in_world: Boxes3D, in_bev: Boxes3D, found: np.ndarray, colors: np.ndarray
+) -> None:
+    """Writes ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
+
+    in_world, in_bev: in the recording's world, and in the bev frame. found: (M,) bool. colors: (M, 3) uint8.
+    """
+    pale = _with_alpha(colors[found], 150)
+    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
+        row = components(rr.Boxes3D, **_shape(in_world[chosen]), colors=color, radii=THIN)
+        stream.log(entity, row, any_values(name=_texts(in_world.classes[chosen])))
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = footprints(truth[chosen])
+        strips = footprints(in_bev[chosen])
         stream.log(entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
@@ -242,14 +244,6 @@ def log_boxes_on_map(
     """Writes the centres of boxes, in the sequence's world frame, in the colours of their classes."""
     places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, classes) if len(boxes) else None
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))
-
-
-PAST_S = 5.0  # length of a trail
-AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
-LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
-PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
-ABOVE_GROUND_M = 0.05
-WIDTH = ui_points(1.2)
 
 
 @dataclass
@@ -320,7 +314,7 @@ def log_tracks(
         own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
         style: Components = []
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
-            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=WIDTH)
+            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
             style = of_lines + any_values(track=name)
         strips = line_strips([ahead[i], outlines[i], *trail], 3)
         stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)

@@ -24,6 +24,16 @@ NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project fa
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
+LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
+LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
+# Of the image's width and height, for a view that is a third of the screen wide.
+LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
+UNSEEN = ui_points(0.01)  # of a point that shows only its label
+JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
+POINT = ui_points(2.0)
+AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
+AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
+KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
 
 
 @dataclass(frozen=True)
@@ -66,16 +76,16 @@ def cut_to_images(
     """
     ends, kept = clip_near(ends)
     own_counts = np.bincount(np.repeat(np.arange(len(cameras)), counts)[kept], minlength=len(cameras))
-    places = np.cumsum(own_counts)[:-1]
-    own_ends, own_owners = np.split(ends[kept], places), np.split(owners[kept], places)
+    ends_of_cameras = np.cumsum(own_counts)[:-1]
+    own_ends, own_owners = np.split(ends[kept], ends_of_cameras), np.split(owners[kept], ends_of_cameras)
     for i, camera in enumerate(cameras):
         if camera.distortion is not None:
             own_ends[i], own_owners[i] = _cut(own_ends[i]), np.repeat(own_owners[i], PIECES_PER_EDGE)
     pixels = [camera.project(own)[0] for camera, own in zip(cameras, own_ends, strict=True)]
     sizes = np.repeat([(camera.width, camera.height) for camera in cameras], [len(own) for own in pixels], axis=0)
     segments, inside = clip_to_image(np.concatenate(pixels), *sizes.T)
-    places = np.cumsum([len(own) for own in pixels])[:-1]
-    parts = zip(*(np.split(whole, places) for whole in (segments, inside)), own_owners, strict=True)
+    ends_of_cameras = np.cumsum([len(own) for own in pixels])[:-1]
+    parts = zip(*(np.split(whole, ends_of_cameras) for whole in (segments, inside)), own_owners, strict=True)
     return [ImageLines(own[shown], owner[shown]) for own, shown, owner in parts]
 
 
@@ -113,17 +123,11 @@ def _cut(ends: Array) -> Array:
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
-LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
-# Of the image's width and height, for a view that is a third of the screen wide.
-LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
-UNSEEN = ui_points(0.01)  # of a point that shows only its label
-
-
-def labels_2d(places: ArrayLike, texts: list[str], **options: Any) -> Components:
-    """Texts at places (L, 2), in the units of their view. options: of `rr.Points2D`."""
-    positions = np.asarray(places)
-    return components(rr.Points2D, positions=positions, labels=texts, radii=UNSEEN, show_labels=True, **options)
+def labels_2d(positions: ArrayLike, texts: list[str], **options: Any) -> Components:
+    """Texts at positions (L, 2), in the units of their view. options: of `rr.Points2D`."""
+    return components(
+        rr.Points2D, positions=np.asarray(positions), labels=texts, radii=UNSEEN, show_labels=True, **options
+    )
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
@@ -178,10 +182,6 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
-POINT = ui_points(2.0)
-
-
 @dataclass(frozen=True)
 class PosedCamera:
     """A camera with its pose at the time of its image.
@@ -209,11 +209,6 @@ def transform(parent_from_entity: Array) -> Components:
     """The pose (4, 4) of an entity in its parent, for a recording."""
     columns = parent_from_entity[:3, :3].T
     return components(rr.Transform3D, translation=parent_from_entity[:3, 3], mat3x3=columns)
-
-
-AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
-AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
-KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
 
 
 class Av1Encoder:
@@ -301,8 +296,8 @@ def log_boxes_in_images(
     """
     for posed, lines in zip(cameras, _lines_of(boxes, cameras), strict=True):
         stream.log(entities.overlay(posed.name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-        places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
-        labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
+        positions, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
+        labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
         stream.log(entities.overlay(posed.name, "boxes/labels"), labels)
 
 
@@ -315,7 +310,7 @@ def log_ground_truth_in_images(
 
 
 def _lines_of(boxes: Boxes3D, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
-    return lines_in_images(boxes, [one.camera for one in cameras], [one.camera_from_world for one in cameras])
+    return lines_in_images(boxes, [posed.camera for posed in cameras], [posed.camera_from_world for posed in cameras])
 
 
 def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevcli._version import __version__
 from bevcli.frame import DriveFacts, FrameStamp
@@ -31,7 +32,7 @@ from bevcli.recording.colors import (
     colormap,
     map_colors,
 )
-from bevcli.recording.components import components
+from bevcli.recording.components import components, packed
 from bevcli.recording.log_cameras import UNSEEN, labels_2d
 from bevcli.recording.mesh_file import Mesh
 from bevcli.recording.meshes import VehicleMesh, default_vehicle
@@ -43,6 +44,30 @@ WARNINGS = {
     UNTRAINED: "The weights are UNTRAINED: boxes and maps are meaningless.",
     FROM_RENDERED: "The weights were trained on rendered streets; these images are not rendered.",
 }
+RING_STEP_M = 10
+DEFAULT_RANGE_M = 50.0  # of the range rings without a model
+FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
+SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
+PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
+HOW_TO_READ = """\
+- **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
+  grey.
+- **False positives** are crossed out in red: no ground truth of their class is within 2 m.
+- **Duplicates**, a second box on an object, have one grey diagonal.
+- **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
+  velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
+- **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
+  box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
+  ribbon.
+- **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
+  `segmentation`, below `ego` in the left panel.
+- **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
+  first: click the eye next to `pillars` in the left panel.
+"""
+LEGEND_COLUMNS = 2
+COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
+TEXT_COLOR: Color = (225, 228, 235)
 
 
 class RecordedModel(Protocol):
@@ -105,29 +130,6 @@ class Recorded:
         return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
 
 
-RING_STEP_M = 10
-DEFAULT_RANGE_M = 50.0  # of the range rings without a model
-FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
-SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
-PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
-HOW_TO_READ = """\
-- **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
-  grey.
-- **False positives** are crossed out in red: no ground truth of their class is within 2 m.
-- **Duplicates**, a second box on an object, have one grey diagonal.
-- **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
-  velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
-- **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
-  box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
-  ribbon.
-- **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
-  `segmentation`, below `ego` in the left panel.
-- **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
-  first: click the eye next to `pillars` in the left panel.
-"""
-
-
 def log_scene(
     stream: rr.RecordingStream,
     rig: CameraRig,
@@ -151,6 +153,7 @@ def log_scene(
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     """Writes the page "About", and the facts of the run that readers of the file need."""
+    cameras, untrained = recorded.drive.rig.names, recorded.model.untrained
     maps, lines = recorded.map_classes, line_entries(recorded.model.config)
     of_map: dict[str, Any] = {"map_classes": list(maps)} if maps else {}
     if lines:
@@ -158,27 +161,21 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
         of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
     facts = rr.AnyValues(
         title=recorded.title,
-        untrained=recorded.model.untrained,
+        untrained=untrained,
         note=recorded.note,
         score=recorded.options.score,
         class_names=list(recorded.classes),
         class_colors=list(map(hex_of_color, recorded.classes.values())),
-        camera_names=list(recorded.drive.rig.names),
+        camera_names=list(cameras),
         **of_map,
     )
-    page = rr.TextDocument(_about_text(recorded), media_type="text/markdown")
-    stream.log(entities.RUN, page, facts, static=True)
-
-
-def _about_text(recorded: Recorded) -> str:
-    """The page "About" in Markdown: the run, and how to read the views."""
-    names, untrained = recorded.drive.rig.names, recorded.model.untrained
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
-    facts = (
-        f"bevcli {__version__}; {counted(len(names), 'cameras')}: {', '.join(names)}. "
+    summary = (
+        f"bevcli {__version__}; {counted(len(cameras), 'cameras')}: {', '.join(cameras)}. "
         f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
     )
-    return f"# {recorded.title}\n\n{warning}{facts}\n{HOW_TO_READ}"
+    page = rr.TextDocument(f"# {recorded.title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
+    stream.log(entities.RUN, page, facts, static=True)
 
 
 def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
@@ -198,26 +195,21 @@ def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
     stream.log(entities.SPEED, components(rr.Points3D, positions=np.array([SPEED_LABEL_M]), **facts))
 
 
-def drawn_pillars(grid: BevGrid, *, all_cells: bool = False) -> Array:
-    """The pillars to draw: (cells, Z, 3) 3D reference points in the bev frame, metres.
+def log_pillars(
+    stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, *, all_cells: bool
+) -> tuple[Array, NDArray[np.uint32]]:
+    """Writes the 3D reference points of the grid's pillars into the scene, coloured by height from blue to red.
 
-    At most PILLARS_PER_SIDE along each side of the grid, evenly spaced, unless `all_cells`.
+    At most PILLARS_PER_SIDE pillars along each side of the grid, evenly spaced, unless `all_cells`.
+
+    Returns the points (K, 3) in the bev frame, and their colours (K,) of `packed`.
     """
     steps = [1 if all_cells else max(1, -(-side // PILLARS_PER_SIDE)) for side in (grid.rows, grid.columns)]
-    pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]]
-    return pillars.reshape(-1, grid.pillar_points, 3)
-
-
-def log_pillars(stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, pillars: Array) -> None:
-    """Writes pillars (cells, Z, 3), in the bev frame, into the scene, coloured by height."""
-    points = apply(ego_from_bev, pillars).reshape(-1, 3)
-    colors = pillar_colors(grid, len(pillars))
+    pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]].reshape(-1, grid.pillar_points, 3)
+    of_pillar = colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo")
+    colors, points = np.tile(of_pillar, (len(pillars), 1)), apply(ego_from_bev, pillars).reshape(-1, 3)
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-
-
-def pillar_colors(grid: BevGrid, cells: int) -> np.ndarray:
-    """(cells * Z, 3) uint8 RGB: the lowest point of each pillar is blue, the highest red."""
-    return np.tile(colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo"), (cells, 1))
+    return pillars.reshape(-1, 3), packed(colors)
 
 
 def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
@@ -277,11 +269,6 @@ def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     return points[:, :2] * (1, -1)
 
 
-COLUMNS = 2
-COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
-TEXT_COLOR: Color = (225, 228, 235)
-
-
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
@@ -298,12 +285,12 @@ def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
 
 def legend_size(entries: int) -> tuple[float, float]:
     """Width and height of the legend with this number of entries, in the units of its view."""
-    return COLUMNS * COLUMN_WIDTH, -(-entries // COLUMNS) * ROW_HEIGHT
+    return LEGEND_COLUMNS * COLUMN_WIDTH, -(-entries // LEGEND_COLUMNS) * ROW_HEIGHT
 
 
 def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
     """Writes the legend: a filled circle and a text for each entry, in columns."""
-    rows = -(-len(entries) // COLUMNS)
+    rows = -(-len(entries) // LEGEND_COLUMNS)
     places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
     texts, colors = [text for text, _ in entries], [color for _, color in entries]
     circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))

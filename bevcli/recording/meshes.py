@@ -31,6 +31,8 @@ RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
 LONGEST_M = 50.0  # a longer mesh is not in metres
+MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
+FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 
 
 @dataclass(frozen=True)
@@ -131,10 +133,6 @@ def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
     return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
 
 
-MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
-FARTHEST = 1e9  # of a vertex from the origin, in the file's units
-
-
 def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
     """The meshes of the classes that have one, by class, scaled to a cube of 1 m around the origin.
 
@@ -142,7 +140,7 @@ def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
     Raises InputError for a file that `read_mesh` does not take, and for one of more than MOST_TRIANGLES triangles.
     """
     colors = class_colors(classes.values())
-    return {name: _read(name, Path(one.mesh), colors[name]) for name, one in classes.items() if one.mesh}
+    return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
 
 
 def _read(name: str, path: Path, color: Color) -> Mesh:
@@ -171,7 +169,7 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
 
 def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
     """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
-    for name in (name for name, one in classes.items() if one.mesh):
+    for name in (name for name, settings in classes.items() if settings.mesh):
         own = boxes[boxes.classes == name]
         # The last one has no size: an entity without poses would show its mesh at the origin.
         poses = components(

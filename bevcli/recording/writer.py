@@ -27,6 +27,10 @@ from bevcli.sequences.files.incremental_json import GrowingFile
 BLOCK = 1 << 20  # bytes
 HEADER = 12  # bytes at the beginning of an .rrd file
 TIMEOUT_S = 20.0
+APPLICATION = "bevcli"
+FLUSH_TIMEOUT_S = 20.0
+ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
+INDEXED_FRAMES = 200  # a longer recording has no index, see `RrdFile`
 
 
 class RrdFile(GrowingFile):
@@ -146,12 +150,6 @@ class RrdFile(GrowingFile):
                 self.append(rest)
         except OutputError as error:
             self._error = error
-
-
-APPLICATION = "bevcli"
-FLUSH_TIMEOUT_S = 20.0
-ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
-INDEXED_FRAMES = 200  # a longer recording has no index, see `RrdFile`
 
 
 class LiveSink(Protocol):

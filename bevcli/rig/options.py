@@ -15,11 +15,6 @@ class CheckOptions:
     sequence: Path | None = option(
         reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
     )
-    motion: bool = option(
-        default=True,
-        help="With a sequence, also measure the calibration from its motion, in the short form of `bevcli calibrate`.",
-        flag="--motion/--no-motion",
-    )
     frame: int = option(default=0, help="Index of the frame whose images are drawn on.", minimum=0)
     out: Path | None = option(default=None, help="The output folder. Default: runs/NAME-project-debug.")
     model: str = option(

@@ -25,7 +25,6 @@ from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibrati
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
-from bevcli.viewer.recording_file import restore_index
 from bevcli.writing import whole_file, write_whole
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
@@ -117,6 +116,8 @@ class RunFiles:
     def __exit__(self, *raised: Any) -> None:
         self._stack.__exit__(*raised)
         if self._resume is not None and self._is_complete:  # else its bytes must stay for the next resume
+            from bevcli.viewer.recording_file import restore_index
+
             restore_index(self._out / RECORDING)
 
     def write(self, frame: Frame, prediction: Prediction) -> None:

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from bevcli.errors import InputError, OutputError
-from bevcli.parsing.documents import read_json
+from bevcli.errors import OutputError
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.writing import lock, output_errors
@@ -48,7 +47,7 @@ class RunFolder:
                     "interrupted run, or `out=DIR` for another folder"
                 )
             self._stack.enter_context(folder_lock(out))
-            self._names = set(self._read_written())
+            self._names = self._read_written()
             self._stack = self._stack.pop_all()
         return self
 
@@ -96,16 +95,13 @@ class RunFolder:
     def _has_no_run(self) -> bool:
         return all(entry.name == OWN for entry in self.path.iterdir()) and not (self.path / OWN / "written").exists()
 
-    def _read_written(self) -> Iterator[str]:
-        """The files of earlier runs: the list, or of older versions the files that summary.json names."""
+    def _read_written(self) -> set[str]:
+        """The files of earlier runs. A path with ".." would leave the folder: no run of ours writes one."""
         file = self.path / OWN / "written"
-        if file.is_file():
-            content = read_bytes(file, LARGEST_LIST, error=OutputError)
-            names = content.decode(errors="replace").splitlines()
-        else:
-            names = [os.path.relpath(path, self.path) for path in _files_in_summary(self.path / SUMMARY)]
-        # A path with ".." would leave the folder: no run of ours writes one.
-        yield from (name for name in names if name and not Path(name).is_absolute() and ".." not in Path(name).parts)
+        if not file.is_file():
+            return set()
+        names = read_bytes(file, LARGEST_LIST, error=OutputError).decode(errors="replace").splitlines()
+        return {name for name in names if name and not Path(name).is_absolute() and ".." not in Path(name).parts}
 
 
 @contextlib.contextmanager
@@ -122,22 +118,16 @@ def folder_lock(out: Path) -> Iterator[None]:
             held = stack.enter_context(_locked(out / OWN / "lock", out))
             stack.callback(_remove, held.name)
             if sys.platform != "win32":
-                stack.callback(os.close, _locked_folder(out))
+                folder = os.open(out, os.O_RDONLY)
+                stack.callback(os.close, folder)
+                if not lock(folder):
+                    raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
         yield
 
 
 def _remove(path: str) -> None:
     with contextlib.suppress(OSError):
         os.unlink(path)
-
-
-def _locked_folder(out: Path) -> int:
-    """The descriptor of the locked folder. Raises OutputError where another run has locked it."""
-    folder = os.open(out, os.O_RDONLY)
-    if not lock(folder):
-        os.close(folder)
-        raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
-    return folder
 
 
 def _locked(path: Path, out: Path) -> IO[str]:
@@ -157,12 +147,3 @@ def _locked(path: Path, out: Path) -> IO[str]:
     file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
     file.flush()
     return file
-
-
-def _files_in_summary(path: Path) -> list[str]:
-    try:
-        summary = read_json(path)
-    except InputError:
-        return []
-    files = summary.get("files") if isinstance(summary, dict) and "bevcli_version" in summary else None
-    return [file for file in files if isinstance(file, str)] if isinstance(files, list) else []

@@ -1,14 +1,13 @@
 """`run_into_folder`: run a model over a sequence and write files, as `bevcli run` does."""
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.inference.background import write_behind
+from bevcli.inference.background import WriteBehind
 from bevcli.inference.commands import read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
@@ -18,12 +17,11 @@ from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.files import RunFiles
 from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions
-from bevcli.runs.state import START_ANEW, RunState, StateSaver, run_facts, save_state, saved_state
+from bevcli.runs.state import START_ANEW, RunState, RunWriter, run_facts, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
 from bevcli.sequences.images import no_image_error
-from bevcli.workshop.engines.in_engine import in_engine
 
-Steps = Iterator[tuple[Frame, Prediction, RunnerState[Any]]]  # of `Runner.run`
+Step = tuple[Frame, Prediction, RunnerState[Any]]
 
 
 def run_into_folder(
@@ -64,8 +62,8 @@ def run_into_folder(
             the run to resume was another one.
     """
     options = RunOptions() if options is None else options
-    model = in_engine(model, sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
-    commands, probes = read_commands(options.command, model.config), tuple(options.recording.probes)
+    model = model.in_engine(sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
+    commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
@@ -83,24 +81,36 @@ def run_into_folder(
         checked = sequence if isinstance(sequence, CheckedDrive) else CheckedDrive(sequence)
         summary = RunSummary(model, checked, options, state.counts)
         folder.add(out / SUMMARY)
-        files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
-        saver, began_at = StateSaver(folder.state_path, facts, files, summary), state.frames
+        done = state.frames
+        files = RunFiles(folder, sequence, model, options, live, state.files, done=done)
+        writer = RunWriter(folder.state_path, facts, files, summary)
 
-        def steps(before: RunnerState[Any]) -> Steps:
-            """The remaining frames; the model is prepared when the first of them is asked for."""
-            asked = {"ask_attention": options.recording.shows_internals, "probes": probes, "commands": commands}
-            runner = model.runner(track=options.track, temporal=options.temporal, **asked)
-            places = range(began_at, len(sequence.stamps))
-            yield from runner.run(sequence, places, runner.preprocessor(options.cameras), before)
+        def write(step: Step) -> bool:
+            frame, prediction, after = step
+            writer.write(frame, prediction, after)
+            after_frame(frame, prediction)
+            return not should_stop()
 
         try:
-            _write_steps(steps(state.runner), files, summary, saver, after_frame, should_stop)
+            with files, writer, WriteBehind(write) as background:
+                runner = model.runner(
+                    track=options.track,
+                    temporal=options.temporal,
+                    ask_attention=options.recording.shows_internals,
+                    probes=tuple(options.recording.probes),
+                    commands=commands,
+                )
+                after, indices = state.runner, range(done, len(sequence.stamps))
+                for prepared, upcoming in runner.frames(sequence, indices, runner.preprocessor(options.cameras)):
+                    after, prediction = runner.step(after, prepared, upcoming)
+                    if not background.put((prepared.frame, prediction, after)):
+                        break
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:
                 raise no_image_error(sequence.name, (each[1:] for each in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())
-            if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < began_at == summary.frames:
+            if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < done == summary.frames:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
                 raise OutputError(
                     f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
@@ -108,35 +118,3 @@ def run_into_folder(
             raise
         summary.write(out, files.written())
     return summary
-
-
-def _write_steps(
-    steps: Steps,
-    files: RunFiles,
-    summary: RunSummary,
-    saver: StateSaver,
-    after_frame: Callable[[Frame, Prediction], None],
-    should_stop: Callable[[], bool],
-) -> None:
-    """Write frames as they are made, count them, and save the state, all in a thread of its own."""
-    start, latest, is_whole, began = summary.frames, RunnerState[Any](), True, time.perf_counter()
-
-    def write(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
-        nonlocal latest, is_whole, began
-        frame, prediction, after = step
-        is_whole, writing_began = False, time.perf_counter()
-        files.write(frame, prediction)
-        now = time.perf_counter()
-        summary.add(frame, prediction, recording_s=now - writing_began, whole_s=now - began)
-        latest, is_whole, began = after, True, now
-        if saver.is_due(latest):
-            saver.save(latest)
-        after_frame(frame, prediction)
-        return not should_stop()
-
-    with files:
-        try:
-            write_behind(write, steps)
-        finally:
-            if is_whole and summary.frames not in (start, saver.saved_frames):
-                saver.save(latest)

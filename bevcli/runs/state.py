@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, get_origin
+from typing import Any, Generic, Protocol, Self, TypeVar, get_origin
 
 import msgspec
 import numpy as np
@@ -19,13 +19,13 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bevcli._version import __version__
+from bevcli.checkpoints import read_safetensors
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Sequence
+from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.load import Model, hash_of
 from bevcli.inference.runner import Memory, RunnerState
-from bevcli.inference.transfer import tensors_in
+from bevcli.model.tensors import tensors_in
 from bevcli.parsing.files import read_bytes
-from bevcli.parsing.pth import read_safetensors
 from bevcli.runs.files import FilesState, RunFiles
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts, RunSummary
@@ -111,15 +111,38 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
     return state
 
 
-class StateSaver:
-    """Saves the state of a run as often as SHARE of its time allows."""
+class RunWriter:
+    """`with RunWriter(…) as writer: writer.write(frame, prediction, after)`.
+
+    Writes frames to the files of a run, counts them, and saves the state as often as SHARE of its time allows. The end
+    of the block, whatever causes it, saves the state after the last whole frame.
+    """
 
     def __init__(self, path: Path, facts: Mapping[str, str], files: RunFiles, summary: RunSummary) -> None:
+        """path: of the state file. facts: of `run_facts`."""
         self._path, self._facts, self._files, self._summary = path, facts, files, summary
-        self._began = time.perf_counter()
+        self._began = self._frame_began = time.perf_counter()
         self._spent_s = 0.0
         self._longest_s: float | None = None
-        self.saved_frames: int | None = None
+        self._after: RunnerState[Any] | None = None  # the state after a frame that is not saved yet
+        self._is_whole = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._is_whole and self._after is not None:
+            self.save(self._after)
+
+    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any]) -> None:
+        """Write the next frame. after: the state of the runner after it."""
+        self._is_whole, began = False, time.perf_counter()
+        self._files.write(frame, prediction)
+        now = time.perf_counter()
+        self._summary.add(frame, prediction, recording_s=now - began, whole_s=now - self._frame_began)
+        self._after, self._is_whole, self._frame_began = after, True, now
+        if self.is_due(after):
+            self.save(after)
 
     def is_due(self, runner: RunnerState[Any]) -> bool:
         """Time has been long enough for another save."""
@@ -133,10 +156,9 @@ class StateSaver:
         if parts is None:
             return
         kept = RunnerState() if summary.is_complete else runner  # nothing comes after the last frame
-        state = RunState(self._facts, parts, summary.counts, kept)
-        save_state(self._path, state)
+        save_state(self._path, RunState(self._facts, parts, summary.counts, kept))
         took = time.perf_counter() - began
-        self.saved_frames = state.frames
+        self._after = None
         self._spent_s += took
         self._longest_s = max(self._longest_s or 0.0, took)
 

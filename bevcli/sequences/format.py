@@ -103,16 +103,20 @@ def format_of(path: Path) -> Format:
     return first
 
 
+def true_result_files(form: str) -> list[str]:
+    """Names of the files and folders with further ground truth that a drive of a format may have."""
+    return [name.removeprefix(f"{form}/") for name in entries(TRUE_RESULTS) if name.startswith(f"{form}/")]
+
+
 def true_results(form: str, folder: Path, **facts: Any) -> tuple[TrueResult, ...]:
-    """Readers of the further ground truth in the folder of a drive, of the types registered for its format.
+    """Readers of the further ground truth in the folder of a drive.
 
     facts: of the drive, which those of this format take beside the path. Raises InputError.
     """
-    from bevcli.sequences.files.incremental_json import existing
+    from bevcli.sequences.files.incremental_json import existing  # imports OpenCV, which `--help` must not
 
-    names = [name for name in entries(TRUE_RESULTS) if name.startswith(f"{form}/")]
-    paths = {name: folder / name.removeprefix(f"{form}/") for name in names}
-    return tuple(load(TRUE_RESULTS, name)(path, **facts) for name, path in paths.items() if is_there(existing(path)))
+    names = [name for name in true_result_files(form) if is_there(existing(folder / name))]
+    return tuple(load(TRUE_RESULTS, f"{form}/{name}")(folder / name, **facts) for name in names)
 
 
 def is_drive(path: Path) -> bool:

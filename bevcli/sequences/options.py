@@ -127,10 +127,6 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
-def _complete_format(incomplete: str) -> list[str]:
-    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
-
-
 @options("Input")
 class LabelOptions:
     """Ground truth from a file of labels."""
@@ -164,7 +160,7 @@ class WriteOptions:
         "Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
-        complete=_complete_format,
+        complete=lambda incomplete: list(entries("bevcli.drive_writers")),
     )
     force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
     boxes: Path | None = option(

@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 PORTS_TRIED = 20
+Answer = TypeVar("Answer")
+START_TIMEOUT_S = 40.0
+WHOLE_TIMEOUT_S = 180.0
+ENDINGS = (".png", ".jpg", ".jpeg")
+JPEG_QUALITY = 90
+SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
+NO_DRIVER = (
+    "the viewer cannot draw here: it needs a Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
+)
 
 
 def viewer_binary() -> Path:
@@ -86,17 +95,6 @@ def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:
                 continue
             return int(probe.getsockname()[1])
     raise AssertionError("the system has no free port")
-
-
-Answer = TypeVar("Answer")
-START_TIMEOUT_S = 40.0
-WHOLE_TIMEOUT_S = 180.0
-ENDINGS = (".png", ".jpg", ".jpeg")
-JPEG_QUALITY = 90
-SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
-NO_DRIVER = (
-    "the viewer cannot draw here: it needs a Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
-)
 
 
 def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> tuple[str, ...]:

@@ -52,9 +52,3 @@ class ViewOptions:
         help="Write a video of all cameras and the BEV, with boxes: H.264 if PyAV is installed, else VP9.",
         metavar="OUT.mp4|.webm",
     )
-    export: Path | None = option(
-        default=None,
-        help="Write the shown boxes in the world frame.",
-        metavar="BOXES.csv|.json",
-        retired="bevcli export RECORDING.rrd writes the boxes",
-    )

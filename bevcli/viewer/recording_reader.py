@@ -15,12 +15,11 @@ import pyarrow as pa
 from rerun.chunk import Chunk, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 Row = dict[str, pa.Scalar]
 
@@ -28,6 +27,8 @@ Row = dict[str, pa.Scalar]
 Logged = tuple[bytes, str, Row]  # the row's identity, which grows with the time of logging; its entity; its components
 OF_EACH_FRAME = (entities.EGO, entities.BOXES)  # never those of an earlier frame
 NO_FRAME = np.inf  # after all frames
+MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
+SHOWN_ENTITIES = 15
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,13 @@ class RecordedFrame:
         count: the N that is expected, if any is. nan: NaN, for a number that is not known, may be among them.
         """
         flat = self._flat(entity, component, width)
-        numbers = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
-        found = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if numbers else np.zeros(1)
-        if not numbers or len(found) % width or count not in (None, len(found) // width):
+        is_numeric = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
+        values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if is_numeric else np.zeros(1)
+        if not is_numeric or len(values) % width or count not in (None, len(values) // width):
             raise self.wrong(entity, component, f"values of {width} numbers", flat, count)
-        if not (np.isfinite(found) | (nan & np.isnan(found))).all():
+        if not (np.isfinite(values) | (nan & np.isnan(values))).all():
             raise self.wrong(entity, component, "finite numbers", "NaN or infinity")
-        return found.reshape(-1, width)
+        return values.reshape(-1, width)
 
     def strips(self, entity: str, component: str) -> list[Array]:
         """The values of a component that are lists of points, (P, 2) each."""
@@ -199,27 +200,12 @@ def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
     return state
 
 
-MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
-
-
 def read_recording(recording: Path) -> BoxesFile:
     """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
     frames = tuple(recorded_boxes(frame) for frame in RecordingReader(recording).frames())
     if not frames:
         raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
     return BoxesFile("world", frames)
-
-
-def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
-    """Write the shown boxes, in the world frame, metres and radians; return the number of frames and of boxes.
-
-    Raises InputError if the path does not end in .csv or .json, OutputError if the file cannot be written.
-    """
-    writers = {".csv": write_csv, ".json": write_boxes}
-    if path.suffix.lower() not in writers:
-        raise InputError(f"{path}: the file must end in .csv or .json")
-    boxes = read_recording(recording)
-    return len(boxes.frames), writers[path.suffix.lower()](boxes, path)
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
@@ -256,9 +242,6 @@ def _column(frame: RecordedFrame, column: Column, count: int) -> Any:
         return np.array(frame.texts(entities.BOXES, column.recorded, count), dtype=np.str_)
     values = frame.array(entities.BOXES, column.recorded, 1, count)[:, 0]
     return values.astype({"flag": bool, "count": np.int64}.get(column.values, np.float64))
-
-
-SHOWN_ENTITIES = 15
 
 
 @dataclass(frozen=True)

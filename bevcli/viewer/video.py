@@ -30,6 +30,27 @@ from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
 
 MOST_PIXELS = 64 << 20
+Canvas = NDArray[np.uint8]
+ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUBPIXEL_BITS = 3
+STRIPS = "LineStrips2D:strips"
+FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
+OPACITIES = 10  # steps of opacity, faint to opaque
+WIDTH, HEIGHT = 1920, 640
+BEV_SIDE = 640
+CAMERAS_WIDTH = WIDTH - BEV_SIDE
+CAMERAS_HEIGHT = 500
+BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
+BEV_MARGIN = 1.02  # of the range rings and the border of the grid
+BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
+BELOW_BOXES = (
+    entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
+)  # fmt: skip
+TEXT, WARNING = (225, 220, 215), (85, 70, 255)
+FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
+H264_QUALITY = 21  # x264's crf
+SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
 class Av1Decoder:
@@ -73,15 +94,6 @@ class CameraImages:
         return None if image is None else image.astype(np.uint8, copy=False)
 
 
-Canvas = NDArray[np.uint8]
-ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-SUBPIXEL_BITS = 3
-STRIPS = "LineStrips2D:strips"
-FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
-OPACITIES = 10  # steps of opacity, faint to opaque
-
-
 def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
     """Draws the line strips of an entity, opaque."""
     strips = frame.strips(entity, STRIPS)
@@ -99,8 +111,8 @@ def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canv
     step = np.ceil(opacity / 255 * OPACITIES).astype(int)
     for level in np.unique(step[step > 0]):
         below = canvas.copy()
-        for place in np.flatnonzero(step == level):
-            _draw_line(canvas, strips[place], colors[place], to_canvas)
+        for index in np.flatnonzero(step == level):
+            _draw_line(canvas, strips[index], colors[index], to_canvas)
         canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
 
 
@@ -159,19 +171,6 @@ def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
     if pixels.size != math.prod(shape) or not pixels.size:
         raise frame.wrong(entity, "Image:buffer", f"{shape[1]} x {shape[0]} pixels RGB", f"{pixels.size} bytes")
     return pixels.reshape(shape)[..., ::-1]
-
-
-WIDTH, HEIGHT = 1920, 640
-BEV_SIDE = 640
-CAMERAS_WIDTH = WIDTH - BEV_SIDE
-CAMERAS_HEIGHT = 500
-BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
-BEV_MARGIN = 1.02  # of the range rings and the border of the grid
-BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
-BELOW_BOXES = (
-    entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
-)  # fmt: skip
-TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 
 
 @dataclass(frozen=True)
@@ -298,8 +297,8 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
     counts = Counter(frame.texts(entities.BOXES, "name"))
     for index, (name, color) in enumerate(_class_colors(frame).items()):
-        place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
+        position = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
+        _draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
     for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
         _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
@@ -321,15 +320,15 @@ def _class_colors(frame: RecordedFrame) -> dict[str, Color]:
 def _named_colors(frame: RecordedFrame, names: str, colors: str) -> dict[str, Color]:
     """The colours that the recording states, by name."""
     keys = frame.texts(entities.RUN, names)
-    found = frame.texts(entities.RUN, colors, len(keys))
+    values = frame.texts(entities.RUN, colors, len(keys))
     try:
-        return {name: color_of_hex(color) for name, color in zip(keys, found, strict=True)}
+        return {name: color_of_hex(color) for name, color in zip(keys, values, strict=True)}
     except ValueError:
-        raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", found) from None
+        raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", values) from None
 
 
-def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str) -> None:
-    x, y = place
+def _draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: str) -> None:
+    x, y = position
     cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), color[::-1], -1)
     draw_text(canvas, text, (x + 24, y), TEXT)
 
@@ -337,11 +336,6 @@ def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str)
 def _rotation(frame: RecordedFrame, entity: str) -> Array:
     columns = frame.array(entity, "Transform3D:mat3x3", 9)
     return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns
-
-
-FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
-H264_QUALITY = 21  # x264's crf
-SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
 def write_video(recording: Path, video: Path, count: int, rate: float, on_frame: Callable[[], None]) -> None:
@@ -365,8 +359,9 @@ def write_video(recording: Path, video: Path, count: int, rate: float, on_frame:
 
 def _check_complete(video: str, count: int) -> None:
     """Raises OSError where a video lacks frames: OpenCV does not tell that a disk is full."""
-    found = cv2.VideoCapture(video)
-    if not (found.isOpened() and found.get(cv2.CAP_PROP_FRAME_COUNT) >= count - 1):  # computed from the times in a WebM
+    capture = cv2.VideoCapture(video)
+    frames = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else -1  # computed from the times in a WebM
+    if frames < max(count - 1, 0):
         raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
 
 
@@ -411,18 +406,3 @@ def _images(recording: Path) -> Iterator[np.ndarray]:
     for frame in RecordingReader(recording).frames():
         layout = layout or tiles(frame)
         yield draw_frame(frame, layout, images)
-
-
-def draw_frame_at(recording: Path, index: int) -> np.ndarray | None:
-    """One frame as in the video, (HEIGHT, WIDTH, 3) uint8 BGR; None if the recording does not have it.
-
-    recording: of `open_recording`. index: of the frame.
-    """
-    images = CameraImages()
-    for frame in RecordingReader(recording).frames():
-        if frame.index == index:
-            return draw_frame(frame, tiles(frame), images)
-        for name in frame.texts(entities.RUN, "camera_names"):
-            if frame.has(entities.image(name), "VideoStream:sample"):  # a video is decoded in order
-                images.image(frame, name)
-    return None

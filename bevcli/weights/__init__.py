@@ -1,4 +1,4 @@
-"""Weights by name: `cache` (where they lie), `download` (HTTP), `fetch` (checks).
+"""Files of weights: the demo's own (`demo.safetensors`), where others are published (`sources.toml`), and downloads.
 
-Only `fetch` connects to another machine, and only where it is called. `demo.safetensors` are the weights of the demo.
+Only `fetch` connects to another machine, and only where it is called.
 """

@@ -38,7 +38,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.transfer import image_uploader
 from bevcli.model.network import Network
-from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.prepare import Precision, methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say
@@ -193,7 +193,7 @@ class Check:
         text = (
             f"{TRAINED_MODEL}: {found['updates']} updates, {found['updates a second']:.2f} a second after the first, "
             f"{found['frames a second']:.0f} frames learned a second; first update after {found['first_s']:.1f} s; "
-            f"{found['without data']:.1%} of the time without data; last loss {found['loss']:.3g}."
+            f"last loss {found['loss']:.3g}."
         )
         if not found["finite"]:
             raise CheckFailed(text)
@@ -375,7 +375,7 @@ def is_launch(name: str) -> bool:
 @contextlib.contextmanager
 def without_graphs(network: TemporalModel) -> Iterator[bool]:
     """Inside, nothing is replayed as a CUDA graph. Yields whether anything was before."""
-    parts = [getattr(network, name) for name in getattr(network, "device_parts", ())]
+    parts = [getattr(network, name) for name in methods_on_device(type(network))]
     captured = [part for part in parts if any(getattr(part, "graphs", {}).values())]
     for part in captured:
         part.failure = RuntimeError("switched off")
@@ -421,7 +421,6 @@ def train(model: str, device: torch.device, seconds: float) -> dict[str, Any]:
         "updates a second": a_second,
         "frames a second": a_second * trainer.job.config.clips.batch,
         "first_s": ends[0] - began,
-        "without data": getattr(trainer, "waited_s", math.nan) / (ends[-1] - began),
         "loss": losses[-1],
         "finite": all(map(math.isfinite, losses)),
     }

@@ -128,75 +128,6 @@ def test_a_repeated_option_has_a_short_spelling():
     assert invoke(read, "-f", "a", "--file", "b").exit_code == 0
 
 
-@options()
-class RenamedOptions:
-    frames: int = option(default=3, help="Number.", flag="--count", old=("--frames", "--number"), minimum=1)
-    files: tuple[Path, ...] = option(default=(), help="Files.", flag="--file", old=("--input",), repeatable=True)
-    every: bool = option(default=False, help="All.", flag="--all", old=("--every",))
-    table: Path | None = option(default=None, help="Gone.", retired="use `bevcli export`")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected", "notes"),
-    [
-        ((), RenamedOptions(), []),
-        (("--count", "4", "--file", "a", "--all"), RenamedOptions(4, (Path("a"),), True), []),
-        (("--frames", "3"), RenamedOptions(3), ["--frames is now --count; the old form ends with this release"]),
-        (("--number", "5"), RenamedOptions(5), ["--number is now --count; the old form ends with this release"]),
-        (
-            ("--input", "a", "--input", "b", "--every"),
-            RenamedOptions(3, (Path("a"), Path("b")), True),
-            [
-                f"{old} is now {new}; the old form ends with this release"
-                for old, new in (("--input", "--file"), ("--every", "--all"))
-            ],
-        ),
-        (
-            ("--table", "t"),
-            RenamedOptions(table=Path("t")),
-            ["--table ends with this release: use `bevcli export`"],
-        ),
-    ],
-)
-def test_old_spellings_work_with_a_note(arguments, expected, notes):
-    def read(given: RenamedOptions) -> None:
-        assert given == expected
-
-    done = invoke(read, *arguments)
-    assert done.exit_code == 0, done.output
-    assert done.stderr.splitlines() == [f"note: {note}" for note in notes]
-
-
-def test_an_old_spelling_beside_the_new_one_is_an_error():
-    def read(given: RenamedOptions) -> None:
-        raise AssertionError
-
-    done = invoke(read, "--count", "4", "--frames", "5")
-    assert done.exit_code == 2
-    assert "--frames" in done.output
-    assert invoke(read, "--frames", "0").exit_code == 2
-
-
-def test_help_shows_no_old_spelling():
-    def read(given: RenamedOptions) -> None:
-        pass
-
-    text = invoke(read, "--help").output
-    assert "--count" in text
-    assert not any(old in text for old in ("--frames", "--number", "--input", "--every", "--table"))
-
-
-def test_an_option_that_was_an_argument_still_is_one():
-    def read(model: Annotated[str | None, Option("A model.", old=("",))] = None) -> None:
-        typer.echo(model)
-
-    assert invoke(read, "--model", "tiny").output == "tiny\n"
-    done = invoke(read, "tiny")
-    assert (done.stdout, done.exit_code) == ("tiny\n", 0)
-    assert done.stderr == "note: the argument tiny is now --model tiny; the old form ends with this release\n"
-    assert invoke(read, "tiny", "--model", "base").exit_code == 2
-
-
 def test_a_required_option_that_is_missing_is_a_usage_error():
     @options()
     class Required:
@@ -242,3 +173,18 @@ def test_arguments_in_messages_become_flags(library, shown):
 
 def test_arguments_stay_as_they_are_outside_a_command():
     assert as_flags("pass `force=True`") == "pass `force=True`"
+
+
+def test_an_extension_adds_options_and_a_step(monkeypatch):
+    @options("Input")
+    class Scale:
+        factor: int = option(default=1, help="Factor.")
+
+    monkeypatch.setattr(bridge, "entries", lambda group: ["read.scale", "write.scale"])
+    monkeypatch.setattr(bridge, "load", lambda group, name: bridge.Extension(Scale, lambda given, x: given.factor * x))
+
+    def read(steps: Annotated[bridge.Steps, bridge.ExtensionsOf("read")]) -> None:
+        (step,) = steps
+        assert step(3) == 6
+
+    assert invoke(read, "--factor", "2").exit_code == 0

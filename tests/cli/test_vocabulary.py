@@ -1,4 +1,4 @@
-"""One vocabulary in all commands: a flag means the same everywhere; earlier spellings work, with a note."""
+"""One vocabulary in all commands: a flag means the same everywhere."""
 
 import pytest
 import typer
@@ -23,7 +23,7 @@ def shown(command):
 def test_frames_is_a_range_and_count_a_number():
     found = [(flag, each.metavar) for one in commands().values() for each in shown(one) for flag in each.opts]
     assert {metavar for flag, metavar in found if flag == "--frames"} == {"A:B"}
-    assert sum(flag == "--count" for flag, _ in found) == 5
+    assert {metavar for flag, metavar in found if flag == "--count"} == {"N"}
 
 
 def test_every_out_has_a_short_form():
@@ -42,33 +42,6 @@ def test_no_command_takes_the_name_of_a_model_as_an_argument():
     for name, found in commands().items():
         arguments = [each.name for each in shown(found) if each.param_type_name == "argument"]
         assert name == "quantize" or "model" not in arguments  # which converts a file
-
-
-@pytest.mark.parametrize(
-    ("arguments", "note"),
-    [
-        (("validate", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
-        (("train", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
-        (("export-onnx", "demo", "--rig", "nowhere", "--cameras", 2), "the argument demo is now --model demo"),
-        (("quantize", "nowhere.onnx", "--int8-drive", "nowhere", "--frames", 3), "--frames is now --count"),
-        (("quantize", "nowhere.onnx", "--calibrate", "nowhere"), "--calibrate is now --int8-drive"),
-        (("run", "nowhere", "--calibrate-with", "nowhere"), "--calibrate-with is now --int8-drive"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else "",
-)
-def test_an_old_form_works_with_a_note(arguments, note, tmp_path):
-    done = command(tmp_path, *arguments)
-    assert done.returncode == 1, done.stderr  # for "nowhere"
-    first, *others = done.stderr.splitlines()
-    assert first == f"note: {note}; the old form ends with this release"
-    assert others[-1].startswith("error: ")
-
-
-def test_each_flag_belongs_to_one_parameter():
-    """A new spelling that is also the old one's gives a note to those who use it."""
-    for found in commands().values():
-        flags = [flag for each in found.params for flag in (*each.opts, *each.secondary_opts)]
-        assert len(flags) == len(set(flags)), found.name
 
 
 @pytest.mark.parametrize(

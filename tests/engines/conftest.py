@@ -10,8 +10,7 @@ import pytest
 from bevcli.config import as_table
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.workshop.engines.export_form import pixels_of
-from bevcli.workshop.engines.export_onnx import export_onnx
-from bevcli.workshop.engines.quantize import quantize
+from bevcli.workshop.engines.export_onnx import export_onnx, quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs

@@ -33,10 +33,9 @@ from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_form import pixels_of
-from bevcli.workshop.engines.export_onnx import export_onnx
-from bevcli.workshop.engines.exported import load_exported
-from bevcli.workshop.engines.quantize import quantize
+from bevcli.workshop.engines.export_onnx import export_onnx, quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs, step_of_file
@@ -96,11 +95,10 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     np.testing.assert_allclose(found[0, 1], np.full_like(pixels, 120), atol=tolerance, rtol=0)
 
 
-@pytest.mark.parametrize("decoder", ["decode_boxes", "decode_map", "decode_results"])
-def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, decoder, monkeypatch):
+def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, monkeypatch):
     exported, decoded = load_exported(small_file, "onnxruntime"), object()
-    monkeypatch.setattr(exported.kind, decoder, lambda model, outputs: (model, outputs, decoded))
-    assert getattr(exported, decoder)("outputs") == (exported, "outputs", decoded)
+    monkeypatch.setattr(exported.kind, "decode", lambda model, outputs: (model, outputs, decoded))
+    assert exported.decode("outputs") == (exported, "outputs", decoded)
 
 
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
@@ -307,7 +305,7 @@ def watch(event, arguments):
         print("CONNECTION", event, arguments, file=sys.stderr)
 sys.addaudithook(watch)
 from pathlib import Path
-from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.engines.engine import load_exported
 load_exported(Path({str(small_file)!r}), "openvino")
 """
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)

@@ -15,18 +15,14 @@ import pytest
 import torch
 
 from bevcli.cli.main import app
-from bevcli.config import load_config
 from bevcli.errors import BevcliError, InputError
-from bevcli.inference.load import Model, load_model
+from bevcli.inference.load import Model, installed_engines, load_model
 from bevcli.inference.run import run
 from bevcli.inference.session import Session
 from bevcli.sequences.open import select_range
-from bevcli.workshop.engines import in_engine as module
-from bevcli.workshop.engines.engine import installed_engines
-from bevcli.workshop.engines.engine_choice import EngineChoice, fastest_engine, remember_speeds
-from bevcli.workshop.engines.exported import load_exported
-from bevcli.workshop.engines.file_cache import EngineFile, engines_folder
-from bevcli.workshop.engines.in_engine import in_engine
+from bevcli.workshop.engines import export_cache as module
+from bevcli.workshop.engines.engine import OnnxRuntimeEngine, OpenVinoEngine, load_exported
+from bevcli.workshop.engines.export_cache import CachedFile, cache_folder
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from memory_drive import MemorySequence, make_rig
@@ -66,12 +62,12 @@ def steps(tmp_path_factory, network, drive, small_file, int8_file):
         patch.setattr(module, "CALIBRATION_FRAMES", 2)
         patch.setattr(module, "COMPARED_FRAMES", 2)
         seen = []
-        in_engine(chosen(network, "openvino", "int8"), drive.rig, drive, report=lambda *step: seen.append(step))
+        chosen(network, "openvino", "int8").in_engine(drive.rig, drive, report=lambda *step: seen.append(step))
         yield seen
 
 
 def chosen(network, engine, precision="fp32", **settings) -> Model:
-    return Model(network, choice=EngineChoice(engine, precision, **settings))
+    return Model(network, engine=engine, precision=precision, **settings)
 
 
 def boxes(model, drive):
@@ -92,7 +88,7 @@ def test_the_first_time_reports_its_steps_and_its_cost(steps, drive, network):
     assert {"calibrating small-for-tests with memory", "comparing openvino with PyTorch"} <= set(words)
     assert steps[-1][0] == steps[-1][1] == 1 + 2 + 1 + 2
     again = []
-    found = in_engine(chosen(network, "openvino", "int8"), drive.rig, drive, report=lambda *step: again.append(step))
+    found = chosen(network, "openvino", "int8").in_engine(drive.rig, drive, report=lambda *step: again.append(step))
     assert again == []
     assert (found.engine, found.precision, found.is_exported) == ("openvino", "int8", True)
     assert found.engine_note.startswith("engine openvino, int8, calibrated with memory; against PyTorch in fp32: ")
@@ -107,11 +103,11 @@ def test_a_session_takes_the_file_and_int8_needs_frames(steps, drive, network):
 
 def test_a_broken_file_is_made_anew(steps, drive, network):
     model = chosen(network, "onnxruntime")
-    file = in_engine(model, drive.rig, drive).file
+    file = model.in_engine(drive.rig, drive).file
     whole, facts = file.read_bytes(), file.with_suffix(".json")
     for path, broken in ((file, whole[:-100]), (facts, b'{"sha256": "0"}')):
         path.write_bytes(broken)
-        assert in_engine(model, drive.rig, drive).file == file
+        assert model.in_engine(drive.rig, drive).file == file
         assert load_exported(file, "onnxruntime").cameras == 2
         assert json.loads(facts.read_text())["differences"]["onnxruntime"]["frames"] == 2
     assert not list(file.parent.glob(".unfinished*"))
@@ -121,7 +117,7 @@ def test_a_broken_file_is_made_anew(steps, drive, network):
 def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, network):
     short = select_range(drive, slice(0, 1))
     model = replace(chosen(network, "onnxruntime", "int8"), bundled=True)
-    files = [in_engine(model, drive.rig, one).file for one in (short, short, drive, short)]
+    files = [model.in_engine(drive.rig, one).file for one in (short, short, drive, short)]
     assert files[0] == files[1] != files[2] == files[3]
 
 
@@ -133,32 +129,23 @@ def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
         both.wait()
 
     with ThreadPoolExecutor(2) as pool:
-        made = [pool.submit(EngineFile("same").make, write, "", "onnxruntime") for _ in range(2)]
+        made = [pool.submit(CachedFile("same").make, write, "", OnnxRuntimeEngine.open) for _ in range(2)]
         assert len({each.result()[1].sha256 for each in made}) == 1
-    assert EngineFile("same").load("onnxruntime") is not None
-    assert not list(engines_folder().glob(".unfinished*"))
+    assert CachedFile("same").load(OnnxRuntimeEngine.open) is not None
+    assert not list(cache_folder().glob(".unfinished*"))
 
 
-def test_probes_are_refused_but_auto_is_torch(steps, drive, network):
-    with pytest.raises(BevcliError, match=r"^attention and probes: not available in openvino: use `engine=torch`$"):
+def test_probes_need_torch(drive, network):
+    with pytest.raises(BevcliError, match=r"^attention and probes: not available in openvino.*leave out `engine=openv"):
         run(chosen(network, "openvino"), drive, attention=True)
-    with pytest.raises(BevcliError, match=r"not available in INT8, which PyTorch does not have"):
-        run(chosen(network, "auto", "int8"), drive, attention=True)
-    remember_speeds(network.config, {"torch fp32": 2.0, "openvino fp32": 1.0, "onnxruntime int8": 0.5})
-    assert fastest_engine(network.config, "fp32") == "openvino"
-    assert in_engine(chosen(network, "auto"), drive.rig, drive).engine == "openvino"
-    in_torch = in_engine(chosen(network, "auto"), drive.rig, drive, parts="`probes`")
-    assert (in_torch.engine, in_torch.engine_note) == ("torch", "engine auto is torch: `probes` need it")
-    assert EngineChoice("auto", "int8").resolve(network.config) == "onnxruntime"
-    (engines_folder() / "speeds.json").write_text("broken")
-    assert EngineChoice("auto", "fp32").resolve(network.config) == "torch"
-    assert EngineChoice("auto", "int8").resolve(network.config) == "openvino"
+    with pytest.raises(BevcliError, match=r"not available in openvino, but in PyTorch: leave out `precision=int8`"):
+        run(chosen(network, "openvino", "int8"), drive, attention=True)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"engine": "openvinno"}, "unknown engine .expected auto, torch, onnxruntime, openvino"),
+        ({"engine": "openvinno"}, "unknown engine .expected torch, onnxruntime, openvino"),
         ({"engine": "openvino", "precision": "bf16"}, "`engine=openvino` computes in fp32 or int8"),
         ({"engine": "openvino", "device": "mps"}, "PyTorch sees no Apple GPU|runs on the CPU"),
         ({"engine": "torch", "precision": "int8"}, "PyTorch has no INT8"),
@@ -172,11 +159,16 @@ def test_options_that_exclude_each_other_are_one_line(options, message):
 
 
 def test_the_device_may_be_a_device_of_torch():
-    assert load_model("demo", precision="int8", device=torch.device("cpu")).choice is not None
+    assert load_model("demo", precision="int8", device=torch.device("cpu")).needs_export
 
 
-def test_what_cannot_be_exported_runs_in_torch_with_auto():
-    assert EngineChoice("auto", "fp32").resolve(load_config("uniad-track-map")) == "torch"
+def test_int8_takes_the_first_engine_that_is_installed(monkeypatch):
+    assert load_model("demo", precision="int8").engine == "openvino"
+    monkeypatch.setattr(OpenVinoEngine, "packages", ("no_such_package",))
+    assert load_model("demo", precision="int8").engine == "onnxruntime"
+    monkeypatch.setattr(OnnxRuntimeEngine, "packages", ("no_such_package",))
+    with pytest.raises(BevcliError, match="`precision=int8`: no engine is installed"):
+        load_model("demo", precision="int8")
 
 
 def test_a_model_in_an_engine_needs_a_drive(network):

@@ -14,8 +14,9 @@ from recorded_drive import record
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from bevcli.recording import entities
+from bevcli.sequences.files.boxes_file import write_boxes
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader, export_boxes, summarise
+from bevcli.viewer.recording_reader import RecordingReader, read_recording, summarise
 from bevcli.viewer.video import CameraImages, draw_frame, frame_rate, tiles
 
 READ = (entities.WORLD, entities.EGO, entities.BOXES, entities.RUN, entities.SPEED, "world/cameras", "bev")
@@ -62,7 +63,7 @@ def _read(path: Path) -> list[dict]:
     out = path.with_name("boxes.json")
     with open_recording(path) as file:
         try:
-            export_boxes(file, out)
+            write_boxes(read_recording(file), out)
             summarise(path, file).text()
         finally:
             frame_rate(file)

@@ -18,10 +18,10 @@ from mutations import TEXT, changed_tree
 from safetensors.torch import save
 from small_model import small_model
 
+from bevcli.checkpoints import read_safetensors
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import Model, hash_of
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.parsing.pth import read_safetensors
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder

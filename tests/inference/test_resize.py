@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from bevcli.inference.preprocess import resize_and_normalize, resize_taps
+from bevcli.inference.preprocess import pixel_weights, resize_and_normalize
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 MEAN, STD = np.array([103.5, 116.3, 123.7], np.float32), np.array([57.4, 57.1, 58.4], np.float32)
@@ -16,7 +16,7 @@ lengths = st.integers(1, 90)
 
 def resized(pixels, width, height, method, **options):
     out = np.full((3, height + 2, width + 3), -7, np.float32)
-    rows, columns = resize_taps(len(pixels), height, method), resize_taps(pixels.shape[1], width, method)
+    rows, columns = pixel_weights(len(pixels), height, method), pixel_weights(pixels.shape[1], width, method)
     resize_and_normalize(pixels, rows, columns, MEAN, STD, out, **{"reverse_channels": False} | options)
     assert (out[:, height:] == -7).all()  # the padding is left as it was
     assert (out[:, :, width:] == -7).all()
@@ -55,7 +55,7 @@ def test_channels_are_reversed_and_any_memory_layout_is_read():
 
 def test_a_part_of_the_rows_and_columns_is_a_crop():
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    rows, columns = resize_taps(40, 20, "linear"), resize_taps(60, 30, "linear")
+    rows, columns = pixel_weights(40, 20, "linear"), pixel_weights(60, 30, "linear")
     out = np.zeros((3, 10, 12), np.float32)
     resize_and_normalize(pixels, rows[5:15], columns[8:20], MEAN, STD, out, reverse_channels=False)
     np.testing.assert_allclose(out, by_opencv(pixels, 30, 20, "linear")[:, 5:15, 8:20], atol=5e-6)

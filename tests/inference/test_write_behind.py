@@ -2,7 +2,14 @@ import threading
 
 import pytest
 
-from bevcli.inference.background import write_behind
+from bevcli.inference.background import QUEUE, WriteBehind
+
+
+def write_behind(work, items, depth=QUEUE):
+    with WriteBehind(work, depth) as writer:
+        for item in items:
+            if not writer.put(item):
+                break
 
 
 def test_every_item_is_worked_on_in_order():

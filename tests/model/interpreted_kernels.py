@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import GridSampling, Hits
+from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
-from bevcli.model.prepare import add_to_class
+from bevcli.model.kernels.by_hits import Hits
 from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
@@ -152,15 +152,14 @@ def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: 
 
 def compare_stems() -> None:
     """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
-    from bevcli.model.kernels.choose import fold_batch_norms
+    from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
     from bevcli.model.kernels.triton_stem import FusedStem
 
     torch.manual_seed(0)
     backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)
     backbone.bn1.bias.normal_()
-    fused = copy.deepcopy(backbone)
+    fused = in_place_of(copy.deepcopy(backbone), FusedStem)
     fold_batch_norms(fused, torch.device("meta"))
-    add_to_class(fused, FusedStem)
     for batch, height, width in ((2, 32, 64), (1, 33, 47), (1, 2, 2), (0, 32, 32)):
         images = torch.randn(batch, 3, height, width)
         images[:, 0, 0, 0] = torch.nan

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer.bevformer import BEVFormer, recurrent_feed
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
@@ -18,7 +18,7 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.step import ModelInputs, ModelOutputs
-from bevcli.workshop.engines.export_form import pixels_of
+from bevcli.workshop.engines.export_form import pixels_of, recurrent_feed
 from bevcli.workshop.engines.exported import ExportedModel
 
 CAMERAS = ("FRONT", "BACK")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,8 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.calibration_embedding import CalibrationEmbedding, ray_features
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokensConfig
-from bevcli.model.prepare import LastCall, add_to_class
+from bevcli.model.kernels.choose import in_place_of
+from bevcli.model.prepare import KeptCalibrationEmbedding
 from bevcli.workshop.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)
@@ -93,8 +93,7 @@ def test_a_prepared_embedding_follows_rig_and_image_size():
     torch.manual_seed(0)
     embedding = CalibrationEmbedding(8, 1.84).requires_grad_(False)
     torch.nn.init.normal_(embedding.layers[-1].weight, std=0.1)
-    prepared = copy.deepcopy(embedding)
-    add_to_class(prepared, LastCall)
+    prepared = in_place_of(embedding, KeptCalibrationEmbedding)
     rig = small_inputs().image_from_bev
     moved = rig.clone()
     moved[:, 0, 0, 3] += 5.0

@@ -8,7 +8,7 @@ from torch import nn
 
 import bevcli.model.kernels.compiled as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.kernels.choose import fastest_convolution
+from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 
 
@@ -53,8 +53,9 @@ def test_results_and_gradients_on_a_gpu_equal_the_cpu(stride, dtype):
     for device in (torch.device("cpu"), torch.device("cuda")):
         layer = plain_layer(stride).to(dtype).to(device, torch.float32 if device.type == "cpu" else dtype)
         x = image().to(dtype).to(layer.weight)
-        layer.convolve, layer.weight.requires_grad = fastest_convolution(device), True
-        result = layer(x.requires_grad_())
+        layer.weight.requires_grad = True
+        choose_kernels(layers := nn.Sequential(layer), device, gradients=True)
+        result = layers(x.requires_grad_())
         gradients = torch.autograd.grad(result.square().sum(), (x, layer.weight))
         found.append([each.float().cpu() for each in (result, *gradients)])
     for expected, equal in zip(*found, strict=True):

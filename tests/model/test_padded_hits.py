@@ -8,10 +8,10 @@ import torch
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.kernels.choose import in_place_of
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.kernels.padded_pillars import PaddedPillars, hits_on_cpu
 from bevcli.model.pillar_projection import PillarHits, Pillars
-from bevcli.model.prepare import add_to_class
 
 GRID = BevGrid(rows=10, columns=12)
 SIZE = (96, 160)
@@ -65,8 +65,7 @@ def test_added_hits_change_no_bit_of_the_attention():
 
 def test_a_rig_keeps_its_sizes_while_it_moves_a_little():
     pillars = Pillars(GRID)
-    vars(pillars).update(points_on_cpu=pillars.points, sizes={})
-    add_to_class(pillars, PaddedPillars)
+    pillars = in_place_of(pillars, PaddedPillars, points_on_cpu=pillars.points, sizes={})
     matrices, has_image = projections(1, 6), torch.ones(1, 6, dtype=torch.bool)
     sizes = set()
     for step in range(5):

@@ -224,9 +224,10 @@ def check_inputs(inputs: ModelInputs, expected: Arrays) -> None:
 
 def check_rotation(history: torch.Tensor, inputs: ModelInputs, expected: Arrays) -> None:
     """Each cell takes the old cell that the original takes; -1 is none."""
-    close(model().align_history(history, inputs.rotation_deg)[0, ::97], expected["prev_rot_sub"], 1e-3)
+    how = inputs.rotation_deg, model().config.bev_grid, "original"
+    close(rotate_history(history, *how)[0, ::97], expected["prev_rot_sub"], 1e-3)
     numbers = torch.arange(1, history.shape[1] + 1).float()[None, :, None]
-    turned = rotate_history(numbers, inputs.rotation_deg, model().config.bev_grid, "original")
+    turned = rotate_history(numbers, *how)
     assert np.array_equal(turned[0, :, 0] - 1, expected["prev_source"])
 
 

@@ -10,9 +10,9 @@ from memory_drive import MemorySequence
 
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
-from bevcli.workshop.benchmark.exported import FrameDifference, check_exported, difference_lines
+from bevcli.workshop.engines.differences import FrameDifference, check_exported, difference_lines
+from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx
-from bevcli.workshop.engines.exported import load_exported
 from bevcli.workshop.vad.vad import VAD
 
 pytest.importorskip("onnxruntime")
@@ -30,7 +30,7 @@ def test_an_exported_vad_equals_the_model(mini_vad: VAD, tmp_path: Path) -> None
     }  # fmt: skip
     assert max(last.further.values()) < 1e-3
     for (_, ours), (_, theirs) in zip(
-        run(Model(mini_vad), drive), run(Model(exported, engine="onnxruntime"), drive), strict=True
+        run(Model(mini_vad), drive), run(Model(exported, engine="onnxruntime", file=exported.file), drive), strict=True
     ):
         np.testing.assert_allclose(theirs.boxes.scores, ours.boxes.scores, atol=1e-4)
         np.testing.assert_allclose(theirs.boxes.futures, ours.boxes.futures, atol=1e-2)

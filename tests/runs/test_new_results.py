@@ -86,3 +86,10 @@ def test_a_new_result_has_a_file_a_drawing_and_a_legend(registered, mini_config,
         assert frame.texts(entities.RUN, "line_names")[0] == "stop line"
         from_above = draw_frame(frame, tiles(frame), CameraImages())[:, 1280:].astype(int)
         assert (np.abs(from_above - RED[::-1]).max(-1) < 60).sum() > 10
+
+
+def test_types_of_results_are_registered_by_their_kind_and_file():
+    kinds = {name: registry.load("bevcli.results", name) for name in registry.entries("bevcli.results")}
+    assert {name: kind.kind for name, kind in kinds.items()} == {name: name for name in kinds}
+    files = {f"native/{kind.true_file}" for kind in kinds.values() if kind.true_file}
+    assert files == {name for name in registry.entries("bevcli.true_results") if name.startswith("native/")}

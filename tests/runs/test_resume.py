@@ -297,7 +297,7 @@ def test_saving_states_takes_two_percent_of_the_time_at_most(model, tmp_path, mo
 
     monkeypatch.setattr(run_state, "save_state", slow_save)
     files, summary = SimpleNamespace(state=object), SimpleNamespace(counts=Counts(), is_complete=False)
-    saver = run_state.StateSaver(tmp_path / "state", {}, files, summary)
+    saver = run_state.RunWriter(tmp_path / "state", {}, files, summary)
     spent = 0
     for _ in range(10_000):
         clock[0] += 0.1

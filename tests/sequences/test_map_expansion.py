@@ -128,7 +128,7 @@ def test_missing_or_wrong_maps_are_named(root: Path, tmp_path: Path) -> None:
     run, bare = perfect_run(root, tmp_path / "run"), tmp_path / "bare"
     write_tables(bare / "v1.0-mini", Size(scenes=1, samples=8, objects=2))
     with pytest.raises(InputError, match=r"scene-0001.* has no true lines .*the map expansion in .*/expansion"):
-        evaluate(run, bare, driving=["map"])
+        evaluate(run, bare, map=True)
     (bare / "v1.0-mini" / "log.json").write_text(json.dumps([{"token": token(9, 0), "location": "here"}]))
     (bare / "maps" / "expansion").mkdir(parents=True)
     (bare / "maps" / "expansion" / "here.json").write_text('{"node": [{"token": "a"}]}')

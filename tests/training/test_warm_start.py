@@ -16,9 +16,9 @@ from bevcli.checkpoints import bundled_weights
 from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
+from bevcli.inference.load import weights_file
 from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.weights.fetch import weights_file
 from bevcli.workshop.training.files import save_weights
 from bevcli.workshop.training.warm_start import WarmStart, warm_start
 
@@ -156,7 +156,7 @@ def test_weights_have_the_name_of_their_model(source: Path, tmp_path: Path, monk
     monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path))
     assert weights_file(source) == source
     assert weights_file(Path("demo")) == bundled_weights("demo")
-    with pytest.raises(WeightsError, match="the weights of base are not there yet: run `bevcli weights fetch base`"):
+    with pytest.raises(WeightsError, match=r"`bevcli weights fetch base`, which downloads them$"):
         weights_file(Path("base"))
     with pytest.raises(WeightsError, match='no weights are known as "nothing"'):
         weights_file(Path("nothing"))

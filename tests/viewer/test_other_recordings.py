@@ -11,10 +11,11 @@ from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
 from bevcli.errors import InputError
+from bevcli.evaluation.box_format import write_csv
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader, export_boxes, read_recording, recorded_boxes, summarise
+from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
 from bevcli.viewer.video import CameraImages, draw_frame, tiles
 
 
@@ -26,7 +27,7 @@ def recording(tmp_path_factory):
 
 
 def table(path, folder) -> str:
-    export_boxes(path, folder / "boxes.csv")
+    write_csv(read_recording(path), folder / "boxes.csv")
     return (folder / "boxes.csv").read_text()
 
 

@@ -51,11 +51,8 @@ def test_the_summary_counts_frames_boxes_and_bytes(drive):
 
 def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
     frames, path = drive
-    note = viz(path, "--export", tmp_path / "old.csv")
-    assert note.startswith("note: --export ends with this release: bevcli export")
     result = CliRunner().invoke(app, ["export", str(path), "--format", "csv", "--out", str(tmp_path / "boxes.csv")])
     assert result.exit_code == 0, result.output
-    assert (tmp_path / "boxes.csv").read_bytes() == (tmp_path / "old.csv").read_bytes()
     with (tmp_path / "boxes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
@@ -70,11 +67,10 @@ def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
 
 def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
     frames, path = drive
-    for arguments in (("viz", str(path), "--export"), ("export", str(path), "--format", "json", "--out")):
-        result = CliRunner().invoke(app, [*arguments, str(tmp_path / f"{arguments[0]}.json")], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    content = json.loads((tmp_path / "export.json").read_text())
-    assert content == json.loads((tmp_path / "viz.json").read_text())
+    arguments = ["export", str(path), "--format", "json", "--out", str(tmp_path / "boxes.json")]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    content = json.loads((tmp_path / "boxes.json").read_text())
     assert (content["format"], content["frame_of_reference"]) == ("bevcli-boxes/1", "world")
     assert [frame["timestamp_ns"] for frame in content["frames"]] == [frame.stamp.timestamp_ns for frame in frames]
     assert [box["class"] for box in content["frames"][0]["boxes"]] == ["car", "pedestrian"]
@@ -151,9 +147,8 @@ def test_a_cut_off_recording_is_shown_with_a_note(drive, tmp_path):
 
 def test_unknown_endings_are_refused(drive, tmp_path):
     _, path = drive
-    for option in ("--video", "--export"):
-        with pytest.raises(InputError, match="must end in"):
-            viz(path, option, tmp_path / "x.avi")
+    with pytest.raises(InputError, match="must end in"):
+        viz(path, "--video", tmp_path / "x.avi")
 
 
 def test_a_frame_without_a_screenshot_is_a_usage_error(drive):

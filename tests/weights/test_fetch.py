@@ -7,6 +7,7 @@ import pickle
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,8 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
-from bevcli.published import own_table, read_sources
-from bevcli.weights import download
-from bevcli.weights.cache import all_weights, named_weights
+from bevcli.published import all_weights, named_weights, own_table, read_sources
+from bevcli.weights import fetch
 from bevcli.weights.fetch import fetch_weights
 
 
@@ -44,8 +44,8 @@ def server(content, monkeypatch, tmp_path):
     """A server, folders of a user, and short pauses."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
     monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path / "weights"))
-    monkeypatch.setattr(download, "PAUSE_S", 0.0)
-    monkeypatch.setattr(download, "STALL_S", 1)
+    monkeypatch.setattr(fetch, "PAUSE_S", 0.0)
+    monkeypatch.setattr(fetch, "STALL_S", 1)
     for name in [name for name in os.environ if name.lower().endswith("_proxy")]:
         monkeypatch.delenv(name)
     with serving(content) as found:
@@ -84,7 +84,7 @@ def test_the_file_arrives_as_it_is(server, model, content, tmp_path, how, reques
     url, handler = server
     add_source(model, f"{url}/{how}/weights.safetensors")
     seen = []
-    found = fetch_weights(named_weights("own"), lambda done, total: seen.append((done, total)))
+    found = fetch_weights(named_weights("own"), lambda done, total, what: seen.append((done, total)))
     assert found.path == tmp_path / "weights/own/weights.safetensors"
     assert found.path.read_bytes() == content
     assert found.known.sha256 == hashlib.sha256(content).hexdigest()
@@ -103,7 +103,7 @@ def test_a_cut_download_goes_on_where_it_ended(server, model, content):
 
 
 def test_ctrl_c_ends_a_download_and_keeps_what_came(server, model, content, tmp_path):
-    def stop(done: int, total: int | None) -> None:
+    def stop(done: int, total: int | None, what: str) -> None:
         if done:
             raise KeyboardInterrupt
 
@@ -117,19 +117,25 @@ def test_ctrl_c_ends_a_download_and_keeps_what_came(server, model, content, tmp_
     assert handler.asked[1] == ("whole", f"bytes={kept}-")
 
 
+def test_weights_that_are_here_import_no_download_and_no_pickles():
+    modules = ("bevcli.weights.fetch", "pycurl", "bevcli.parsing.pth", "bevcli.workshop.engines.engine")
+    code = f"import sys, bevcli; bevcli.load_model('demo'); print([name for name in {modules} if name in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
 @pytest.mark.parametrize("how", ["cut_for_ever", "stalling", "too_long"])
 def test_the_next_command_goes_on_with_what_was_kept(server, model, content, monkeypatch, how, tmp_path):
     url, handler = server
-    monkeypatch.setattr(download, "ATTEMPTS", 1)
+    monkeypatch.setattr(fetch, "ATTEMPTS", 1)
     if how == "stalling":
-        monkeypatch.setattr(download, "STALL_BYTES", 1 << 40)  # libcurl compares the mean speed of some seconds
+        monkeypatch.setattr(fetch, "STALL_BYTES", 1 << 40)  # libcurl compares the mean speed of some seconds
     add_source(model, f"{url}/{how}/weights.safetensors")
     with pytest.raises(WeightsError, match=r"the download broke off \d times \(.+\); [\d,]+ bytes are kept: the same"):
         fetch_weights(named_weights("own"))
     kept = len(content) if how == "too_long" else len(content) // 2
     assert (tmp_path / "weights/own/.partial-weights.safetensors").stat().st_size == kept
     assert named_weights("own").here is None
-    monkeypatch.setattr(download, "ATTEMPTS", 2)
+    monkeypatch.setattr(fetch, "ATTEMPTS", 2)
     monkeypatch.setattr(handler, how, handler.whole)
     handler.asked.clear()
     assert fetch_weights(named_weights("own")).path.read_bytes() == content
@@ -159,8 +165,8 @@ def test_a_server_that_brings_nothing_is_left(server, model, tmp_path, how, requ
 @pytest.mark.parametrize("how", ["slow_for_ever", "slow_headers"])
 def test_a_slow_download_has_an_end(server, model, monkeypatch, how):
     url, _ = server
-    monkeypatch.setattr(download, "WHOLE_S", 0.2)
-    monkeypatch.setattr(download, "STALL_S", 60)
+    monkeypatch.setattr(fetch, "WHOLE_S", 0.2)
+    monkeypatch.setattr(fetch, "STALL_S", 60)
     add_source(model, f"{url}/{how}/weights.safetensors")
     with pytest.raises(WeightsError, match=r"broke off \d times? \(.*timed out"):
         fetch_weights(named_weights("own"))
@@ -168,7 +174,7 @@ def test_a_slow_download_has_an_end(server, model, monkeypatch, how):
 
 def test_a_file_without_a_length_does_not_fill_the_disk(server, model, content, monkeypatch, tmp_path):
     url, _ = server
-    monkeypatch.setattr(download, "MOST_BYTES", len(content) // 2)
+    monkeypatch.setattr(fetch, "MOST_BYTES", len(content) // 2)
     add_source(model, f"{url}/endless/weights.safetensors")
     with pytest.raises(WeightsError, match=r"sends more than [\d,]+ bytes: refused \(a larger file needs its size"):
         fetch_weights(named_weights("own"))

@@ -3,44 +3,69 @@
 from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes
-from bevcli.model.deformable_convolution import (
-    Convolve,
-    ModulatedDeformableConvolution,
-    predicted_deformable_convolution,
-)
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.kernels.by_hits import AttentionByHits, SpatialByHits, TemporalByHits
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
-from bevcli.model.temporal_model import TemporalModel
+from bevcli.model.network import Network
 
 VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
+Kind = TypeVar("Kind", bound=nn.Module)
 
 
-def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: bool = False) -> None:
+def in_place_of(plain: nn.Module, kind: type[Kind], **attributes: Any) -> Kind:
+    """A module of another class, mostly a faster subclass, with the parameters, parts and settings of the plain one."""
+    fast = kind.__new__(kind)
+    vars(fast).update(vars(plain), **attributes)
+    return fast
+
+
+def choose_kernels(model: nn.Module, device: torch.device, *, gradients: bool = False) -> None:
     """Gives a model, in place, the memory layout and the deformable operations that are fastest on a device.
 
-    gradients: whether the model is trained; then only kernels with gradients are used.
+    model: not itself one of the operations. gradients: whether the model is trained; then only kernels with gradients
+    are used.
     """
-    if model.has_parts:
+    if isinstance(model, Network):
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    kept_sizes = cache(level_sizes)  # all: CUDA graphs hold their addresses
-    for module in model.modules():
+    functions: dict[str, Any] = {}
+    if not gradients:
+        functions["level_sizes"] = cache(level_sizes)  # CUDA graphs hold the addresses of the tables
+        functions |= {"softmax": softmax_of_few} if device.type == "cpu" else {}
+    for module in list(model.modules()):
         if isinstance(module, DeformableAttention):
-            module.sampling = fastest_sampling(device)
-            if not gradients:
-                module.level_sizes = kept_sizes
-            if not gradients and device.type == "cpu":
-                module.softmax, module.sample_hits = softmax_of_few, sample_hits
-            elif not gradients and has_triton(device):
-                from bevcli.model.kernels import triton_attention  # only where Triton is installed
+            sampling = fastest_sampling(device)
+            module.sampling = in_place_of(sampling, type(sampling), **functions)
+    if has_triton(device):
+        from bevcli.model.kernels.triton_convolution import TritonDeformableConvolution  # where Triton is installed
 
-                module.sample_hits = triton_attention.sample_hits
-        elif isinstance(module, ModulatedDeformableConvolution):
-            module.convolve = fastest_convolution(device)
+        for name, module in list(model.named_modules()):
+            if isinstance(module, ModulatedDeformableConvolution):
+                model.set_submodule(name, in_place_of(module, TritonDeformableConvolution))
+    if not gradients:
+        _choose_attentions(model, device)
+
+
+def _choose_attentions(model: nn.Module, device: torch.device) -> None:
+    kernel = sample_hits
+    kinds: dict[type[nn.Module], type[nn.Module]]
+    kinds = {TemporalSelfAttention: TemporalByHits, SpatialCrossAttention: SpatialByHits}
+    if has_triton(device):
+        from bevcli.model.kernels import triton_attention  # only where Triton is installed
+
+        kernel, kinds = triton_attention.sample_hits, {**kinds, DeformableAttention: AttentionByHits}
+    elif device.type != "cpu":
+        return
+    for name, module in list(model.named_modules()):
+        if type(module) in kinds:
+            model.set_submodule(name, in_place_of(module, kinds[type(module)], sample_hits=kernel))
 
 
 def has_triton(device: torch.device) -> bool:
@@ -48,17 +73,8 @@ def has_triton(device: torch.device) -> bool:
     return device.type == "cuda" and find_spec("triton") is not None
 
 
-def fastest_convolution(device: torch.device) -> Convolve:
-    """The fastest function for `ModulatedDeformableConvolution.convolve` on a device, with gradients."""
-    if has_triton(device):
-        from bevcli.model.kernels.triton_convolution import deformable_convolution  # only where Triton is installed
-
-        return deformable_convolution
-    return predicted_deformable_convolution
-
-
-def fastest_sampling(device: torch.device) -> nn.Module:
-    """The fastest module for `DeformableAttention.sampling` on a device. Devices such as "mps" get the plain module."""
+def fastest_sampling(device: torch.device) -> GridSampling:
+    """The fastest module for `DeformableAttention.sampling` on a device, with gradients; the plain one for "mps"."""
     if device.type == "cpu":
         return CompiledSampling()
     if has_triton(device):

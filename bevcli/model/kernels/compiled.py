@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import Hits, LevelShapes
+from bevcli.model.deformable_attention import GridSampling, LevelShapes
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
+from bevcli.model.kernels.by_hits import Hits
 
 # More ranges than threads: where another process delays one thread, the others take over its ranges.
 RANGES_PER_THREAD = 8
@@ -24,8 +25,8 @@ SAMPLES_PER_RANGE = 1 << 15
 TILE_BYTES = 8 << 20
 
 
-class CompiledSampling(nn.Module):
-    """Takes the place of `GridSampling` on the CPU, with gradients."""
+class CompiledSampling(GridSampling):
+    """A `GridSampling` on the CPU, with gradients."""
 
     def forward(
         self,
@@ -35,7 +36,7 @@ class CompiledSampling(nn.Module):
         weights: Tensor,
         queries_per_map: Sequence[int],
     ) -> Tensor:
-        """Arguments and result as for `GridSampling`; the gradients are computed in float32."""
+        """As `GridSampling.forward`; the gradients are computed in float32."""
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
             values = values.float()
         return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)

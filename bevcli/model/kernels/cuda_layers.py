@@ -10,11 +10,17 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.resnet import Bottleneck
-from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, SegmentationOutputs, map_layers
+from bevcli.model.segmentation import (
+    MaskDecoderLayer,
+    SegmentationConfig,
+    SegmentationHead,
+    SegmentationOutputs,
+    map_layers,
+)
 
 
 class FusedBottleneck(Bottleneck):
-    """Added to the bottlenecks with folded batch norms: cuDNN adds bias and shortcut, and applies ReLU, at once."""
+    """A `Bottleneck` with folded batch norms: cuDNN adds bias and shortcut, and applies ReLU, at once."""
 
     def fuse(self) -> None:
         """Moves the bias of the shortcut's convolution into the last one, in place, as both are added to the result."""
@@ -47,7 +53,7 @@ def convolution_with_relu(convolution: nn.Module, x: Tensor, shortcut: Tensor | 
 
 
 class TokensInOnePass(ImageTokens):
-    """Added to the image tokens: each level is read once, and written to its place with both embeddings added."""
+    """`ImageTokens`: each level is read once, and written to its place with both embeddings added."""
 
     def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `ImageTokens.forward`."""
@@ -64,17 +70,20 @@ class TokensInOnePass(ImageTokens):
         return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
 
 
-def attention_by_products(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
-    """`scaled_dot_product_attention` with its table of weights in memory.
+class AttentionByProducts(MaskDecoderLayer):
+    """A `MaskDecoderLayer` with its table of attention weights in memory.
 
     With few queries and many keys this is faster: PyTorch's kernel gives each block of queries to one multiprocessor.
     """
-    scores = (queries * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)
-    return scores.softmax(-1) @ values
+
+    def attend(self, queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+        """As `MaskDecoderLayer.attend`."""
+        scores = (queries * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)
+        return scores.softmax(-1) @ values
 
 
 class MapOnDevice(SegmentationHead):
-    """Added to the segmentation head: the GPU merges the masks, so that neither masks are copied nor the CPU does it.
+    """A `SegmentationHead`: the GPU merges the masks, so that neither masks are copied nor the CPU does it.
 
     Attributes:
         config: of the head.

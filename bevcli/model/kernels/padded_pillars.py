@@ -14,7 +14,7 @@ PLACES = 128  # numbers of padded hits are multiples of this
 
 
 class PaddedPillars(Pillars):
-    """Added to the pillars on a GPU: nobody waits for the GPU to count the hits, whose tensors keep their shapes.
+    """`Pillars` on a GPU: nobody waits for the GPU to count the hits, whose tensors keep their shapes.
 
     Attributes:
         points_on_cpu: the points, on the CPU.

@@ -10,18 +10,18 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor, nn
+from torch import Tensor
 
-from bevcli.model.deformable_attention import DeformableAttention, Hits, LevelShapes
-from bevcli.model.encoder import map_queries
+from bevcli.model.deformable_attention import GridSampling, LevelShapes
+from bevcli.model.kernels.by_hits import Hits
 from bevcli.model.kernels.triton_bilinear import corner_of
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
 
 
-class TritonSampling(nn.Module):
-    """Takes the place of `GridSampling` on a GPU."""
+class TritonSampling(GridSampling):
+    """A `GridSampling` on a GPU."""
 
     def forward(
         self,
@@ -31,7 +31,7 @@ class TritonSampling(nn.Module):
         weights: Tensor,
         queries_per_map: Sequence[int],
     ) -> Tensor:
-        """Arguments and result as for `GridSampling`."""
+        """As `GridSampling.forward`."""
         sums = _WeightedSums.apply(values, locations, weights, level_shapes, tuple(queries_per_map))
         return sums.flatten(1)
 
@@ -63,21 +63,6 @@ def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: 
                 **constants(heads, depth, levels, points),
             )
     return out.flatten(1)
-
-
-class AttentionByHits(DeformableAttention):
-    """Added to attentions whose `attend` samples around points: it makes no tables of locations and weights either."""
-
-    def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
-        """As `DeformableAttention.attend`."""
-        if self.sample_hits is None:  # someone looks at the tables
-            return super().attend(query, reference_points, tokens, level_shapes)
-        batch, queries, _ = query.shape
-        of_hit = map_queries(1, 1, batch * queries, query.device)
-        hits = Hits(of_hit[0], reference_points.reshape(-1, 1, 2), [queries] * batch, of_hit[1])
-        sampled = self.sample_hits(self.values(tokens), level_shapes, hits, *self.predict(query.flatten(0, 1)))
-        result: Tensor = self.output_projection(sampled.view(batch, queries, -1))
-        return result
 
 
 class _WeightedSums(torch.autograd.Function):

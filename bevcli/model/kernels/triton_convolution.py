@@ -14,12 +14,21 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.kernels.triton_bilinear import corner_of
 
 # Positions, channels and taps that a program takes at a time.
 COLUMN_TILES = {"BLOCK": 8, "BLOCK_CHANNELS": 128, "TAPS": 9}
 GRADIENT_TILES = {"BLOCK": 16, "BLOCK_CHANNELS": 64, "TAPS": 1}
 COLUMN_BYTES = 512 << 20  # of the columns that exist at a time
+
+
+class TritonDeformableConvolution(ModulatedDeformableConvolution):
+    """A `ModulatedDeformableConvolution` on a GPU."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As `ModulatedDeformableConvolution.forward`; the result is channels last."""
+        return deformable_convolution(x, self.offset_and_mask(x), self.weight, self.bias, self.stride)
 
 
 def deformable_convolution(x: Tensor, predicted: Tensor, weight: Tensor, bias: Tensor | None, stride: int) -> Tensor:

@@ -17,7 +17,7 @@ ELEMENTS_PER_PROGRAM = 1024
 
 
 class FusedStem(ResNet):
-    """Added to a ResNet whose batch norms are folded into their convolutions. No gradients."""
+    """A `ResNet` whose batch norms are folded into their convolutions. No gradients."""
 
     def stem(self, images: Tensor) -> Tensor:
         """As `ResNet.stem`."""

@@ -36,6 +36,10 @@ _TYPES: dict[str, Any] = {
     "flag": Annotated[bool, Meta(description="true or false")] | UnsetType,
     "count": Annotated[int, Meta(ge=0, description="an integer, 0 or more")] | UnsetType,
 }
+FORMAT = "bevcli-boxes/1"
+FRAMES_OF_REFERENCE = ("world", "ego", "bev")
+_FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
+_FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
 
 class _FixedMembers(Struct, forbid_unknown_fields=True):
@@ -73,8 +77,8 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     try:
         rows = msgspec.convert(objects, list[_Box])
     except msgspec.ValidationError:
-        place, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
-        raise InputError(f"{where}: box {place}: {mistake}") from None
+        index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
+        raise InputError(f"{where}: box {index}: {mistake}") from None
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
@@ -84,7 +88,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         **{name: _column(rows, column) for name, column in OPTIONAL_COLUMNS.items()},
         **_futures(rows, where),
     )
-    without = [place for place, row in enumerate(rows) if row.score is UNSET]
+    without = [index for index, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
         raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
     for name, column in OPTIONAL_COLUMNS.items():
@@ -125,8 +129,8 @@ def _mistake(box: Any) -> str:
     """The first mistake in the object of a box, "" if it is right."""
     if not isinstance(box, dict):
         return f"expected an object, found {box!r:.40}"
-    fields = {each.encode_name: each for each in msgspec.structs.fields(_Box)}
-    for key in (key for key, each in fields.items() if each.required and key not in box):
+    fields = {member.encode_name: member for member in msgspec.structs.fields(_Box)}
+    for key in (key for key, member in fields.items() if member.required and key not in box):
         return f'"{key}" is missing (found: {", ".join(box)})'
     for key, value in box.items():
         if key not in fields:
@@ -140,7 +144,7 @@ def _mistake(box: Any) -> str:
 
 def _description(kind: Any) -> str:
     """The description in a type, or in one of the types of a union."""
-    notes = [note for one in (kind, *get_args(kind)) for note in getattr(one, "__metadata__", ())]
+    notes = [note for part in (kind, *get_args(kind)) for note in getattr(part, "__metadata__", ())]
     return str(notes[0].description)
 
 
@@ -163,50 +167,44 @@ def _is_known(values: NDArray[Any], column: Column) -> NDArray[np.bool_]:
 
 def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
     if not good.all():
-        place = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-        raise InputError(f"{where}: box {place}: {key}: expected {expected}, found {column[place].tolist()}")
+        index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+        raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {column[index].tolist()}")
 
 
 def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
     """Add futures to N JSON objects: M modes of T steps, each x and y, null if unknown; and the times of the steps."""
     if boxes.futures is None:
         return
-    for place, box in enumerate(objects):
-        future = boxes.futures[place]  # (M, T, 3)
+    for index, box in enumerate(objects):
+        future = boxes.futures[index]  # (M, T, 3)
         if not np.isfinite(future[..., 1:]).any():
             continue
         box["future_times_s"] = future[0, :, 0].tolist()
         modes = future[..., 1:].round(FUTURE_DECIMALS).tolist()
         box["futures"] = [[None if math.isnan(point[0]) else point for point in mode] for mode in modes]
         if boxes.future_scores is not None:
-            box["future_scores"] = boxes.future_scores[place].tolist()
+            box["future_scores"] = boxes.future_scores[index].tolist()
 
 
 def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
     """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
-    having = {place: row for place, row in enumerate(rows) if row.futures}
+    having = {index: row for index, row in enumerate(rows) if row.futures}
     if not having:
         return {}
     first = next(iter(having.values()))
     modes, steps = len(first.futures or ()), len(first.future_times_s)
     futures, scores = np.full((len(rows), modes, steps, 3), np.nan), np.full((len(rows), modes), np.nan)
-    for place, row in having.items():
+    for index, row in having.items():
         counts = [len(mode) for mode in row.futures or ()]
         if counts != [steps] * modes or len(row.future_times_s) != steps or len(row.future_scores or counts) != modes:
             raise InputError(
-                f"{where}: box {place}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
+                f"{where}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
                 f"{steps}, as in the other boxes of the frame, with a score for each mode and a time for each step)"
             )
-        futures[place, ..., 0] = row.future_times_s
-        futures[place, ..., 1:] = [[point or (np.nan, np.nan) for point in mode] for mode in row.futures or ()]
-        scores[place] = row.future_scores or np.nan
+        futures[index, ..., 0] = row.future_times_s
+        futures[index, ..., 1:] = [[point or (np.nan, np.nan) for point in mode] for mode in row.futures or ()]
+        scores[index] = row.future_scores or np.nan
     return {"futures": futures, **({"future_scores": scores} if any(row.future_scores for row in rows) else {})}
-
-
-FORMAT = "bevcli-boxes/1"
-FRAMES_OF_REFERENCE = ("world", "ego", "bev")
-_FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
-_FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
 
 @dataclass(frozen=True)
@@ -270,7 +268,7 @@ def read_boxes(
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
         reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
         names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
-        frames = tuple(_frame(path, place, row, reference, names) for place, row in enumerate(rows))
+        frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
@@ -341,8 +339,8 @@ def write_boxes(boxes: BoxesFile, path: Path) -> int:
     return sum(len(frame.boxes) for frame in boxes.frames)
 
 
-def _frame(path: Path, place: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
-    stamp = stamp_from_json(row, f"{path}: entry {place} of frames")
+def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
+    stamp = stamp_from_json(row, f"{path}: entry {index} of frames")
     where = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
         raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')

@@ -16,8 +16,7 @@ from bevcli.workshop.batch.options import BatchOptions, Workers
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model
-    from bevcli.workshop.batch.drives import Drive
-    from bevcli.workshop.batch.job import Job
+    from bevcli.workshop.batch.job import Drive, Job
     from bevcli.workshop.batch.run_batch import BatchSummary
 
 PANEL = "Run"
@@ -51,10 +50,8 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.cli.progress import fetch_if_asked
     from bevcli.sequences.nuscenes.format import NuScenesOptions
-    from bevcli.workshop.batch.drives import find_drives, read_list
-    from bevcli.workshop.batch.job import Job, all_own_options, with_absolute_paths
+    from bevcli.workshop.batch.job import Job, all_own_options, find_drives, read_list, with_absolute_paths
     from bevcli.workshop.batch.storage import is_url
 
     texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]
@@ -64,14 +61,12 @@ def batch(
         options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
         with_absolute_paths(model),
         run=replace(run_options, recording=recording),
-        embed=options.embed,
         evaluate=options.evaluate,
         retries=workers.retries,
     )
-    fetch_if_asked(model)
-    loaded = load_for_batch(job, workers)
+    loaded = load_for_batch(job, workers, fetch=model.fetch)
     found, notes = find_drives(texts, NuScenesOptions(format_options["version"], format_options.pop("split")))
-    if loaded.choice is not None:
+    if loaded.needs_export:
         notes = (*notes, "the first drive of each number of cameras and image size exports the model, and waits for it")
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     job = replace(job, source=source, own=all_own_options(format_options))
@@ -84,11 +79,12 @@ def batch(
         raise typer.Exit(SOME_FAILED)
 
 
-def load_for_batch(job: "Job", workers: Workers) -> "Model":
+def load_for_batch(job: "Job", workers: Workers, *, fetch: bool = False) -> "Model":
     """The model, loaded before the batch, so that a mistake in it ends the command at once. Raises BevcliError.
 
-    The batch needs its hash; only a worker in this process runs it.
+    The batch needs its hash; only a worker in this process runs it. fetch: download weights that are missing.
     """
+    from bevcli.cli.progress import load_with_bar
     from bevcli.inference.load import choose_device
     from bevcli.workshop.batch.worker import use_threads
 
@@ -99,7 +95,7 @@ def load_for_batch(job: "Job", workers: Workers) -> "Model":
         device = "cpu"
     if workers.address is None:
         choose_device(device)
-    return job.load_model(device if alone else "cpu")
+    return load_with_bar(replace(job.model, device=device if alone else "cpu", fetch=fetch))
 
 
 def run_with_progress(

@@ -1,20 +1,50 @@
 """`bevcli bench`: the speed of a model on this machine."""
 
 import json
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from bevcli.cli.bridge import Json, Part, as_flags
 from bevcli.errors import BevcliError
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions, complete_model
+from bevcli.options import option, options
 from bevcli.printing import say
-from bevcli.workshop.benchmark.options import BenchOptions
+from bevcli.registry import known_models
 
 if TYPE_CHECKING:
-    import torch
-
     from bevcli.inference.load import Model
 
 PANEL = "Deploy"
+
+
+@options()
+class BenchOptions:
+    """The model that is measured, and what is written."""
+
+    model: str = option(
+        reads="path or name",
+        default="tiny",
+        help=f"{', '.join(known_models())}, a FILE.toml or a FILE.onnx.",
+        metavar="NAME|FILE",
+        complete=complete_model,
+    )
+    frames: int = option(
+        default=5,
+        help="Number of timed frames, after the warm-up.",
+        metavar="N",
+        flag="--count",
+        minimum=1,
+    )
+    against: Literal["plain"] | None = option(
+        default=None, help="Also run the plain version; compare times and results."
+    )
+    engines: bool = option(
+        default=False,
+        help="Time PyTorch and all installed engines side by side, alternating, and compare their boxes.",
+    )
+    profile: Path | None = option(
+        default=None, help="Write PyTorch's profile of one frame (open it at chrome://tracing).", metavar="OUT"
+    )
 
 
 def bench(
@@ -29,16 +59,9 @@ def bench(
     """
     from bevcli.cli.progress import engine_bar
     from bevcli.config import load_config
-    from bevcli.inference.load import choose_device, choose_precision
     from bevcli.workshop.benchmark.engines import compare_engines
     from bevcli.workshop.benchmark.measure import run_benchmark
-    from bevcli.workshop.benchmark.result import write_table
 
-    target = choose_device(model_options.device)
-    if options.table is not None:
-        write_table(options.table, target, options.frames)
-        say(f"wrote {options.table}", err=True)
-        return
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("`engines` compares all of them on the CPU: leave out other options")
@@ -46,32 +69,26 @@ def bench(
             table = compare_engines(load_config(options.model), options.frames, show)
         say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))
         return
-    exported = _exported(options, model_options, target)
-    config, device = (load_config(options.model), target) if exported is None else (exported.config, exported.device)
-    precision = "fp32" if model_options.precision == "int8" else choose_precision(model_options.precision, target)
-    result = run_benchmark(config, device, precision, options, exported)
+    model, against_plain = _model(options, model_options), options.against == "plain"
+    result = run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)
     say(json.dumps(result.as_data(), indent=1) if as_json else result.text())
 
 
-def _exported(options: BenchOptions, model_options: ModelOptions, device: "torch.device") -> "Model | None":
-    """The exported file, or a model with made-up weights in the engine that is asked for; None for PyTorch."""
+def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
+    """The exported file, or a model with made-up weights in the engine that is asked for."""
     from bevcli.cli.progress import in_engine_with_bar
     from bevcli.config import load_config
-    from bevcli.inference.load import Model, load_model
+    from bevcli.inference.load import Model, choose_engine, load_model
     from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-    from bevcli.workshop.engines.engine_choice import engine_choice
-    from bevcli.workshop.engines.exported import SUFFIX
-    from bevcli.workshop.engines.in_engine import CALIBRATION_FRAMES
+    from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
 
+    if options.model.endswith(EXPORTED_SUFFIX):
+        model = load_model(options.model, options=model_options)
+    else:
+        config = load_config(options.model)
+        engine, device, precision = choose_engine(model_options, config)
+        model = Model(made_up_model(config), device, precision, engine=engine)
     parts = " and ".join(f"`{name}`" for name in ("against", "profile") if getattr(options, name) is not None)
-    if options.model.endswith(SUFFIX):
-        found = load_model(options.model, options=model_options)
-        if parts:
-            found.require_parts(parts)
-        return found
-    config = load_config(options.model)
-    choice = engine_choice(model_options, config, device)
-    if choice is None:
-        return None
-    found = in_engine_with_bar(Model(made_up_model(config), choice=choice), MadeUpDrive(CALIBRATION_FRAMES), parts)
-    return found if found.is_exported else None
+    if parts:
+        model.require_parts(parts)
+    return in_engine_with_bar(model, MadeUpDrive(CALIBRATION_FRAMES)) if model.needs_export else model

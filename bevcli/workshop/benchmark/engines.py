@@ -1,25 +1,23 @@
 """`compare_engines`: PyTorch and the engines side by side, alternating in one process."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from statistics import median
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from bevcli.errors import BevcliError
-from bevcli.inference.load import Model
+from bevcli.inference.load import Model, Report, installed_engines
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
 from bevcli.model.config import ModelConfig
-from bevcli.model.network import Network
-from bevcli.model.prepare import prepare_for_inference
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.measure import WARM_UP_FRAMES
 from bevcli.workshop.benchmark.versions import Version, difference, largest_differences
-from bevcli.workshop.engines.engine import installed_engines
-from bevcli.workshop.engines.engine_choice import EngineChoice, remember_speeds
-from bevcli.workshop.engines.in_engine import CALIBRATION_FRAMES, Report, in_engine
+from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
 
 CPU = torch.device("cpu")
 
@@ -46,11 +44,6 @@ class EngineRow:
     score: float = 0.0
     problem: str = ""
 
-    @property
-    def name(self) -> str:
-        """Engine and precision."""
-        return f"{self.engine} {self.precision}"
-
 
 @dataclass(frozen=True)
 class EngineTable:
@@ -65,66 +58,62 @@ class EngineTable:
         return {"model": self.model, "machine": self.machine, "engines": [vars(row) for row in self.rows]}
 
     def text(self) -> str:
-        """The table, and what `auto` takes."""
+        """The table."""
         first = median(self.rows[0].seconds)
         heads = ("engine", "frame, ms", "fastest to slowest", "of torch fp32", "in 0.1 m", "largest, m", "scores")
         lines = [f"{self.model}, {self.machine}, alternating frames, made-up weights", "", _line(*heads)]
         for row in self.rows:
+            name = f"{row.engine} {row.precision}"
             if row.problem:
-                lines.append(f"{row.name:<18}{row.problem}")
+                lines.append(f"{name:<18}{row.problem}")
                 continue
             middle, span = median(row.seconds), f"{1000 * min(row.seconds):.1f} to {1000 * max(row.seconds):.1f}"
             cells = (f"{1000 * middle:.1f}", span, f"{middle / first:.2f}", f"{row.near:.1%}")
-            lines.append(_line(row.name, *cells, f"{row.largest_m:.2g}", f"{row.score:.2g}"))
-        rows = sorted((row for row in self.rows if row.seconds), key=lambda row: median(row.seconds))
-        fastest = {row.precision: row.engine for row in reversed(rows)}
-        words = [f"{fastest[precision]} in {precision}" for precision in ("fp32", "int8") if precision in fastest]
-        return "\n".join([*lines, "", f"`engine=auto` takes {', '.join(words)} for {self.model} from now on"])
+            lines.append(_line(name, *cells, f"{row.largest_m:.2g}", f"{row.score:.2g}"))
+        return "\n".join(lines)
 
 
-def compare_engines(config: ModelConfig, frames: int, report: Report = lambda done, total, what: None) -> EngineTable:
+def compare_engines(config: ModelConfig, frames: int, report: Report) -> EngineTable:
     """Time a step of PyTorch and of every installed engine on the same frames, in turn, and compare their boxes.
 
-    The times are kept in the user's cache, where `engine="auto"` finds them. Nothing else should run on the machine.
+    Nothing else should run on the machine.
 
     Args:
         config: of the model, which gets made-up weights.
         frames: number of timed frames.
-        report: of the export, see `in_engine`.
+        report: of the export, see `Model.in_engine`.
     """
-    versions: dict[EngineRow, Version] = {}
+    versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []
-    network = made_up_model(config)
-    for engine, precision in [*product([TORCH], ("fp32", "bf16")), *product(installed_engines(), ("fp32", "int8"))]:
+    network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
+    pairs: Iterable[tuple[str, Any]] = chain(
+        product([TORCH], ("fp32", "bf16")), product(installed_engines(), ("fp32", "int8"))
+    )
+    for engine, precision in pairs:
+        model = Model(network, engine=engine, precision=precision)
         try:
-            versions[EngineRow(engine, precision)] = _version(network, engine, precision, report)
+            model = model.in_engine(drive.rig, drive, report=report)
         except BevcliError as error:
             failed.append(EngineRow(engine, precision, problem=str(error)))
-    drive = MadeUpDrive(config.past_frames + WARM_UP_FRAMES + frames)
-    preprocessors = {row: version.runner.preprocessor() for row, version in versions.items()}
-    reference = next(iter(versions.values()))
-    found: dict[EngineRow, list[Any]] = {row: [] for row in versions}
-    for place in range(config.past_frames, len(drive.stamps)):
-        frame = drive.load(place)
-        for row, version in versions.items():
-            version.step(preprocessors[row](frame))
-            if place == config.past_frames:
+        else:
+            versions[engine, precision] = Version(model.prepared, CPU)
+    first = config.past_frames
+    drive = MadeUpDrive(first + WARM_UP_FRAMES + frames)
+    preprocessors = {name: version.runner.preprocessor() for name, version in versions.items()}
+    differences: dict[tuple[str, Any], list[tuple[Tensor, Tensor]]] = {name: [] for name in versions}
+    for index in range(first, len(drive.stamps)):
+        frame = drive.load(index)
+        for name, version in versions.items():
+            version.step(preprocessors[name](frame))
+            if index == first:
                 version.fill_past(drive)
-            if place >= config.past_frames + WARM_UP_FRAMES:
-                found[row].append(difference(version.queries, reference.queries))
+            if index >= first + WARM_UP_FRAMES:
+                differences[name].append(difference(version.queries, versions[TORCH, "fp32"].queries))
     rows = [
-        EngineRow(row.engine, row.precision, tuple(version.seconds[WARM_UP_FRAMES:]), *largest_differences(found[row]))
-        for row, version in versions.items()
+        EngineRow(*name, tuple(version.seconds[WARM_UP_FRAMES:]), *largest_differences(differences[name]))
+        for name, version in versions.items()
     ]
-    remember_speeds(config, {row.name: median(row.seconds) for row in rows})
     return EngineTable(config.name, describe_machine(CPU), (*rows, *failed))
-
-
-def _version(network: Network, engine: str, precision: Any, report: Report) -> Version:
-    if engine == TORCH:
-        return Version(prepare_for_inference(network, CPU, precision), CPU)
-    model, drive = Model(network, choice=EngineChoice(engine, precision)), MadeUpDrive(CALIBRATION_FRAMES)
-    return Version(in_engine(model, drive.rig, drive, report=report).prepared, CPU)
 
 
 def _line(name: str, *cells: str) -> str:

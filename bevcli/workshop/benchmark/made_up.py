@@ -44,9 +44,9 @@ class MadeUpDrive(Sequence):
         self._files = [_jpeg(seed) for seed in range(ENCODED_IMAGES)]
         self._reader = ImageReader(strict=True)
 
-    def load(self, place: int) -> Frame:
+    def load(self, index: int) -> Frame:
         """The frame at an index; every call decodes its six images, in threads as those of other drives."""
-        stamp, pose, first = self.stamps[place], self.pose(place), place * len(self.rig.names)
+        stamp, pose, first = self.stamps[index], self.pose(index), index * len(self.rig.names)
         decoders = {name: partial(self._image, first + i, stamp) for i, name in enumerate(self.rig.names)}
         sources = {name: MessageSource(name, stamp.timestamp_ns, decode) for name, decode in decoders.items()}
         return Frame(
@@ -58,9 +58,9 @@ class MadeUpDrive(Sequence):
             kinematics=Kinematics(np.array([0, 0, GRAVITY]), np.array([0, 0, 0.05]), np.array([SPEED, 0, 0])),
         )
 
-    def pose(self, place: int) -> Pose:
+    def pose(self, index: int) -> Pose:
         """world_from_ego of the frame at an index."""
-        seconds = place * STEP_S
+        seconds = index * STEP_S
         yaw = 0.05 * seconds
         return Pose(np.array([SPEED * seconds, 0.2 * seconds, 0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 

@@ -4,7 +4,8 @@ import contextlib
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -13,62 +14,188 @@ from typing import Any
 import torch
 
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.background import write_behind
+from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
-from bevcli.model.config import ModelConfig
-from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.prepare import DTYPES, Precision
 from bevcli.recording.writer import Recording
-from bevcli.workshop.benchmark.limits import count_operations, measure_limits
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.workshop.benchmark.options import BenchOptions
-from bevcli.workshop.benchmark.result import BenchmarkResult
-from bevcli.workshop.benchmark.versions import Version, compare_with_plain
+from bevcli.workshop.benchmark.operations import count_operations
+from bevcli.workshop.benchmark.versions import Comparison, Version, compare_with_plain, wait_for
 
 WARM_UP_FRAMES = 2  # one without and one with history
 MIN_RUN_FRAMES = 4  # of a run with reading and recording; the times between them are measured, but for the last
 RUN_FRAMES = 12  # of a run if frames are short
 RUNS = 6  # that take turns with the model alone if frames are short
 TURNS_S = 30.0  # for all turns if frames are short; with slow models one run
+# Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
+CPU_EDGE, GPU_EDGE = 2048, 8192
+COPIED_FLOATS = 1 << 26
+REPEATS = 8
+
+
+@dataclass(frozen=True)
+class MachineLimits:
+    """Peak throughput.
+
+    Attributes:
+        gemm_gflops: rate of matrix products, 10^9 operations a second.
+        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
+    """
+
+    gemm_gflops: float
+    copy_gbs: float
+
+    def fastest(self, other: "MachineLimits") -> "MachineLimits":
+        """The higher of two measurements; disturbances only make a measurement lower."""
+        return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
+
+
+@dataclass(frozen=True)
+class BenchmarkResult:
+    """All measurements of one model.
+
+    Attributes:
+        model: its name.
+        device: "cpu" or "cuda".
+        precision: of the prepared model or the exported file.
+        machine: description of processor or GPU, threads and PyTorch's version.
+        stages_s: stage -> seconds of each frame; no two stages ran at the same time.
+        frame_s: seconds of the model's step for each frame, from network inputs to boxes.
+        run_frame_s: median seconds of a frame in a whole run, where other threads decode, preprocess and record.
+        run_over_model: the same, divided by the time of the model alone, which took turns with the runs.
+        peak_memory_bytes: of the process on a CPU, of tensors on a GPU.
+        operations: arithmetic operations of one frame.
+        limits: the machine's peak throughput.
+        comparison: with the plain version, None where that was not run.
+        engine: the program that ran the model.
+    """
+
+    model: str
+    device: str
+    precision: str
+    machine: str
+    stages_s: Mapping[str, tuple[float, ...]]
+    frame_s: tuple[float, ...]
+    run_frame_s: float
+    run_over_model: float
+    peak_memory_bytes: int
+    operations: float
+    limits: MachineLimits
+    comparison: Comparison | None = None
+    engine: str = "torch"
+
+    @property
+    def times_limit(self) -> float:
+        """The frame's time divided by the time of its operations at the peak rate of matrix products."""
+        return median(self.frame_s) / (self.operations / (self.limits.gemm_gflops * 1e9))
+
+    @property
+    def speedup(self) -> float | None:
+        """The plain version's median frame time divided by the fast version's."""
+        return median(self.comparison.plain_frame_s) / median(self.frame_s) if self.comparison else None
+
+    def as_data(self) -> dict[str, object]:
+        """The result for JSON."""
+        frame_s = median(self.frame_s)
+        data: dict[str, object] = {
+            **{name: getattr(self, name) for name in ("model", "device", "precision", "engine", "machine")},
+            "stages_ms": {stage: round(1000 * median(times), 3) for stage, times in self.stages_s.items()},
+            "frame_ms": round(1000 * frame_s, 3),
+            "frame_ms_spread": [round(1000 * min(self.frame_s), 3), round(1000 * max(self.frame_s), 3)],
+            "run_frame_ms": round(1000 * self.run_frame_s, 3),
+            "run_over_model": round(self.run_over_model, 3),
+            "fps": round(1 / frame_s, 4),
+            "peak_memory_mb": round(self.peak_memory_bytes / 1e6, 1),
+            "operations_g": round(self.operations / 1e9, 2),
+            "limits": {
+                "gemm_gflops": round(self.limits.gemm_gflops, 1),
+                "copy_gbs": round(self.limits.copy_gbs, 1),
+                "times_limit": round(self.times_limit, 3),
+            },
+        }
+        if self.comparison is not None and self.speedup is not None:
+            data |= {
+                "plain_frame_ms": round(1000 * median(self.comparison.plain_frame_s), 3),
+                "speedup": round(self.speedup, 3),
+                "max_box_difference_m": self.comparison.max_box_difference_m,
+                "share_within_0.1_m": self.comparison.share_within_tenth_m,
+                "max_score_difference": self.comparison.max_score_difference,
+            }
+        return data
+
+    def text(self) -> str:
+        """A table of the stages, then one line for each other measurement."""
+        lines = [f"{self.model}, {self.precision}, {self.engine}, {self.machine}", ""]
+        lines.append(f"{'stage':<22}{'median ms':>10}  fastest to slowest")
+        for stage, times in {**self.stages_s, "whole frame": self.frame_s}.items():
+            low, middle, high = (1000 * seconds for seconds in (min(times), median(times), max(times)))
+            lines.append(f"{stage:<22}{middle:>10.1f}  {low:.1f} to {high:.1f}")
+        frame_s, gemm = median(self.frame_s), self.limits.gemm_gflops
+        run_ms, memory = 1000 * self.run_frame_s, self.peak_memory_bytes / 1e6
+        lines += [
+            "",
+            f"model alone                {1 / frame_s:.3g} frames per second",
+            f"with reading, recording    {run_ms:.0f} ms per frame, {self.run_over_model:.2f} times the model alone",
+            f"operations                 {self.operations / 1e9:.0f} G per frame; "
+            f"the frame takes {self.times_limit:.2f} times their time at the peak rate",
+            f"peak rate                  {gemm:.0f} G operations per second (matrix products), "
+            f"{self.limits.copy_gbs:.1f} GB/s (copying)",
+            f"peak memory                {memory:.0f} MB",
+        ]
+        comparison = self.comparison
+        if comparison is not None:
+            lines += [
+                f"plain version              {1000 * median(comparison.plain_frame_s):.0f} ms per frame, "
+                f"{self.speedup:.2f} times the prepared model's",
+                f"largest difference to it   {comparison.max_box_difference_m:.2g} m "
+                f"({comparison.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
+                f"{comparison.max_score_difference:.2g} in the scores",
+            ]
+        return "\n".join(lines)
 
 
 def run_benchmark(
-    config: ModelConfig, device: torch.device, precision: Precision, options: BenchOptions, exported: Model | None
+    model: Model, frames: int, *, against_plain: bool = False, profile_path: Path | None = None
 ) -> BenchmarkResult:
-    """Runs all measurements one after another. Nothing else should run on the machine.
+    """Run all measurements one after another. Nothing else should run on the machine.
 
-    precision: of the prepared model. exported: an exported file of the model, which is timed with its own weights and
-    precision; None for PyTorch.
+    Args:
+        model: with made-up weights; or an exported file, which is timed with its own weights and precision.
+        frames: number of timed frames.
+        against_plain: compare with the plain version.
+        profile_path: where PyTorch's profile of one frame is written; None for no profile.
     """
-    limits = measure_limits(device, precision)
-    model = made_up_model(config)
-    network = prepare_for_inference(model, device, precision) if exported is None else exported.prepared
-    fast = Version(network, device)
+    config, device = model.config, model.device
+    peak_precision: Precision = "fp32" if model.precision == "int8" else model.precision
+    limits = measure_limits(device, peak_precision)
+    plain: Any = made_up_model(config) if model.is_exported else model.network
+    fast = Version(model.prepared, device)
     first = config.past_frames
-    timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + options.frames
-    drive = MadeUpDrive(run + 2 * RUNS * max(options.frames, RUN_FRAMES))
+    timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + frames
+    drive = MadeUpDrive(run + 2 * RUNS * max(frames, RUN_FRAMES))
     stages = _time_stages(fast, drive, first, range(timed, run))
     frame_s, peak = tuple(fast.seconds), peak_memory(device)
-    run_frame_s, run_over_model = time_runs(fast, drive, run, max(options.frames, MIN_RUN_FRAMES))
+    run_frame_s, run_over_model = time_runs(fast, drive, run, max(frames, MIN_RUN_FRAMES))
     preprocessor = Preprocessor(config)
     prepared = preprocessor(drive.load(0))
-    if options.profile is not None:
+    if profile_path is not None:
         with torch.profiler.profile() as profile:
             fast.step(prepared)
-        profile.export_chrome_trace(str(options.profile))
+        profile.export_chrome_trace(str(profile_path))
     comparison = None
-    if options.against == "plain":
-        frames = (preprocessor(drive.load(place)) for place in range(options.frames))
-        comparison, frame_s = compare_with_plain(model, fast, frames)
+    if against_plain:
+        inputs = (preprocessor(drive.load(index)) for index in range(frames))
+        comparison, frame_s = compare_with_plain(plain, fast, inputs)
     size = (prepared.images.shape[-2], prepared.images.shape[-1])
-    hits = model.pillars(prepared.image_from_bev, size, prepared.has_image)
+    hits = plain.pillars(prepared.image_from_bev, size, prepared.has_image)
     return BenchmarkResult(
         model=config.name,
         device=device.type,
-        precision=precision if exported is None else exported.precision,
-        engine="torch" if exported is None else exported.engine,
+        precision=model.precision,
+        engine=model.engine,
         machine=describe_machine(device),
         stages_s=stages,
         frame_s=frame_s,
@@ -76,7 +203,7 @@ def run_benchmark(
         run_over_model=run_over_model,
         peak_memory_bytes=peak,
         operations=count_operations(config, hits.hits_per_camera),
-        limits=limits.fastest(measure_limits(device, precision)),
+        limits=limits.fastest(measure_limits(device, peak_precision)),
         comparison=comparison,
     )
 
@@ -86,14 +213,14 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
     preprocessor = fast.runner.preprocessor()
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
-        for place in range(first, timed.stop):
-            if place == first + 1:
+        for index in range(first, timed.stop):
+            if index == first + 1:
                 fast.fill_past(drive)
-            if place == timed.start:
+            if index == timed.start:
                 times.clear()
                 fast.seconds = []
             began = time.perf_counter()
-            frame = drive.load(place)
+            frame = drive.load(index)
             loaded = time.perf_counter()
             prepared = preprocessor(frame)
             before = {"decode": loaded - began, "preprocess": time.perf_counter() - loaded}
@@ -107,12 +234,12 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
 
 
 def time_runs(
-    fast: Version, drive: MadeUpDrive, place: int, frames: int, turns_s: float = TURNS_S
+    fast: Version, drive: MadeUpDrive, index: int, frames: int, turns_s: float = TURNS_S
 ) -> tuple[float, float]:
     """Median seconds of a frame in whole runs, and how many times as long that is as a frame of the model alone.
 
     Both take turns, because the speed of a machine that others use changes within seconds. The frames of the drive are
-    used once each, from `place` on; the model has seen those before.
+    used once each, from `index` on; the model has seen those before.
 
     frames: of a run, at least. turns_s: of all turns if frames are short.
     """
@@ -123,7 +250,7 @@ def time_runs(
     fast.seconds = []
     in_runs: list[float] = []
     with _recording(drive, fast) as recording:
-        for first in range(place, place + 2 * frames * runs, 2 * frames):
+        for first in range(index, index + 2 * frames * runs, 2 * frames):
             for alone in range(first, first + frames):
                 fast.step(preprocessor(drive.load(alone)))
             in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), preprocessor, recording)
@@ -142,7 +269,9 @@ def _time_run(
         fast.state = step[2]
         return True
 
-    write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state))
+    with WriteBehind(record) as writer:
+        for step in fast.runner.run(drive, places, preprocessor, fast.state):
+            writer.put(step)
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 
@@ -152,3 +281,26 @@ def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
     folder = tempfile.TemporaryDirectory(prefix="bevcli-bench-")
     with folder, Recording(Path(folder.name) / "recording.rrd", drive, Model(fast.runner.model)) as recording:
         yield recording
+
+
+def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
+    """The best of several matrix products in a precision, and of several copies, on a device."""
+    edge = GPU_EDGE if device.type == "cuda" else CPU_EDGE
+    matrix = torch.randn(edge, edge, device=device).to(DTYPES[precision])
+    product = torch.empty_like(matrix)
+    source, target = (torch.ones(COPIED_FLOATS, device=device) for _ in range(2))
+    gemm_s = _best_seconds(lambda: torch.mm(matrix, matrix, out=product), device)
+    copy_s = _best_seconds(lambda: target.copy_(source), device)
+    return MachineLimits(2 * edge**3 / gemm_s / 1e9, 2 * 4 * COPIED_FLOATS / copy_s / 1e9)
+
+
+def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
+    work()
+    best = float("inf")
+    for _ in range(REPEATS):
+        wait_for(device)
+        began = time.perf_counter()
+        work()
+        wait_for(device)
+        best = min(best, time.perf_counter() - began)
+    return best

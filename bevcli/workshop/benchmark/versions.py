@@ -3,26 +3,44 @@
 import copy
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bevcli.frame import Prediction
+from bevcli.frame import FrameStamp, Prediction
+from bevcli.geometry.transforms import Pose
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
-from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
+from bevcli.model.bevformer_v2.window import FeatureWindow
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
-from bevcli.workshop.benchmark.limits import wait_for
+from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
-from bevcli.workshop.benchmark.result import Comparison
-from bevcli.workshop.engines.box_differences import NEAR_M
+from bevcli.workshop.engines.export_cache import NEAR_M
 
 QueryResults = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The fast version compared with the plain one, over all object queries of all frames.
+
+    Attributes:
+        plain_frame_s: seconds of each frame of the plain version.
+        max_box_difference_m: largest distance between the two versions' box centres.
+        share_within_tenth_m: share of the box centres that are within 0.1 m of each other.
+        max_score_difference: largest difference of scores.
+    """
+
+    plain_frame_s: tuple[float, ...]
+    max_box_difference_m: float
+    share_within_tenth_m: float
+    max_score_difference: float
 
 
 class Version:
@@ -57,11 +75,31 @@ class Version:
         assert self.state is not None
         assert self.state.stamp is not None
         past = [(stamp, drive.pose(stamp.index)) for stamp in drive.stamps[: self.state.stamp.index]]
-        self.state = replace(self.state, memory=model_class(self.runner.config).with_past(self.state.memory, past))
+        for with_past in for_model("past", model_class(self.runner.config))[:1]:
+            self.state = replace(self.state, memory=with_past(self.state.memory, past))
 
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: ModelOutputs) -> None:
         codes = outputs.box_codes[-1, 0]
         self.queries = torch.cat([codes[:, :2], codes[:, 4:5]], dim=-1), outputs.class_logits[-1, 0].sigmoid()
+
+
+def with_past(memory: FeatureWindow, past: Sequence[tuple[FrameStamp, Pose]]) -> FeatureWindow:
+    """A memory as if the model had seen earlier frames too, with copies of the image features.
+
+    past: their stamps and world_from_ego.
+    """
+    if not memory.frames:
+        return memory  # nothing of one frame is kept for the next
+    seen = memory.frames[-1]
+    return FeatureWindow((*(replace(seen, stamp=stamp, pose=pose) for stamp, pose in past), seen))
+
+
+def wait_for(device: torch.device) -> None:
+    """Returns when a GPU has finished all queued work; at once on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    if device.type == "mps":
+        torch.mps.synchronize()
 
 
 def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
@@ -69,7 +107,7 @@ def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
     stages = {module: stage.replace("_", " ") for module, stage in model.stages.items()}
     if "" in stages:  # of the whole model, a CUDA graph
         return stages, {}
-    if not model.has_parts:
+    if not isinstance(model, Network):
         return stages, dict.fromkeys(stages, "input")
     parts = {
         "temporal_self_attention": "temporal attention",
@@ -96,7 +134,7 @@ def textbook_version(model: Network, device: torch.device) -> Network:
     return textbook
 
 
-class PaddedSampling(nn.Module):
+class PaddedSampling(GridSampling):
     """`grid_sample` of all maps at once; the queries of every map are padded to the longest list."""
 
     def forward(
@@ -130,7 +168,7 @@ def compare_with_plain(
     device = fast.runner.device
     plain = Version(textbook_version(model, device), device)
     fast.state, fast.seconds = None, []
-    found = []
+    differences = []
     for prepared in frames:
         if device.type == "cpu":
             return_freed_memory()
@@ -139,8 +177,8 @@ def compare_with_plain(
             keep_freed_memory()
         fast.runner.step(fast.state, prepared)  # to have memory to reuse
         fast.step(prepared)
-        found.append(difference(fast.queries, plain.queries))
-    return Comparison(tuple(plain.seconds), *largest_differences(found)), tuple(fast.seconds)
+        differences.append(difference(fast.queries, plain.queries))
+    return Comparison(tuple(plain.seconds), *largest_differences(differences)), tuple(fast.seconds)
 
 
 def difference(ours: QueryResults, theirs: QueryResults) -> tuple[Tensor, Tensor]:

@@ -1,12 +1,27 @@
-"""`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion."""
+"""`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion.
 
+And its short forms: `bevcli run --calibrate`, and the check of `bevcli project-debug`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part, as_flags
+from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.calibration.options import CalibrateOptions, CalibrateOutputOptions
+from bevcli.workshop.calibration.options import (
+    CalibrateFirstOptions,
+    CalibrateOptions,
+    CalibrateOutputOptions,
+    CheckMotionOptions,
+)
+
+if TYPE_CHECKING:
+    from bevcli.findings import Finding
+    from bevcli.frame import Sequence
 
 PANEL = "Look"
 
@@ -22,9 +37,8 @@ def calibrate(
     """Measure the calibration of a drive from its own images and ego-motion.
 
     Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
-    fine, corrected, or not measurable. Writes calibration.json with the corrected rig, report.json with all numbers,
-    calibration.png and recording.rrd, which show the cameras before and after. Nothing in SEQUENCE is changed.
-    `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
+    fine, corrected, or not measurable. Writes calibration.json with the corrected rig and report.json with all numbers.
+    Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
     """
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
@@ -39,3 +53,37 @@ def calibrate(
     written = result.write(out)
     say(result.to_json() if as_json else as_flags(result.text()))
     say("Written: " + ", ".join(map(str, written)), err=as_json)
+
+
+def _corrected(options: CalibrateFirstOptions, drive: Sequence) -> Sequence:
+    """The drive with the rig that it shows, where this is asked for; what is corrected is printed."""
+    if not options.calibrate:
+        return drive
+    from bevcli.cli.progress import Progress
+    from bevcli.workshop.calibration.calibrate import STEPS, CorrectedDrive, calibrate as measure
+    from bevcli.workshop.calibration.estimates import Verdict, change_text
+
+    with Progress(STEPS, "steps of the calibration") as progress:
+        result = measure(drive, after_step=progress.advance)
+    for each in result.cameras:
+        reason = change_text(each) if each.verdict is Verdict.CORRECTED else each.reason
+        say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
+    return CorrectedDrive(drive, result)
+
+
+def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], Sequence]) -> tuple[Finding, ...]:
+    """Findings of a short calibration of the drive, where it has ego-motion and is no calibration alone."""
+    if not options.motion:
+        return ()
+    from bevcli.errors import InputError
+    from bevcli.workshop.calibration.calibrate import motion_findings
+
+    try:
+        drive = open_drive()
+    except InputError:  # the check has said so
+        return ()
+    return motion_findings(drive)
+
+
+CALIBRATE_FIRST = Extension(CalibrateFirstOptions, _corrected)
+CHECK_MOTION = Extension(CheckMotionOptions, _motion_findings)

@@ -1,86 +1,44 @@
-"""Engines: ONNX Runtime and OpenVINO on the CPU, with one interface. Each runs an exported file."""
+"""Engines: ONNX Runtime and OpenVINO on the CPU, with one interface, which brings all that bevcli does with one."""
 
-import contextlib
 import importlib
-import logging
 import sys
-from collections.abc import Iterator, Mapping
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from torch import nn
+import torch
 
 from bevcli.errors import BevcliError, WeightsError
-from bevcli.registry import entries, load
-
-Arrays = Mapping[str, np.ndarray]
-
-LARGEST_BYTES = 2**31  # protobuf's own limit, which every file of `bevcli export-onnx` keeps
-
-
-def require(*names: str, extra: str = "onnx") -> None:
-    """Raises BevcliError where one of these packages is not installed. extra: of bevcli, which installs them."""
-    missing = [name for name in names if find_spec(name) is None]
-    if missing:
-        raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[{extra}]'")
+from bevcli.frame import Sequence
+from bevcli.geometry.cameras import CameraRig
+from bevcli.inference.load import Model, Report, tracker_of_table
+from bevcli.inference.options import ModelOptions
+from bevcli.model.config import ModelConfig
+from bevcli.registry import load
+from bevcli.workshop.engines.export_cache import exported_for_rig
+from bevcli.workshop.engines.export_form import export_form
+from bevcli.workshop.engines.export_onnx import EXPORTERS, QUANTIZERS, check_size, require
+from bevcli.workshop.engines.exported import Arrays, ExportedModel, LoadedFile
 
 
-@contextlib.contextmanager
-def errors_only(*names: str) -> Iterator[None]:
-    """Inside, these loggers of other packages tell errors only; "" is the root of all loggers."""
-    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
-    for logger in levels:
-        logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)
+class Engine(LoadedFile):
+    """A program that runs exported files. An instance is a file, loaded.
 
-
-def import_openvino() -> Any:
-    """The package openvino, without its telemetry.
-
-    When it is imported for the first time, openvino sends a message to Google Analytics by the package
-    openvino_telemetry. Without that package it takes a stub, which sends nothing.
-    """
-    hidden = "openvino_telemetry"
-    before = sys.modules.get(hidden)
-    sys.modules[hidden] = None  # type: ignore[assignment]  # import then raises ImportError
-    try:
-        return importlib.import_module("openvino")
-    finally:
-        if before is None:
-            del sys.modules[hidden]
-        else:
-            sys.modules[hidden] = before
-
-
-class Engine(nn.Module):
-    """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
-
-    An engine is registered under `bevcli.engines`: a subclass, made from the file and a number of threads.
+    An engine is registered under `bevcli.engines`: a subclass, made from the file and a number of threads, that sets
+    the attributes of `LoadedFile` and has its `forward`.
 
     Attributes:
         packages: that it needs.
         extra: of bevcli, which installs them.
-        rank: of the engines that are installed, the lowest is taken where none is named and none was measured.
+        rank: of the engines that are installed, the lowest is taken for INT8 where none is named.
         deformable_convolution: as `OnnxOptions.deformable_convolution`, for files that are exported for it.
-        metadata: of the file: text by name.
-        input_shapes: name of each input -> its shape.
-        outputs: names of the outputs.
     """
 
     packages: ClassVar[tuple[str, ...]] = ()
     extra: ClassVar[str] = "onnx"
     rank: ClassVar[int] = 2
     deformable_convolution: ClassVar[Literal["operator", "gridsample"]] = "operator"
-    metadata: Mapping[str, str]
-    input_shapes: Mapping[str, tuple[int, ...]]
-    outputs: tuple[str, ...]
 
     def __init__(self, file: Path, threads: int) -> None:
         """Raises BevcliError where the program is not installed, WeightsError for a file that it cannot load."""
@@ -92,9 +50,58 @@ class Engine(nn.Module):
         """Raises BevcliError where a package that it needs is not installed."""
         require(*cls.packages, extra=cls.extra)
 
-    def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        """One step. feed: every input by name. Returns every output by name."""
-        raise NotImplementedError
+    @classmethod
+    def open(cls, file: Path, threads: int | None = None) -> ExportedModel:
+        """An exported file in the place of a model. threads: that it uses; None takes PyTorch's number.
+
+        Raises:
+            BevcliError: the engine is not installed.
+            WeightsError: the file is missing, cannot be loaded, or is not of `bevcli export-onnx`.
+            ConfigError: the model in its metadata is wrong.
+        """
+        return ExportedModel(file, cls(file, torch.get_num_threads() if threads is None else threads))
+
+    @classmethod
+    def open_model(cls, name: str, options: ModelOptions) -> Model:
+        """The model of an exported file, `options.model`. name: of the engine. Raises BevcliError, as `open` does."""
+        file = Path(str(options.model))
+        if options.weights is not None or options.untrained:
+            option = "`untrained`" if options.untrained else f"`weights={options.weights}`"
+            raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
+        if options.precision is not None:
+            raise BevcliError(
+                f"`precision={options.precision}`: {file} has a fixed precision: leave out the option "
+                "(bevcli quantize writes files with INT8)"
+            )
+        if str(options.device) not in ("auto", "cpu"):
+            raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
+        network = cls.open(file)
+        stated = network.metadata
+        return Model(
+            network,
+            precision=stated.precision,
+            weights=None if stated.untrained else file,
+            bundled=stated.bundled,
+            tracker=tracker_of_table(stated.contents, stated.config, str(file)),
+            engine=name,
+            file=file,
+        )
+
+    @classmethod
+    def check_options(cls, name: str, options: ModelOptions, config: ModelConfig) -> None:
+        """Raises BevcliError where the engine, `name`, is not installed or cannot run a model with these options."""
+        if options.precision not in (None, "fp32", "int8"):
+            raise BevcliError(f"`precision={options.precision}`: `engine={name}` computes in fp32 or int8")
+        if str(options.device) not in ("auto", "cpu"):
+            raise BevcliError(f"`device={options.device}`: `engine={name}` runs on the CPU: leave out the option")
+        cls.require_packages()
+        require(*EXPORTERS, *(QUANTIZERS if options.precision == "int8" else ()))
+        export_form(config, len(config.cameras))
+
+    @classmethod
+    def export(cls, model: Model, rig: CameraRig, drive: Sequence | None, report: Report) -> Model:
+        """A model that is loaded for this engine, as an exported file for a rig, see `Model.in_engine`."""
+        return exported_for_rig(model, rig, drive, report, cls.open, cls.deformable_convolution)
 
 
 class OnnxRuntimeEngine(Engine):
@@ -158,21 +165,32 @@ class OpenVinoEngine(Engine):
         self.request = self.model.create_infer_request()
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        found = self.request.infer(dict(feed), share_inputs=True)
-        return {name: found[name] for name in self.outputs}
+        outputs = self.request.infer(dict(feed), share_inputs=True)
+        return {name: outputs[name] for name in self.outputs}
 
 
-def installed_engines() -> dict[str, type[Engine]]:
-    """The engines whose packages are installed, the one with the lowest rank first."""
-    found = {}
-    for name in entries("bevcli.engines"):
-        try:
-            engine: type[Engine] = load("bevcli.engines", name)
-            engine.require_packages()
-        except BevcliError:  # not installed, or a broken package of somebody else
-            continue
-        found[name] = engine
-    return dict(sorted(found.items(), key=lambda item: item[1].rank))
+def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:
+    """An exported file in the place of a model, see `Engine.open`. engine: a name of `bevcli.engines`."""
+    kind: type[Engine] = load("bevcli.engines", engine)
+    return kind.open(file, threads)
+
+
+def import_openvino() -> Any:
+    """The package openvino, without its telemetry.
+
+    When it is imported for the first time, openvino sends a message to Google Analytics by the package
+    openvino_telemetry. Without that package it takes a stub, which sends nothing.
+    """
+    hidden = "openvino_telemetry"
+    before = sys.modules.get(hidden)
+    sys.modules[hidden] = None  # type: ignore[assignment]  # import then raises ImportError
+    try:
+        return importlib.import_module("openvino")
+    finally:
+        if before is None:
+            del sys.modules[hidden]
+        else:
+            sys.modules[hidden] = before
 
 
 @cache
@@ -183,13 +201,6 @@ def _openvino_core() -> Any:
     another core may have freed. The next Ctrl-C would then end the process with a segmentation fault (2026.4).
     """
     return import_openvino().Core()
-
-
-def check_size(file: Path) -> None:
-    """Raises OSError for a missing file, ValueError for one that is larger than an exported file can be."""
-    size = file.stat().st_size
-    if size > LARGEST_BYTES:
-        raise ValueError(f"it has {size} bytes (expected at most {LARGEST_BYTES})")
 
 
 def _cannot_load(file: Path, program: str, error: Exception) -> WeightsError:

@@ -18,7 +18,6 @@ def export_onnx(
         model_option(
             "tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that WEIGHTS "
             "fit, else demo.",
-            old=("",),
         ),
     ] = None,
     *,
@@ -36,7 +35,7 @@ def export_onnx(
     from bevcli.inference.load import load_model
     from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.benchmark.exported import check_exported, difference_lines
+    from bevcli.workshop.engines.differences import check_exported, difference_lines
     from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
 
     loaded = load_model(model, options=replace(model_options, device="cpu"))

@@ -7,9 +7,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from bevcli.errors import BevcliError
+from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
-from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.temporal_model import model_class
+from bevcli.registry import for_model
+from bevcli.workshop.engines.export_step import RecurrentStep
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,15 @@ class ExportForm:
         raise NotImplementedError
 
 
+def export_form(config: ModelConfig, cameras: int) -> ExportForm:
+    """The form in which a model is exported for a number of cameras. Raises BevcliError for a model that has none."""
+    forms = for_model("export_form", model_class(config))
+    if not forms:
+        raise BevcliError(f"{config.name}: a {config.architecture} cannot be exported")
+    form: ExportForm = forms[0](config, cameras)
+    return form
+
+
 def camera_ports(
     config: ModelConfig, lead: tuple[int, ...], axes: str = "1, N", bev_frame: str = "the bev frame"
 ) -> tuple[Port, ...]:
@@ -88,7 +102,7 @@ def camera_ports(
     image = config.image
     width, height = image.padded_size
     left, top, right, bottom = image.crop_box
-    pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
+    pad = ", ".join(f"{value:g}" for value in image.pad_bgr)
     cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
     levels = ", their grey levels moved as by bevcli.inference.image_repair.auto_levels" if image.auto_levels else ""
     levels += ", fog removed as by bevcli.inference.image_repair.defogged" if image.defog else ""
@@ -190,7 +204,57 @@ def _pixel(config: ModelConfig) -> str:
     return f"pixel (u, v) of the {'resized' if image.crop is None else 'cropped'} image, {moved},"
 
 
-def pad_value_bgr(config: ModelConfig) -> tuple[float, ...]:
-    """The pixels outside the resized image: the mean, which normalisation turns into zero."""
-    mean = config.image.mean
-    return mean[::-1] if config.image.color_order == "rgb" else mean
+class RecurrentForm(ExportForm):
+    """The exported form: the BEV map of the previous frame enters, that of the current one comes out."""
+
+    step = RecurrentStep
+
+    @property
+    def inputs(self) -> tuple[Port, ...]:
+        return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
+
+    def feed(self, prepared: PreparedFrame, memory: BevHistory | None) -> dict[str, Tensor]:
+        inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
+        return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
+
+    def memory(self, prepared: PreparedFrame, memory: BevHistory | None, found: Mapping[str, Tensor]) -> BevHistory:
+        return BevHistory(found["bev"], prepared.frame.world_from_ego)
+
+
+def _history_ports(config: ModelConfig) -> Iterator[Port]:
+    cells = config.bev_grid.rows * config.bev_grid.columns
+    quaternion = "w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "w w w w"
+    yield Port(
+        "can_bus",
+        (1, 18),
+        f"(1, 18): 0-2 translation since the previous frame, metres, world frame; 3-6 quaternion {quaternion} of "
+        "world_from_ego; 7-9 acceleration with gravity, m/s^2; 10-12 angular rate, rad/s; 13-15 velocity, m/s, ego "
+        "frame; 16 yaw in radians, 0 to 2 pi; 17 change of yaw since the previous frame, degrees. 0-2 and 17 are zero "
+        "without a previous frame.",
+    )
+    yield Port(
+        "shift",
+        (1, 2),
+        "(1, 2): translation since the previous frame to the right and ahead, as fractions of the extent of the BEV "
+        "map in x and y.",
+    )
+    yield Port("rotation", (1,), "(1,): change of yaw since the previous frame, degrees.")
+    yield Port(
+        "previous_bev",
+        (1, cells, config.channels),
+        "(1, Y*X, C): the output bev of the previous frame; ignored where use_previous is false.",
+    )
+    yield Port("use_previous", (1,), "(1,): false in the first frame of a scene and after a gap in time.", torch.bool)
+
+
+def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelConfig) -> dict[str, Tensor]:
+    """The inputs by name. history: (1, Y·X, C), the BEV map of the previous frame; None without one."""
+    grid = config.bev_grid
+    previous = torch.zeros(1, grid.rows * grid.columns, config.channels) if history is None else history
+    return camera_feed(inputs) | {
+        "can_bus": inputs.can_bus,
+        "shift": inputs.shift,
+        "rotation": inputs.rotation_deg,
+        "previous_bev": previous,
+        "use_previous": torch.tensor([history is not None]),
+    }

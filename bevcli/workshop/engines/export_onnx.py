@@ -1,30 +1,52 @@
-"""`export_onnx`: writes one step of a model as an ONNX file."""
+"""`export_onnx` writes one step of a model as an ONNX file, `quantize` a copy of it that computes in INT8.
+
+The quantisation is ONNX Runtime's static one after training: weights in 8 bits, one scale for each output channel;
+activations in 8 bits, one scale a tensor, from the smallest and the largest value of the calibration images. Everything
+after the neck stays in float32: it is a small part of the work, and rounding it would move boxes.
+"""
 
 import contextlib
 import io
 import json
+import logging
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from bevcli._version import __version__
-from bevcli.config import as_table
-from bevcli.errors import BevcliError
+from bevcli.config import as_table, config_of_table
+from bevcli.errors import BevcliError, WeightsError
+from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
-from bevcli.workshop.engines.engine import errors_only, require
-from bevcli.workshop.engines.export_form import ExportForm, Port, pad_value_bgr
+from bevcli.parsing.documents import parse_json
+from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
 from bevcli.workshop.engines.options import OnnxOptions
-from bevcli.writing import whole_file
+from bevcli.writing import check_output, whole_file
 
+EXPORTERS = ("onnx", "onnxscript")  # packages that write the file
+QUANTIZERS = ("onnx", "onnxruntime")  # packages that make it INT8, whatever engine runs it
 NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
+LARGEST_BYTES = 2**31  # protobuf's own limit, which every file of `bevcli export-onnx` keeps
 
 # GridSample exists since opset 16, ScatterND with a sum since 16, LayerNormalization since 17, DeformConv since 19.
 MIN_OPSET = {"operator": 19, "gridsample": 17}
+# The part of the metadata that bevcli itself reads, to run the file: the contents of the model's TOML file as JSON,
+# the number of cameras that may see one cell, whether the weights are random or those of the package, and the precision
+# of backbone and neck.
+METADATA = ("config", "cameras_per_cell", "untrained", "bundled", "precision")
+
+QUANTIZED_PARTS = ("backbone", "neck")
+QUANTIZED_OPERATORS = ("Conv", "Add", "MaxPool")
+# Deformable convolutions stay in float32: rounding would move their samples.
+DEFORMABLE = {"convolution", "offset_and_mask"}
 
 
 def export_onnx(
@@ -57,7 +79,7 @@ def export_onnx(
             form, because it looks at later frames or because its memory grows.
         OutputError: the file cannot be written.
     """
-    require("onnx", "onnxscript")
+    require(*EXPORTERS)
     import onnx
 
     chosen = gather(OnnxOptions, options, changes)
@@ -67,7 +89,7 @@ def export_onnx(
             f"`deformable_convolution={chosen.deformable_convolution}`"
         )
     config = network.config
-    form = network.export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
+    form = export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
     slots = min(chosen.cameras_per_cell, form.cameras)
     inputs, outputs = form.inputs, form.outputs(decode=chosen.decode)
     step = form.step(network, chosen.deformable_convolution, slots, decode=chosen.decode).eval()
@@ -126,7 +148,7 @@ def metadata(
         "image_size": image.size,
         "crop": image.crop_box,
         "padded_size": image.padded_size,
-        "pad_value_bgr": pad_value_bgr(config),
+        "pad_value_bgr": config.image.pad_bgr,
         "x_range_m": grid.x_range_m,
         "y_range_m": grid.y_range_m,
         "bev_rows_columns": (grid.rows, grid.columns),
@@ -161,3 +183,163 @@ def _part(node: object) -> str:
     scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
     parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
     return parts[-1] if parts else ""
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """The metadata of an exported file that describes its model.
+
+    Attributes:
+        config: of the model.
+        contents: the contents of the model's TOML file, its table of the tracker included.
+        cameras_per_cell: the number of cameras that may see one cell of the BEV map.
+        untrained: whether the weights are random.
+        bundled: whether the weights are those of the package.
+        precision: of backbone and neck, "fp32" or "int8".
+    """
+
+    config: ModelConfig
+    contents: dict[str, Any]
+    cameras_per_cell: int
+    untrained: bool
+    bundled: bool
+    precision: Literal["fp32", "int8"]
+
+
+def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
+    """Reads the metadata of a file of `bevcli export-onnx`. Raises WeightsError, or ConfigError for its model."""
+    missing = [name for name in METADATA if name not in metadata]
+    if missing:
+        raise WeightsError(
+            f"{file}: its metadata lacks {', '.join(missing)} (expected a file of bevcli export-onnx of this version)"
+        )
+    contents, slots, untrained, bundled = (parse_json(metadata[name].encode(), file) for name in METADATA[:4])
+    if not isinstance(contents, dict) or type(slots) is not int:
+        raise WeightsError(
+            f"{file}: its metadata config or cameras_per_cell is wrong (expected a table and an integer)"
+        )
+    precision: Literal["fp32", "int8"] = "int8" if metadata["precision"] == "int8" else "fp32"
+    config = config_of_table(contents, str(file))
+    # The file's images have one size, for every rig.
+    config = replace(config, image=replace(config.image, focal_px=None, max_pixels=None))
+    return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
+
+
+def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
+    """Writes a copy of an exported file whose backbone and neck compute in INT8.
+
+    Args:
+        file: of `bevcli export-onnx`.
+        images: the input `images` of some frames, (1, N, H, W, 3) float32 each, for the ranges of the activations.
+
+    Raises:
+        BevcliError: the extra bevcli[onnx] is not installed.
+        WeightsError: the file cannot be loaded, is not of `bevcli export-onnx`, or is quantised already.
+        OutputError: the file cannot be written.
+    """
+    require(*QUANTIZERS)
+    import onnx
+    from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
+
+    try:
+        check_size(file)
+        proto = onnx.load(str(file), load_external_data=False)
+    except Exception as error:  # protobuf has classes of its own
+        raise WeightsError(f"{file}: cannot be read as ONNX: {str(error).splitlines()[0]:.200}") from error
+    metadata = {entry.key: entry.value for entry in proto.metadata_props}
+    if read_metadata(metadata, file).precision != "fp32":
+        raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
+    check_output(out, file)
+    # Without advice about models that have not been simplified.
+    with errors_only(""), whole_file(out, parents=True) as unfinished:
+        quantize_static(
+            proto,
+            str(unfinished),
+            _reader(proto, images),
+            quant_format=QuantFormat.QDQ,
+            op_types_to_quantize=list(QUANTIZED_OPERATORS),
+            nodes_to_quantize=quantized_nodes(proto.graph),
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            extra_options={
+                "WeightSymmetric": True,
+                "ActivationSymmetric": False,
+                "OpTypesToExcludeOutputQuantization": _unrounded(proto.graph),
+            },
+        )
+        quantized = onnx.load(str(unfinished))
+        onnx.helper.set_model_props(quantized, metadata | {"precision": "int8"})
+        onnx.save(quantized, str(unfinished))
+
+
+def quantized_nodes(graph: Any) -> list[str]:
+    """The names of the nodes of a file that compute in INT8. A name is "part.of.the.network/operator"."""
+    constants = {value.name for value in graph.initializer}
+    constants |= {name for node in graph.node if node.op_type == "Constant" for name in node.output}
+    names = []
+    for node in graph.node:
+        parts = node.name.partition("/")[0].split(".")
+        computes = node.op_type in ("Conv", "MaxPool") or (
+            node.op_type == "Add" and not constants.intersection(node.input)  # a sum of maps
+        )
+        if computes and parts[0] in QUANTIZED_PARTS and not DEFORMABLE.intersection(parts):
+            names.append(node.name)
+    return names
+
+
+def _unrounded(graph: Any) -> list[str]:
+    """Operators whose results are rounded only where another one in INT8 reads them.
+
+    Before a ReLU6 a convolution has results far outside of 0 to 6, and few steps of 8 bits would be left for these.
+    """
+    clips = [node for node in graph.node if node.op_type == "Clip" and node.name.startswith(QUANTIZED_PARTS)]
+    return ["Conv"] if clips else []
+
+
+def _reader(proto: Any, images: Iterable[np.ndarray]) -> Any:
+    """The inputs for one frame after another; matrices are the identity, other inputs but the images zero."""
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader
+
+    rest = {}
+    for value in proto.graph.input:
+        kind = value.type.tensor_type
+        shape = [dimension.dim_value for dimension in kind.shape.dim]
+        rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+        if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
+            rest[value.name] += np.eye(4, dtype=rest[value.name].dtype)
+    feeds = (rest | {"images": image} for image in images)
+
+    class Frames(CalibrationDataReader):
+        def get_next(self) -> Mapping[str, np.ndarray] | None:
+            return next(feeds, None)
+
+    return Frames()
+
+
+def require(*names: str, extra: str = "onnx") -> None:
+    """Raises BevcliError where one of these packages is not installed. extra: of bevcli, which installs them."""
+    missing = [name for name in names if find_spec(name) is None]
+    if missing:
+        raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[{extra}]'")
+
+
+@contextlib.contextmanager
+def errors_only(*names: str) -> Iterator[None]:
+    """Inside, these loggers of other packages tell errors only; "" is the root of all loggers."""
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
+
+
+def check_size(file: Path) -> None:
+    """Raises OSError for a missing file, ValueError for one that is larger than an exported file can be."""
+    size = file.stat().st_size
+    if size > LARGEST_BYTES:
+        raise ValueError(f"it has {size} bytes (expected at most {LARGEST_BYTES})")

@@ -18,7 +18,8 @@ from bevcli.model.box_coding import best_boxes
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
-from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.ego_motion import rotate_history
+from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.step import ModelOutputs
 
@@ -77,6 +78,43 @@ class ExportedStep(nn.Module):
         masks = () if segmentation is None else (segmentation.mask_logits[-1], segmentation.class_logits[-1])
         boxes = decode_boxes(logits, codes, self.config) if self.decode else ()
         return (bev, logits, codes, most_cameras, *masks, *found.further.values(), *boxes)
+
+
+class RecurrentStep(ExportedStep):
+    """`BEVFormer.forward` as a graph, which has no optional inputs: `use_previous` says whether there is a history."""
+
+    def forward(
+        self,
+        images: Tensor,
+        image_from_bev: Tensor,
+        camera_index: Tensor,
+        has_image: Tensor,
+        can_bus: Tensor,
+        shift: Tensor,
+        rotation: Tensor,
+        previous_bev: Tensor,
+        use_previous: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """One step; `RecurrentForm` documents every input and output."""
+        network = self.network
+        image_features = self.image_features(images, camera_index)
+        if network.calibration_embedding is not None:
+            rays = image_from_bev, image_features.level_shapes, self.image_size
+            image_features = image_features.scaled(*network.calibration_embedding(*rays))
+        bev_query = network.bev_queries(can_bus)
+        position = network.bev_queries.position()
+        center = self.config.ego_motion.history_rotation_center
+        history = rotate_history(previous_bev, rotation, self.config.bev_grid, center)
+        centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
+        reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
+        hits = self.hits(image_from_bev, has_image)
+        with_history = torch.stack([history, bev_query], dim=1)
+        bev = bev_query
+        for layer in network.encoder.layers:
+            assert isinstance(layer, EncoderLayer)
+            bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
+            bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
+        return self.outputs(bev, hits.most_cameras)
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,10 +1,10 @@
-"""The options of the export of models and of their quantisation."""
+"""The options of the export of models."""
 
 from pathlib import Path
 from typing import Literal
 
-from bevcli.errors import OutputError
 from bevcli.options import option, options
+from bevcli.writing import check_new
 
 
 @options()
@@ -17,8 +17,7 @@ class FileOptions:
     def target(self, default: Path) -> Path:
         """The file to write. Raises OutputError where it exists and `force` is false."""
         target = default if self.out is None else self.out
-        if target.exists() and not self.force:
-            raise OutputError(f"{target}: already exists; choose another name, or pass `force=True` to overwrite it")
+        check_new(target, force=self.force)
         return target
 
 
@@ -51,34 +50,5 @@ class OnnxOptions:
         reads="path",
         default=None,
         help="Run this drive through the file and through our model, and print the largest differences.",
-        metavar="SEQUENCE",
-    )
-
-
-@options()
-class QuantizeOptions:
-    """The drives whose images calibrate a quantised file, and a check of it."""
-
-    calibrate: tuple[Path, ...] = option(
-        reads="path",
-        default=(),
-        help="Drive whose images give the ranges of the numbers for int8; required. Repeatable.",
-        metavar="SEQUENCE",
-        flag="--int8-drive",
-        old=("--calibrate",),
-        repeatable=True,
-    )
-    frames: int = option(
-        default=16,
-        help="Number of frames for the calibration, evenly spaced over all drives.",
-        metavar="N",
-        flag="--count",
-        old=("--frames",),
-        minimum=1,
-    )
-    check: Path | None = option(
-        reads="path",
-        default=None,
-        help="Run this drive through both files, and print the largest differences.",
         metavar="SEQUENCE",
     )

@@ -6,11 +6,39 @@ from typing import Annotated
 import typer
 
 from bevcli.cli.bridge import Part, argument
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import FILE_ENGINE, ModelOptions
+from bevcli.options import option, options
 from bevcli.printing import say
-from bevcli.workshop.engines.options import FileOptions, QuantizeOptions
+from bevcli.workshop.engines.options import FileOptions
 
 PANEL = "Deploy"
+
+
+@options()
+class QuantizeOptions:
+    """The drives whose images calibrate a quantised file, and a check of it."""
+
+    calibrate: tuple[Path, ...] = option(
+        reads="path",
+        default=(),
+        help="Drive whose images give the ranges of the numbers for int8; required. Repeatable.",
+        metavar="SEQUENCE",
+        flag="--int8-drive",
+        repeatable=True,
+    )
+    frames: int = option(
+        default=16,
+        help="Number of frames for the calibration, evenly spaced over all drives.",
+        metavar="N",
+        flag="--count",
+        minimum=1,
+    )
+    check: Path | None = option(
+        reads="path",
+        default=None,
+        help="Run this drive through both files, and print the largest differences.",
+        metavar="SEQUENCE",
+    )
 
 
 def quantize(
@@ -26,13 +54,13 @@ def quantize(
     """
     from bevcli.inference.preprocess import calibration_images
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.benchmark.exported import check_exported, difference_lines
-    from bevcli.workshop.engines.exported import load_exported
-    from bevcli.workshop.engines.quantize import quantize as write_quantized
+    from bevcli.workshop.engines.differences import check_exported, difference_lines
+    from bevcli.workshop.engines.engine import load_exported
+    from bevcli.workshop.engines.export_onnx import quantize as write_quantized
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
-    engine = model_options.engine or "onnxruntime"
+    engine = model_options.engine or FILE_ENGINE
     network = load_exported(model, engine)
     config = network.config
     target = file.target(model.with_name(f"{model.stem}-int8.onnx"))

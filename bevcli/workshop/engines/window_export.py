@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bevcli.errors import BevcliError
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, frames_at, kept
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
@@ -138,3 +140,13 @@ class WindowForm(ExportForm):
 
 def _listed(frames: tuple[int, ...]) -> str:
     return ", ".join(map(str, frames))
+
+
+def window_form(config: BEVFormerV2Config, cameras: int) -> WindowForm:
+    """The form of a model. Raises BevcliError for one that looks at later frames."""
+    if config.later_frames:
+        raise BevcliError(
+            f"{config.name}: a model that looks at later frames cannot be exported: frames is "
+            f"{list(config.frames)} (expected a window that ends with 0, the current frame)"
+        )
+    return WindowForm(config, cameras, config.frames)

@@ -18,8 +18,7 @@ PANEL = "Score"
 
 def stress(
     sequence: Annotated[
-        list[Path] | None,
-        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        list[Path] | None, argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS.")
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
@@ -36,14 +35,12 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.progress import Progress, fetch_if_asked, in_engine_with_bar
+    from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
-    from bevcli.inference.load import load_model
     from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.report import stress_table
-    from bevcli.workshop.robustness.results import read_results
+    from bevcli.workshop.robustness.results import read_results, stress_table
     from bevcli.workshop.robustness.stress import stress
     from bevcli.workshop.synth.drives import open_drives
 
@@ -51,8 +48,7 @@ def stress(
     other = None if options.against is None else read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
-    fetch_if_asked(model)
-    loaded = load_model(options=model)
+    loaded = load_with_bar(model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
         drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]

@@ -5,7 +5,6 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import SequenceOptions
 from bevcli.viewer.options import ViewOptions
-from bevcli.workshop.calibration.options import CalibrateFirstOptions
 from bevcli.workshop.synth.options import DemoOptions, RenderOptions
 
 PANEL = "Start"
@@ -23,7 +22,6 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=RESOLUTION, force=options.force))
-    as_stated = CalibrateFirstOptions()
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), as_stated, results, {})
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
     if options.view:
         viz(options.out / "results/recording.rrd", ViewOptions())

@@ -20,7 +20,7 @@ PANEL = "Train"
 def train(
     model: Annotated[
         str | None,
-        model_option("A model name or a FILE.toml; required. Its training table holds the settings.", old=("",)),
+        model_option("A model name or a FILE.toml; required. Its training table holds the settings."),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
@@ -51,8 +51,7 @@ def train(
     if file_options.init is not None:
         if model or options != TrainOptions():
             raise InputError("`init` trains nothing: remove the model and the options of a training")
-        device = choose_device(model_options.device)
-        say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
+        say(*write_model_file(file_options.init, drives, file_options.preset or "quick"))
         return
     if file_options.preset is not None:
         raise InputError("`preset` is for `init`: remove it")

@@ -16,9 +16,7 @@ PANEL = "Score"
 def validate(
     model: Annotated[
         str | None,
-        model_option(
-            "A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.", old=("",)
-        ),
+        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
@@ -34,17 +32,15 @@ def validate(
     """
     from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
-    from bevcli.workshop.synth.drives import count_frames
-    from bevcli.workshop.synth.splits import scored_drives
-    from bevcli.workshop.training.drive_checks import check_scored_drives
+    from bevcli.workshop.synth.drives import count_frames, scored_drives
     from bevcli.workshop.training.job import rig_for_drives
-    from bevcli.workshop.training.validation import validate as validate_model
+    from bevcli.workshop.training.validation import check_scored_drives, validate as validate_model
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
     drives = scored_drives(drive_options, loaded.config, rig)
     notes = check_scored_drives(drive_options, drives, loaded.config)
-    if loaded.choice is not None:
+    if loaded.needs_export:
         loaded = in_engine_with_bar(loaded, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
     runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)

@@ -1,19 +1,15 @@
 """Key names of the released weights files of UniAD, and ours."""
 
-import re
-
-# The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
-QUERIES = "query_embedding.weight"
+from bevcli.model.official_keys import OfficialNames, Renames
 
 # Keys without effect at inference.
-UNUSED = re.compile(
+_UNUSED = (
     r"^(pts_bbox_head\.(past_traj_reg_branches|query_embedding|transformer\.reference_points)\.|criterion\.|bbox_size_fc\."
     r"|seg_head\.(bev_embedding|reg_branches2|cls_thing_branches|cls_stuff_branches|cls_branches\.[0-4])\."
     r"|seg_head\.(things|stuff)_mask_head\.blocks\.\d+\.attn\.linear)"
 )
 
-# Pattern of the official name, and ours, in the order of use.
-NAMES = (
+_RENAMES: Renames = (
     (r"^query_embedding\.weight$", "decoder.query_embedding"),
     (r"^reference_points\.", "decoder.reference_points."),
     (r"^memory_bank\.temporal_attn\.", "memory_bank.attention."),
@@ -60,3 +56,6 @@ NAMES = (
     (r"^(map_head\.\w+_masks\..*)\.k\.", r"\1.key_projection."),
     (r"^(map_head\.\w+_masks\..*)\.v\.", r"\1.value_projection."),
 )
+
+# The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
+OFFICIAL_NAMES = OfficialNames(r"^(query_embedding|memory_bank|query_interact|seg_head)\.", _RENAMES, _UNUSED)

@@ -9,22 +9,22 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError, ConfigError
-from bevcli.frame import BevMap
+from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import boxes_of_codes
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import ObjectQueries
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
-from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.tensors import without_autocast
 from bevcli.model.upload import upload
 from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
 from bevcli.workshop.uniad.map_merging import merge_map
 from bevcli.workshop.uniad.memory_bank import Memories, MemoryBank
-from bevcli.workshop.uniad.official_keys import NAMES, QUERIES, UNUSED
+from bevcli.workshop.uniad.official_keys import OFFICIAL_NAMES
 from bevcli.workshop.uniad.query_interaction import QueryInteraction
 from bevcli.workshop.uniad.track_queries import (
     EGO,
@@ -108,6 +108,18 @@ class TrackMemory:
     timestamp_ns: int
 
 
+PART_NAMES = (
+    ("tracks: memory bank", "memory_bank"),
+    ("tracks: query interaction", "query_interaction"),
+    ("map head: encoder", "map_head.encoder"),
+    ("map head: location decoder", "map_head.location_decoder"),
+    ("map head: class branch", "map_head.class_branch"),
+    ("map head: stuff queries", "map_head.stuff_queries"),
+    ("map head: mask decoder of things", "map_head.thing_masks"),
+    ("map head: mask decoder of stuff", "map_head.stuff_masks"),
+)
+
+
 class UniAD(BEVFormer):
     """The whole model: a recurrence, in which the BEV map and the tracks of a frame go on to the next.
 
@@ -118,8 +130,7 @@ class UniAD(BEVFormer):
     config_class = UniADConfig
     memory_type = TrackMemory
     stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
-    official_names = NAMES
-    figures = ()
+    official_names = OFFICIAL_NAMES
 
     def __init__(self, config: UniADConfig) -> None:
         super().__init__(config)
@@ -143,19 +154,15 @@ class UniAD(BEVFormer):
             tracks: of the previous frame; None for the first frame of all.
             motion: since the previous frame; needed with tracks.
         """
-        bev = self.device_part(self.host_part(inputs, history))
+        bev = self.compute(self.geometry(inputs, history), False)  # the CPU chooses the tracks
         outputs = self.track(bev, tracks, motion)
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             return replace(outputs, map=self.map_head(bev.float()))
-
-    def device_part(self, inputs: EncoderInputs) -> Tensor:
-        """The BEV map (B, Y·X, C): the number of tracks changes, and the CPU chooses them."""
-        return self.encode(inputs)
 
     def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
         """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
         # In float32, as the decoder of BEVFormer.
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             queries = self._queries(tracks, motion)
             class_logits, box_codes, embedding = self.decoder(bev.float(), self.detection_head, queries)
             scores = class_logits[-1, 0].sigmoid().amax(-1)
@@ -221,47 +228,30 @@ class UniAD(BEVFormer):
         """See `TemporalModel`: the next identity, and the pose for EgoMotionConfig.first_frame "original"."""
         return replace(memory, bev=None, tracks=memory.tracks.ended())
 
-    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        assert isinstance(outputs, UniADOutputs)
-        return decode_tracks(outputs, self.config)
-
-    def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
+    def decode(self, outputs: ModelOutputs) -> Iterator[Boxes3D | BevMap | FrameResult]:
         assert isinstance(outputs, UniADOutputs)
         grid, head = self.config.bev_grid, self.config.map_head
-        return None if outputs.map is None else merge_map(outputs.map, head, grid).bev_map(grid, head)
+        yield decode_tracks(outputs, self.config)
+        if outputs.map is not None:
+            yield merge_map(outputs.map, head, grid).bev_map(grid, head)
 
-    def exchange_parts(self) -> None:
-        """See `TemporalModel`: nothing is constant, because the tracks and the learned queries attend to each other."""
 
-    def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
-        bev = super().run_on_shapes(images, camera_index, hits)
-        self.map_head(bev)
-        return bev
+def fix_nothing(model: UniAD) -> None:
+    """Nothing is constant, because the tracks and the learned queries attend to each other."""
 
-    @classmethod
-    def export_form(cls, config: ModelConfig, cameras: int) -> NoReturn:
-        raise BevcliError(
-            f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
-            "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
-        )
 
-    @classmethod
-    def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-        unused = [key for key in state if UNUSED.match(key)] if QUERIES in state else []
-        left = {key: tensor for key, tensor in state.items() if key not in unused}
-        return left, f"{len(unused)} keys, such as {unused[0]}" if unused else ""
+def run_map_head(model: UniAD, *_inputs: object) -> None:
+    """The operations of a frame that BEVFormer does not have, for the network on the device "meta"."""
+    grid = model.config.bev_grid
+    model.map_head(torch.empty(1, grid.rows * grid.columns, model.config.channels))
 
-    @classmethod
-    def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
-        yield from super().part_names(config)
-        yield "tracks: memory bank", "memory_bank"
-        yield "tracks: query interaction", "query_interaction"
-        yield "map head: encoder", "map_head.encoder"
-        yield "map head: location decoder", "map_head.location_decoder"
-        yield "map head: class branch", "map_head.class_branch"
-        yield "map head: stuff queries", "map_head.stuff_queries"
-        yield "map head: mask decoder of things", "map_head.thing_masks"
-        yield "map head: mask decoder of stuff", "map_head.stuff_masks"
+
+def refuse_export(config: ModelConfig, cameras: int) -> NoReturn:
+    """Raises BevcliError in the place of an exported form."""
+    raise BevcliError(
+        f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
+        "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
+    )
 
 
 def _motion(prepared: PreparedFrame, memory: TrackMemory, device: torch.device) -> FrameMotion:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.training.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.detection_loss import focal_cost, focal_loss, hungarian_matching
 from bevcli.workshop.vad.config import LossWeights
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
 from bevcli.workshop.vad.map_lines import MapLines

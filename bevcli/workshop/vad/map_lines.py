@@ -44,14 +44,14 @@ class LinesWriter(FileOfFrames):
 
     def write(self, ground: Ground, lines: "MapLines | None") -> None:
         """Append a frame. lines: in the bev frame; None where the model was not run."""
-        found = [] if lines is None else [_line(ground, lines, place) for place in range(len(lines))]
-        self.add({**stamp_to_json(ground.stamp), "lines": found}, f"frame {ground.stamp.index}")
+        entries = [] if lines is None else [_line(ground, lines, index) for index in range(len(lines))]
+        self.add({**stamp_to_json(ground.stamp), "lines": entries}, f"frame {ground.stamp.index}")
 
 
-def _line(ground: Ground, lines: "MapLines", place: int) -> dict[str, Any]:
-    score = {} if lines.scores is None else {"score": float(lines.scores[place])}
-    points = ground.points(lines.points[place]).round(DECIMALS)
-    return {"class": str(lines.classes[place]), **score, "points": points.tolist()}
+def _line(ground: Ground, lines: "MapLines", index: int) -> dict[str, Any]:
+    score = {} if lines.scores is None else {"score": float(lines.scores[index])}
+    points = ground.points(lines.points[index]).round(DECIMALS)
+    return {"class": str(lines.classes[index]), **score, "points": points.tolist()}
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ class MapLines(FrameResult):
     kind = "map_lines"
     file_name = "map_lines.json"
     writer = LinesWriter
+    true_file = TRUE_LINES
+    true_names = LINE_CLASSES
 
     points: tuple[Array, ...]
     classes: NDArray[np.str_]
@@ -127,7 +129,7 @@ def read_lines(path: Path) -> LinesFile:
     reference, classes, rows = (content.pop(key, None) for key in ("frame_of_reference", "classes", "frames"))
     if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
         raise InputError(f'{path}: "classes" must be a list of names, found {classes!r:.40}')
-    frames = tuple(_frame(f"{path}: entry {place} of frames", row) for place, row in enumerate(rows))
+    frames = tuple(_frame(f"{path}: entry {index} of frames", row) for index, row in enumerate(rows))
     content.pop("format")
     return LinesFile(reference, tuple(classes), frames, content)
 
@@ -136,14 +138,14 @@ def _frame(where: str, row: Any) -> FrameLines:
     stamp, lines = stamp_from_json(row, where), row.get("lines")
     if not isinstance(lines, list):
         raise InputError(f'{where}: expected a list "lines", found {lines!r:.60}')
-    for place, line in enumerate(lines):
+    for index, line in enumerate(lines):
         if not isinstance(line, dict) or not isinstance(line.get("class"), str):
-            raise InputError(f'{where}: line {place}: expected an object with "class" and "points", found {line!r:.60}')
-    points = tuple(_points(line.get("points"), f"{where}: line {place}") for place, line in enumerate(lines))
+            raise InputError(f'{where}: line {index}: expected an object with "class" and "points", found {line!r:.60}')
+    points = tuple(_points(line.get("points"), f"{where}: line {index}") for index, line in enumerate(lines))
     classes = np.array([line["class"] for line in lines], dtype=np.str_)
     scores = None
     if any("score" in line for line in lines):
-        scores = np.array([_score(line.get("score"), f"{where}: line {place}") for place, line in enumerate(lines)])
+        scores = np.array([_score(line.get("score"), f"{where}: line {index}") for index, line in enumerate(lines)])
     return FrameLines(stamp, MapLines(points, classes, scores))
 
 

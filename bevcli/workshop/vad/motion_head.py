@@ -1,7 +1,5 @@
 """The motion head of VAD: each object attends to all objects and to the lines around it; its futures come of that."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -168,20 +166,6 @@ class AttentionLayer(nn.Module):
         """The attention weights (B, Q, K) of `forward`, the mean over heads; each row sums to 1."""
         _, weights = self.attention(query + query_position, value + key_position, value, key_padding_mask=masked)
         return weights
-
-
-@contextmanager
-def attention_weights(*layers: AttentionLayer) -> Iterator[dict[AttentionLayer, Tensor]]:
-    """A dict that is filled with the `AttentionLayer.weights` of each call inside the context; the last call stays."""
-    found: dict[AttentionLayer, Tensor] = {}
-
-    def keep(layer: AttentionLayer, arguments: tuple[Tensor, ...]) -> None:
-        found[layer] = layer.weights(*arguments)
-
-    with ExitStack() as hooks:
-        for layer in layers:
-            hooks.enter_context(layer.register_forward_pre_hook(keep))
-        yield found
 
 
 def line_positions(points: Tensor) -> Tensor:

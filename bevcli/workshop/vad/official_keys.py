@@ -1,10 +1,8 @@
 """Key names of the released weights files of VAD, and ours."""
 
-# In the files, but used in training only.
-UNUSED = "pts_bbox_head.map_code_weights"
+from bevcli.model.official_keys import OfficialNames, Renames
 
-# Pattern of the official name, and ours, in the order of use.
-NAMES = (
+_RENAMES: Renames = (
     (r"^pts_bbox_head\.map_instance_embedding\.weight$", "line_decoder.line_embedding"),
     (r"^pts_bbox_head\.map_pts_embedding\.weight$", "line_decoder.point_embedding"),
     (r"^pts_bbox_head\.transformer\.map_reference_points\.", "line_decoder.reference_points."),
@@ -27,4 +25,9 @@ NAMES = (
     (r"^pts_bbox_head\.ego_map_pos_mlp\.", "planner.line_position."),
     (r"^pts_bbox_head\.ego_fut_decoder\.", "planner.path_branch."),
     (r"^((motion_head|planner)\..*)\.attentions\.0\.attn\.", r"\1.attention."),
+)
+
+# The weights of the loss are used in training only.
+OFFICIAL_NAMES = OfficialNames(
+    r"^pts_bbox_head\.map_", _RENAMES, unused=r"^pts_bbox_head\.map_code_weights$", unused_text="{first}"
 )

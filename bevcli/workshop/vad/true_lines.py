@@ -78,14 +78,14 @@ class MapExpansion:
 def lines_around(shapes: Mapping[str, STRtree], bev_from_world: Array) -> MapLines:
     """The lines of `lines_in_area`. Crossings that touch are one; boundaries are those of all roads together."""
     area = affine_transform(AREA, _on_the_ground(inverse(bev_from_world)))
-    found: list[tuple[str, BaseGeometry]] = []
+    near_shapes: list[tuple[str, BaseGeometry]] = []
     for name, tree in shapes.items():
         near = list(tree.geometries[tree.query(area, predicate="intersects")])
         if name == DIVIDER or not near:
-            found += [(name, line) for line in near]
+            near_shapes += [(name, line) for line in near]
         else:
-            found.append((name, union_all(near).boundary))
-    return lines_in_area((name, affine_transform(shape, _on_the_ground(bev_from_world))) for name, shape in found)
+            near_shapes.append((name, union_all(near).boundary))
+    return lines_in_area((name, affine_transform(shape, _on_the_ground(bev_from_world))) for name, shape in near_shapes)
 
 
 def read_map(file: Path) -> dict[str, STRtree]:
