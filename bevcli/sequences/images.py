@@ -24,12 +24,10 @@ from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.waiting import result_within
 
-# Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
-# H.265, VP9 and AV1.
+# Where the beginning of a file shows its container: offset and bytes. The last row is that of streams in bags.
 CONTAINERS = (
     (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
-    (0, b"\x1a\x45\xdf\xa3"),
-    (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
+    (0, b"\x1a\x45\xdf\xa3"), (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"),
 )  # fmt: skip
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
@@ -85,7 +83,7 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     with open_regular(path, missing="is missing") as file:
         start = file.read(12)
     # FFmpeg recognises playlists too, which could lead it to other files and to servers.
-    if not any(start[place:].startswith(magic) for place, magic in CONTAINERS):
+    if not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
     try:
         with plain_name(path) as name:

@@ -56,7 +56,7 @@ class Record:
         value = self._member(name)
         if not isinstance(value, list):
             raise InputError(f'{self.where}: "{name}": expected a list, found {type(value).__name__}')
-        return [Record(one, f"{self.where}: {name}[{place}]") for place, one in enumerate(value)]
+        return [Record(member, f"{self.where}: {name}[{index}]") for index, member in enumerate(value)]
 
     def text(self, name: str) -> str:
         """A member that is a text of at most 400 characters. Raises InputError."""
@@ -68,7 +68,7 @@ class Record:
     def texts(self, name: str) -> list[str]:
         """A member that is a list of texts. Raises InputError."""
         value = self._member(name)
-        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
             raise InputError(f'{self.where}: "{name}": expected a list of texts')
         return value
 

@@ -218,7 +218,7 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
     if path is None:
         return StatedTopics(renamed=topics)
     stated = parse_toml(read_text(path, TOML_BYTES), path)
-    known = [one.name for one in fields(StatedTopics) if one.name != "renamed"]
+    known = [entry.name for entry in fields(StatedTopics) if entry.name != "renamed"]
     for key, value in stated.items():
         if key not in known:
             raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
@@ -269,15 +269,15 @@ class TopicFinder:
             CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
             for name, images in found.items()
         ]
-        without = [one for one in cameras if one.calibration is None and calibrated is None]
-        for one in without:
-            if one.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
+        without = [camera for camera in cameras if camera.calibration is None and calibrated is None]
+        for camera in without:
+            if camera.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
                 raise InputError(
-                    f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
+                    f"{bag.path}: camera {camera.camera}: no CameraInfo belongs to {camera.images}: pass "
                     f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
                 )
-        self.left_out = tuple(one.images for one in without)
-        self.cameras = tuple(one for one in cameras if one not in without)
+        self.left_out = tuple(camera.images for camera in without)
+        self.cameras = tuple(camera for camera in cameras if camera not in without)
         if not self.cameras:
             raise InputError(
                 f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
@@ -304,10 +304,10 @@ class TopicFinder:
     def table(self, pose: str) -> str:
         """A table of the topics that are used and those that are not. pose: where poses come from, "" for nowhere."""
         rows = []
-        for one in self.cameras:
-            rows.append((one.camera, one.images))
-            if one.calibration:
-                rows.append(("  calibration", one.calibration))
+        for camera in self.cameras:
+            rows.append((camera.camera, camera.images))
+            if camera.calibration:
+                rows.append(("  calibration", camera.calibration))
         rows += [("ego-motion", pose)] if pose else []
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
         used = {name for _, name in rows}
