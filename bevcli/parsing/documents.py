@@ -33,6 +33,7 @@ JSON_BYTES, TOML_BYTES, YAML_BYTES = 64 * MIB, MIB, MIB // 4
 MOST_VALUES = 200_000  # of a TOML or YAML file
 _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
+_STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CSV_BYTES = 256 << 20
@@ -71,7 +72,8 @@ def read_json(
 
 def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
     """Parses JSON: at most 64 nested levels, integers of at most 62 bits. Raises InputError, which names `path`."""
-    if _depth_bound(text) > DEEPEST and _exact_depth(text) > DEEPEST:
+    without_strings = _STRING.sub(b"", text) if _depth(text) > DEEPEST else b""
+    if _depth(without_strings) > DEEPEST:
         raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels of lists and objects)")
 
     def integer(digits: str) -> int:
@@ -131,7 +133,11 @@ def read_yaml(path: Path) -> Any:
     """The contents of a YAML file with plain values. Raises InputError."""
     text = re.sub(r"\A%YAML:.*", "", read_text(path, YAML_BYTES))  # OpenCV's header, which is not YAML
     try:
-        _check_yaml_depth(text, path)
+        depth = 0
+        for event in yaml.parse(text, _YamlLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
         document = yaml.load(text, _YamlLoader)
     except yaml.YAMLError as error:
         raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
@@ -165,26 +171,13 @@ def check_values(document: Any, path: str | Path, error: type[BevcliError] = Inp
     raise error(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
 
 
-def _check_yaml_depth(text: str, path: Path) -> None:
-    depth = 0
-    for event in yaml.parse(text, _YamlLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
-
-
-def _depth_bound(text: bytes) -> int:
+def _depth(text: bytes) -> int:
     """The deepest nesting of brackets, those in strings included."""
     brackets = np.frombuffer(text.translate(None, _NO_BRACKETS), dtype=np.uint8)
     if not len(brackets):
         return 0
     opening = (brackets == ord("[")) | (brackets == ord("{"))
     return int(np.cumsum(np.where(opening, 1, -1), dtype=np.int32).max())
-
-
-def _exact_depth(text: bytes) -> int:
-    """The deepest nesting of brackets outside of strings."""
-    return _depth_bound(re.sub(rb'"(?:[^"\\]|\\.)*+"', b"", text, flags=re.DOTALL))
 
 
 @contextmanager
