@@ -228,7 +228,6 @@ class ImageReader:
         return image
 
     def _check_place(self, source: ImageSource) -> None:
-        """Raises InputError for an image that lies outside of the sequence, also behind a link."""
         if self._inside is None:
             return
         try:

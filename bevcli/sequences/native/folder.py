@@ -161,7 +161,6 @@ def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple
 
 
 def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...], advice: str) -> None:
-    """Raise InputError for a frame or an image at whose time the pose is not known."""
     first, last = motion.first_ns, motion.last_ns
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
@@ -287,7 +286,6 @@ def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> 
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The images of a folder by the number in their name."""
     if not folder.is_dir():
         raise InputError(f"{folder}: the folder is missing (the calibration has the camera {folder.name})")
     found: dict[int, Path] = {}

@@ -210,7 +210,6 @@ class McapWriter:
 
 
 def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFile:
-    """The boxes of a run of a sequence, with at least this score."""
     file = run / "predictions.json" if run.is_dir() else run
     check_output(out, file)
     boxes = above_score(read_boxes(file), score)
@@ -220,7 +219,6 @@ def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFi
 
 
 def _optical(camera: str) -> str:
-    """The name of a camera's optical frame."""
     return f"{camera}_optical"
 
 

@@ -264,7 +264,6 @@ class VehicleReader:
         return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
 
     def _frame_of(self, topics: CameraTopics) -> str:
-        """The optical frame that the images name, or else the calibration."""
         named = (
             self._bag.first(topic, frame_of, "an image or a calibration")
             for topic in (topics.images, topics.calibration)
@@ -298,7 +297,6 @@ class VehicleReader:
         return common[0]
 
     def _child_of(self, topic: str) -> str:
-        """The frame whose poses a topic has, "" if it names none."""
         return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
 
     def _ego_from(self, frame: str, camera: str) -> Array:
