@@ -46,7 +46,7 @@ WINGS: dict[str, set[str]] = {
     "calibration": set(),
     "engines": set(),
     "formats": set(),
-    "robustness": {"calibration", "scores", "synth"},
+    "robustness": {"calibration", "synth"},
     "synth": {"formats", "vad"},
     "scores": set(),
     "training": {"synth"},

@@ -129,7 +129,7 @@ def project_debug(
     Exit code: 0 without errors, 3 with findings of severity error.
     """
     from bevcli.config import load_config
-    from bevcli.inference.training_rigs import rig_notes
+    from bevcli.inference.training_rigs import training_rig_notes
     from bevcli.rig.check_calibration import check_calibration
     from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
     from bevcli.sequences.open import open_sequence
@@ -149,7 +149,7 @@ def project_debug(
     else:
         notes = [
             textwrap.fill(f"Model {options.model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
-            for note in rig_notes(check.rig, load_config(options.model))
+            for note in training_rig_notes(check.rig, load_config(options.model))
         ]
         say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:

@@ -123,7 +123,7 @@ class Session:
                 "choose another model, or pass `temporal=False`"
             )
         model = model.in_engine(rig)
-        self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
+        self.name, self.rig, self.notes = name, rig, model.training_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
         commands = read_commands(command, model.config)
