@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import show as show
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
-    from bevcli.workshop.synth.export import render as render
+    from bevcli.workshop.synth.drive import render as render
 
 # The public names by the modules that define them.
 _NAMES = {
@@ -64,7 +64,7 @@ _NAMES = {
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
-    "bevcli.workshop.synth.export": "render",
+    "bevcli.workshop.synth.drive": "render",
     "bevcli.viewer.recording_file": "show",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

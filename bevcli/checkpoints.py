@@ -195,8 +195,7 @@ def expected_state(config: ModelConfig) -> dict[str, Tensor]:
 
 
 def _read_pth(path: Path, left_out: list[str]) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
-    from bevcli.parsing.pickles import Placeholder
-    from bevcli.parsing.pth import StoredTensor, read_pth
+    from bevcli.parsing.pth import Placeholder, StoredTensor, read_pth
 
     file = read_pth(path)
     contents = state = file.contents

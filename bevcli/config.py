@@ -127,9 +127,7 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(kind)
     for key in table.keys() - fields.keys():
-        renamed: Mapping[str, str] = getattr(kind, "RENAMED_KEYS", {})
-        hint = renamed[key] if key in renamed else _nearest(key, list(fields))
-        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
     values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

@@ -1,10 +1,10 @@
 """The types that pass between the parts: a frame as readers return it, and a prediction as the model returns it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,8 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
-from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array, Pose, apply
+from bevcli.geometry.object_classes import Color
+from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
 from bevcli.printing import valid_text
 
 if TYPE_CHECKING:
@@ -30,9 +30,6 @@ def class_bits(names: Iterable[str]) -> dict[str, int]:
 
 # The map classes of rendered drives and of the segmentation head.
 MAP_CLASSES = class_bits(["drivable_road", "lane_boundary", "pedestrian_crossing", "vehicle"])
-
-# The classes of the true lines of rendered drives, which are those of VAD.
-LINE_CLASSES = ("divider", "ped_crossing", "boundary")
 
 
 @dataclass(frozen=True)
@@ -75,43 +72,64 @@ class BevMap:
 
 
 @dataclass(frozen=True)
-class MapLines:
-    """N lines of the map, such as lane dividers.
+class GroundLines:
+    """N lines on the ground, as recordings draw them.
 
     Attributes:
-        points: N lines of x and y in the bev frame (P, 2), or of points on the ground in the ego or world frame (P, 3),
-            metres; P may differ.
-        classes: (N,) class names.
-        scores: (N,) confidence, 0 to 1. Optional.
+        strips: N lines (K, 3) in the world frame, metres.
+        colors: N colours, RGB and opacity, 0 to 255.
+        width: in points of the user interface.
     """
 
-    points: tuple[Array, ...]
-    classes: NDArray[np.str_]
-    scores: Array | None = None
-
-    def __len__(self) -> int:
-        return len(self.points)
+    strips: list[Array] = field(default_factory=list)
+    colors: list[tuple[int, int, int, int]] = field(default_factory=list)
+    width: float = 1.0
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Planned paths of the vehicle, one for each command of the driver.
+class FrameResult:
+    """A further result of a model for one frame, or its ground truth.
+
+    Each type of results is a subclass, which is registered under `bevcli.results` by its kind. It brings its file, its
+    drawing and its entries of the legend; `ModelConfig.results` states the types that a model has, with their names.
 
     Attributes:
-        commands: names of the C commands.
-        paths: (C, T, 2) x and y in the bev frame, or (C, T, 3) points on the ground in the ego or world frame, metres:
-            future places of the origin of the bev frame.
-        times_s: (T,) seconds from the frame's time.
-        command: the one that was given, "" for none.
+        kind: last part of its entities in a recording, such as "map_lines".
+        file_name: of its file in the folder of a run.
+        writer: makes the `GrowingFile` of a path, with `frame_of_reference` ("world" or "ego"), `extras` (facts of the
+            run, "classes" with the names among them) and `resume_at`. Its method `write(ground, result)` adds a frame;
+            the result is None where the model was not run.
+        takes_command: its names are commands of the driver, see `with_command`.
+        true_file: of its ground truth in a native sequence folder, which `writer` makes; "" without.
+        true_names: of its ground truth.
     """
 
-    commands: tuple[str, ...]
-    paths: Array
-    times_s: Array
-    command: str = ""
+    kind: ClassVar[str]
+    file_name: ClassVar[str]
+    writer: ClassVar[Callable[..., Any]]
+    takes_command: ClassVar[bool] = False
+    true_file: ClassVar[str] = ""
+    true_names: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def legend(cls, names: tuple[str, ...]) -> dict[str, Color]:
+        """Entries of the legend: text -> colour."""
+        raise NotImplementedError
+
+    def drawn(self, ground: "Ground", names: tuple[str, ...], score: float) -> GroundLines:
+        """Its drawing. score: what has a lower one is hidden."""
+        raise NotImplementedError
+
+    def with_command(self, command: str) -> Self:
+        """The result where the driver gives a command, "" for none."""
+        return self
 
 
-FrameResult = MapLines | Plan  # further results of a model, which files and recordings take by their type
+Kind = TypeVar("Kind", bound=FrameResult)
+
+
+def result_of(kind: type[Kind], results: Iterable[FrameResult]) -> Kind | None:
+    """The result of a type, or None."""
+    return next((result for result in results if isinstance(result, kind)), None)
 
 
 @dataclass(frozen=True)
@@ -143,7 +161,7 @@ class Frame:
         dropped: camera -> why its image is missing.
         ground_truth: boxes in the world frame.
         ground_truth_map: a map in the bev frame.
-        ground_truth_lines: lines of the map in the bev frame, of LINE_CLASSES.
+        ground_truth_results: further ground truth in the bev frame, each of another type.
         sample_token: nuScenes' name of the frame.
         impossible_boxes: number of ground-truth boxes that were left out: a size of 0 or less, or not finite.
     """
@@ -157,7 +175,7 @@ class Frame:
     dropped: Mapping[str, str] = field(default_factory=dict)
     ground_truth: Boxes3D | None = None
     ground_truth_map: BevMap | None = None
-    ground_truth_lines: "MapLines | None" = None
+    ground_truth_results: tuple[FrameResult, ...] = ()
     sample_token: str | None = None
     impossible_boxes: int = 0
 

@@ -40,7 +40,8 @@ def say(*texts: object, err: bool = False) -> None:
 
 def counted(count: int | str, things: str) -> str:
     """A number of things, such as "6 cameras" or "1 camera". things: a plural, such as "cameras" or "boxes"."""
-    return f"{count} {things.removesuffix('es' if things.endswith('xes') else 's') if str(count) == '1' else things}"
+    ending = "es" if things.endswith(("xes", "ches")) else "s"
+    return f"{count} {things.removesuffix(ending) if str(count) == '1' else things}"
 
 
 class _Output(io.FileIO):

@@ -8,11 +8,15 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.results",
     "bevcli.model_uses",
     "bevcli.sequences",
+    "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
+    "bevcli.scores",
+    "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",
     "bevcli.extensions",
@@ -24,6 +28,7 @@ OWN: dict[Group, dict[str, str]] = {
         "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
         "BEVFormerV2": "bevcli.model.bevformer_v2.bevformer_v2:BEVFormerV2",
     },
+    "bevcli.results": {},
     # What others need to know of a model, by its class or a base class: see `bevcli.registry.for_model`.
     "bevcli.model_uses": {
         "constant_parts BEVFormer": "bevcli.model.prepare:fix_first_attention",
@@ -33,15 +38,11 @@ OWN: dict[Group, dict[str, str]] = {
         "native": "bevcli.sequences.native.format:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes.format:FORMAT",
     },
-    "bevcli.drive_writers": {
-        "native": "bevcli.sequences.native.format:OUTPUT",
-        "nuscenes": "bevcli.sequences.nuscenes.format:OUTPUT",
-    },
     "bevcli.box_formats": {
-        "csv": "bevcli.evaluation.formats.csv_table:FORMAT",
-        "json": "bevcli.evaluation.formats.boxes_json:FORMAT",
-        "nuscenes": "bevcli.evaluation.formats.nuscenes:DETECTION",
-        "nuscenes-tracking": "bevcli.evaluation.formats.nuscenes:TRACKING",
+        "csv": "bevcli.evaluation.box_format:CSV",
+        "json": "bevcli.evaluation.box_format:JSON",
+        "nuscenes": "bevcli.evaluation.submission:DETECTION",
+        "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
     },
     "bevcli.commands": {
         "eval": "bevcli.cli.eval:evaluate",

@@ -60,7 +60,7 @@ def warm_python() -> Iterator[WarmPython]:
 def assets_built_once() -> Iterator[None]:
     """The meshes of rendered drives, which are always the same. They are imported where tests of rendering are."""
     with pytest.MonkeyPatch.context() as patch:
-        if catalog := sys.modules.get("bevcli.workshop.synth.assets.catalog"):
+        if catalog := sys.modules.get("bevcli.workshop.synth.catalog"):
             patch.setattr(catalog.Assets, "build", cache(catalog.Assets.build))
         yield
 

@@ -16,8 +16,8 @@ from bevcli.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
-# These two describe earlier versions, whose commands and files may be gone.
-OF_TODAY = [path for path in DOCUMENTS if path.name not in ("CHANGELOG.md", "history.md")]
+# The changelog describes earlier versions, whose commands and files may be gone.
+OF_TODAY = [path for path in DOCUMENTS if path.name != "CHANGELOG.md"]
 
 FENCED = re.compile(r"^ *```.*?^ *```", flags=re.MULTILINE | re.DOTALL)
 CODE_SPAN = re.compile(r"(`+)(.+?)\1", flags=re.DOTALL)

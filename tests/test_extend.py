@@ -143,7 +143,7 @@ def folders(group: str) -> set[str]:
 
 def test_opening_a_sequence_names_no_format():
     inside = tuple(f"{folder}." for folder in folders("bevcli.sequences"))
-    files = [PACKAGE / "sequences" / f"{name}.py" for name in ("open", "format", "options", "selection")]
+    files = [PACKAGE / "sequences" / f"{name}.py" for name in ("open", "format", "options")]
     for path in [*files, PACKAGE / "cli/run.py", *PACKAGE.glob("inference/*.py"), *PACKAGE.glob("runs/*.py")]:
         assert not [name for name in imported(path) if f"{name}.".startswith(inside)], path
 

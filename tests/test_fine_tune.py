@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from command_line import command
 
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.sequences.files.boxes_file import read_boxes
 
 ROOT = Path(__file__).parents[1]

@@ -38,7 +38,7 @@ def test_a_run_opens_no_connection(tmp_path):
         (("weights", "list", "--json"), "github.com"),
         (("run", SAMPLE, "--model", "tiny"), "run `bevcli weights fetch tiny`, which downloads them"),
         (("batch", SAMPLE, "--model", "tiny-fp16", "--out", "out"), "run `bevcli weights fetch tiny-fp16`"),
-        (("explain", SAMPLE, "--model", "small"), "run `bevcli weights fetch small`"),
+        (("run", SAMPLE, "--model", "small"), "run `bevcli weights fetch small`"),
         (("reproduce", "tiny", "--data", SAMPLE), "is not a nuScenes root"),
     ],
     ids=lambda value: " ".join(map(str, value[:2])) if isinstance(value, tuple) else "",

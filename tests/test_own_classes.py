@@ -8,7 +8,7 @@ import pytest
 
 from bevcli.config import as_table, config_of_table, load_config
 from bevcli.errors import ConfigError, InputError
-from bevcli.evaluation.config import DetectionConfig, TrackingConfig
+from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.cameras import Camera
@@ -16,7 +16,8 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, are_
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.recording.colors import class_colors
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.workshop.formats.boxes.kitti import kitti_labels
+from bevcli.workshop.formats.kitti import kitti_labels
+from bevcli.workshop.scores.tracking import TrackingConfig
 
 NAMES = ("PKW", "Lorry", "person", "deer")
 SETTINGS = {"PKW": {"like": "car", "range_m": 60.0}, "Lorry": {"like": "truck"}, "person": {"like": "pedestrian"}}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from source_code import ROOT, trees
-from test_layers import LEFT
+from test_layers import WINGS
 
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.registry import entries, load, own
@@ -24,7 +24,7 @@ def classes_of(folder: Path) -> set[str]:
 def trees_outside() -> dict[Path, ast.Module]:
     """The files outside of the models' folders, but for those that are registered for a use of a model."""
     registered = {value.partition(":")[0] for value in own("bevcli.model_uses").values()}
-    left = {ROOT.joinpath(*name.split(".")[1:]).with_suffix(".py") for name in (*LEFT, *registered)}
+    left = {ROOT.joinpath(*name.split(".")[1:]).with_suffix(".py") for name in registered}
     return {
         path: tree
         for path, tree in trees().items()
@@ -50,13 +50,14 @@ def _names(tree: ast.Module) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
 
 
-@pytest.mark.parametrize("folder", [one for one in FOLDERS if one.name != "vad"], ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_no_other_room_names_a_model(folder):
-    """UniAD extends BEVFormer, so that the models' folders may name each other."""
+    """UniAD extends BEVFormer, so that the models' folders may name each other; a wing may name what it states."""
     own, module = classes_of(folder), ".".join(("bevcli", *folder.relative_to(ROOT).parts))
     named = [
         f"{path.relative_to(ROOT)}: {name}"
         for path in trees_outside()
+        if folder.name not in WINGS.get(path.parent.name, ())
         for name in names_in(path)
         if name in own or name == module or name.startswith(f"{module}.")
     ]

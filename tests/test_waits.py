@@ -7,11 +7,11 @@ from source_code import ROOT, trees
 # Calls that wait without a limit, by file.
 ALLOWED = {
     (
-        "workshop/batch/drives.py",
+        "workshop/batch/job.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
-        "workshop/batch/find_like.py",
+        "workshop/batch/report.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
     (
@@ -26,7 +26,7 @@ ALLOWED = {
     ("cli/stop_signals.py", "numbers.recv"): "in a daemon thread, until a signal comes or the command ends",
     ("viewer/native.py", "process.wait"): "until the user closes the viewer's window",
     ("viewer/web.py", "self.serve_forever"): "until Ctrl-C, or `close`",
-    ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
+    ("recording/writer.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
     ("inference/preprocess.py", "task.result"): "the task is done",
     ("model/kernels/compiled.py", "helper.result"): "the tasks only compute",
     ("workshop/synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",

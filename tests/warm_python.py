@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from select import select
 
-from bevcli.parsing.own_process import LIMIT_MEMORY
+from bevcli.parsing.files import LIMIT_MEMORY
 from bevcli.viewer.recording_file import CHECK_ENVIRONMENT
 
 # A child ends as `python -P -c CODE …` does, but without the interpreter's own end.

@@ -56,10 +56,12 @@ class Part:
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
+        classes: makes the list of the dataclasses whose options are in `FormatValues`.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    classes: Callable[[], list[type[Any]]] = option_classes
 
     def __contains__(self, name: str) -> bool:
         return name not in self.without and (not self.only or name in self.only)
@@ -304,7 +306,7 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
         extensions = [load(EXTENSIONS, name) for name in entries(EXTENSIONS) if name.startswith(f"{extended}.")]
         make, classes = partial(_steps, extensions), [each.options for each in extensions]
     elif hint == FormatValues:
-        make, classes = dict, option_classes()
+        make, classes = dict, part.classes()
     elif not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}

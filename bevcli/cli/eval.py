@@ -6,6 +6,7 @@ from typing import Annotated
 
 from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.evaluation.options import EvaluationOptions
+from bevcli.evaluation.scorers import score_options
 from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
 
@@ -20,6 +21,7 @@ def evaluate(
     source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
     format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     options: EvaluationOptions,
+    results: Annotated[FormatValues, Part(classes=score_options)],
     as_json: Json = False,
 ) -> None:
     """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
@@ -28,18 +30,16 @@ def evaluate(
     runs a model on several drives and scores them together.
     """
     from bevcli.evaluation.evaluate import evaluate
-    from bevcli.workshop.vad.driving_scores import DRIVING
 
     scores = evaluate(
         predictions,
         ground_truth,
         options.max_range,
         options.count_missing,
-        tracking=options.tracking,
-        driving=[name for name in DRIVING if getattr(options, name)],
         scene=source.scene,
         class_map=source.class_map,
         **format_options,
+        **results,
     )
     say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:

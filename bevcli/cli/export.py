@@ -21,7 +21,7 @@ def export(
     ],
     options: ExportOptions,
 ) -> None:
-    """Write boxes as a table, a boxes file, KITTI labels, a nuScenes submission, or tracks for annotation tools.
+    """Write boxes as a table, a boxes file, KITTI labels, or a nuScenes submission.
 
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
@@ -44,8 +44,8 @@ def _read(file: Path) -> "BoxesFile":
 
     if file.suffix.lower() != ".rrd":
         return read_boxes(file)
-    from bevcli.viewer.export import read_recording
     from bevcli.viewer.recording_file import open_recording
+    from bevcli.viewer.recording_reader import read_recording
 
     with open_recording(file) as whole:
         if whole != file:

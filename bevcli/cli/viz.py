@@ -38,8 +38,8 @@ def viz(
 def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
     """Write what the options name. read_from: the recording, or a repaired copy of it."""
     from bevcli.cli.progress import Progress
-    from bevcli.viewer.screenshot import take_screenshot
-    from bevcli.viewer.summary import summarise
+    from bevcli.viewer.native import take_screenshot
+    from bevcli.viewer.recording_reader import summarise
     from bevcli.viewer.video import frame_rate, write_video
 
     if options.summary:

@@ -1,4 +1,4 @@
-"""Parameters of the detection score (nuScenes' detection_cvpr_2019) and of the tracking score (tracking_nips_2019)."""
+"""Parameters of the detection score (nuScenes' detection_cvpr_2019), and the ranges of all scores."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -54,7 +54,7 @@ class DetectionConfig(ClassRanges):
         visibility_bins: for the table by visibility, lower end included; the last bin includes 1.
     """
 
-    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _ranges_m(NUSCENES_CLASSES.values()))
+    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: ranges_m(NUSCENES_CLASSES.values()))
     classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     error_distance_m: float = 2.0
@@ -72,7 +72,7 @@ class DetectionConfig(ClassRanges):
     @classmethod
     def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
         """The score of these classes, each within its range."""
-        return cls(_ranges_m(classes.values()), classes)
+        return cls(ranges_m(classes.values()), classes)
 
     def cut_at(self, max_range_m: float) -> Self:
         """The same score with all class ranges and bins cut at max_range_m. Raises ConfigError as `ClassRanges`."""
@@ -80,37 +80,6 @@ class DetectionConfig(ClassRanges):
         return replace(super().cut_at(max_range_m), range_bins_m=bins)
 
 
-@dataclass(frozen=True)
-class TrackingConfig(ClassRanges):
-    """All parameters of the tracking metrics; the defaults are the nuScenes devkit's.
-
-    Attributes:
-        match_distance_m: centres that are closer on the ground can match.
-        recall_levels: number of recall levels from `min_recall` to 1 over which AMOTA and AMOTP are means.
-        min_recall: the lowest recall level.
-        frame_period_s: duration that one frame counts in tid and lgd, whatever the timestamps are.
-        mostly_tracked, mostly_lost: an object counts as mostly tracked when it is matched in at least, and as mostly
-            lost when it is matched in less than, this share of its frames.
-    """
-
-    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _tracked_ranges_m(NUSCENES_CLASSES))
-    match_distance_m: float = 2.0
-    recall_levels: int = 40
-    min_recall: float = 0.1
-    frame_period_s: float = 0.5
-    mostly_tracked: float = 0.8
-    mostly_lost: float = 0.2
-
-    @classmethod
-    def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
-        """The metrics of those of these classes that are tracked, each within its range."""
-        return cls(_tracked_ranges_m(classes))
-
-
-def _ranges_m(classes: Iterable[ObjectClass]) -> dict[str, float]:
-    return {one.name: one.range_m for one in classes}
-
-
-def _tracked_ranges_m(classes: Mapping[str, ObjectClass]) -> dict[str, float]:
-    """The ranges of the tracked classes, in the order of their names, as the devkit has them."""
-    return _ranges_m(classes[name] for name in sorted(classes) if classes[name].tracked)
+def ranges_m(classes: Iterable[ObjectClass]) -> dict[str, float]:
+    """The range of each class, by name."""
+    return {kind.name: kind.range_m for kind in classes}

@@ -47,15 +47,15 @@ class RecallCurve:
         return float(np.mean(along[first : last + 1]))
 
 
-def recall_curve(found: NDArray[np.bool_], scores: Array, ground_truth_count: int) -> RecallCurve:
+def recall_curve(is_match: NDArray[np.bool_], scores: Array, ground_truth_count: int) -> RecallCurve:
     """The curve of P predictions.
 
-    found: (P,), bool, whether the prediction is a true positive. scores: (P,), descending.
+    is_match: (P,), bool, whether the prediction is a true positive. scores: (P,), descending.
     """
-    if not found.any():
+    if not is_match.any():
         return RecallCurve(np.zeros_like(RECALLS), np.zeros_like(RECALLS))
-    true_positives = np.cumsum(found).astype(np.float64)
-    precision = true_positives / np.arange(1, len(found) + 1)
+    true_positives = np.cumsum(is_match).astype(np.float64)
+    precision = true_positives / np.arange(1, len(is_match) + 1)
     recall = true_positives / ground_truth_count
     return RecallCurve(*(np.interp(RECALLS, recall, values, right=0) for values in (precision, scores)))
 
@@ -227,8 +227,8 @@ def evaluate_detections(
     # Boxes without points are left out on both sides, as in the devkit: then ground truth used as predictions has a
     # perfect score.
     sides = (gather(side, ego) for side in (ground_truth, predictions))
-    truth, found = (side[side.column("num_points") != 0] for side in sides)
-    matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
+    truth, predicted = (side[side.column("num_points") != 0] for side in sides)
+    matches = tuple(match_class(name, truth, predicted, config) for name in config.class_ranges_m)
     return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
 
 
@@ -242,10 +242,10 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     row = config.error_row
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
     truths = part.ground_truth[part.matched[row][hits]]
-    one = config.classes[part.name]
-    errors = _true_positive_errors(truths, part.predictions[hits], symmetric=one.symmetric)
+    kind = config.classes[part.name]
+    errors = _true_positive_errors(truths, part.predictions[hits], symmetric=kind.symmetric)
     curve = curves[config.error_distance_m]
-    undefined = {*one.undefined_errors, *unmeasured}
+    undefined = {*kind.undefined_errors, *unmeasured}
     return ClassScores(
         ground_truth_count=truth_count,
         prediction_count=int(part.counts[row].sum()),
@@ -268,17 +268,17 @@ def _true_positive_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symm
     vel_err: m/s; NaN where ground truth has no velocity.
     attr_err: 0 for the right attribute, 1 for a wrong one; NaN where ground truth has none.
     """
-    truth, found, attributes = truths.boxes, predictions.boxes, truths.column("attributes")
-    offsets = found.centers[:, :2] - truth.centers[:, :2]
-    intersection = np.minimum(truth.sizes_lwh, found.sizes_lwh).prod(axis=1)
-    union = truth.sizes_lwh.prod(axis=1) + found.sizes_lwh.prod(axis=1) - intersection
+    truth, predicted, attributes = truths.boxes, predictions.boxes, truths.column("attributes")
+    offsets = predicted.centers[:, :2] - truth.centers[:, :2]
+    intersection = np.minimum(truth.sizes_lwh, predicted.sizes_lwh).prod(axis=1)
+    union = truth.sizes_lwh.prod(axis=1) + predicted.sizes_lwh.prod(axis=1) - intersection
     half_turns = 2 if symmetric else 1
-    turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
+    turn = wrap_angle(half_turns * (truth.yaws - predicted.yaws)) / half_turns
     errors = (
         np.hypot(offsets[:, 0], offsets[:, 1]),
         1 - intersection / union,
         np.abs(turn),
-        np.linalg.norm(found.velocities - truth.velocities, axis=1),
+        np.linalg.norm(predicted.velocities - truth.velocities, axis=1),
         np.where(attributes == "", np.nan, attributes != predictions.column("attributes")),
     )
     return dict(zip(ERRORS, errors, strict=True))
@@ -287,4 +287,4 @@ def _true_positive_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symm
 def _unmeasured(truth: ScoredBoxes) -> tuple[str, ...]:
     """The errors whose quantity no ground truth has."""
     unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
-    return tuple(name for name, each in unknown.items() if len(truth) and each.all())
+    return tuple(name for name, is_unknown in unknown.items() if len(truth) and is_unknown.all())

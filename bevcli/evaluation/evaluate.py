@@ -1,30 +1,81 @@
-"""`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps."""
+"""`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps.
 
+Scores become a dict for JSON, with the key names of the nuScenes devkit, and tables for the terminal.
+"""
+
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
-from statistics import median
 from typing import Any
 
-from bevcli.evaluation.config import DetectionConfig, TrackingConfig
-from bevcli.evaluation.detection import DetectionScores, evaluate_detections
-from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
-from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import FrameScores, driving_tables, driving_to_dict, finite
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.detection import DetectionScores, ScoreTable, evaluate_detections
+from bevcli.evaluation.inputs import (
+    Compared,
+    FramePairs,
+    ScoredInput,
+    open_ground_truth,
+    open_predictions,
+    pair_frames,
+    without_cycles_in_racks,
+)
+from bevcli.evaluation.scorers import ResultScores, score_results
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
-from bevcli.printing import counted
+from bevcli.printing import aligned, counted
+from bevcli.registry import load
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.workshop.tracking_scores.scoring import TrackingScores, evaluate_tracking
-from bevcli.workshop.vad.driving_scores import DrivingScores, Scored, evaluate_driving
 
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "
     "numbers are not comparable to nuScenes'"
 )
+_ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """The scores of the boxes, maps and further results of some frames.
+
+    Attributes:
+        detection: the scores of the boxes.
+        segmentation: the scores of the maps; None where predictions or ground truth have none.
+        others: the scores of further results that were asked for, by the name of their scorer, such as "tracking". Each
+            is an attribute too: `scores.tracking`.
+        notes: what was assumed or left out, one line each.
+    """
+
+    detection: DetectionScores
+    segmentation: SegmentationScores | None = None
+    others: Mapping[str, ResultScores] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __getattr__(self, name: str) -> Any:
+        others = self.__dict__.get("others", {})
+        if name not in others:
+            raise AttributeError(f"these scores have no {name}")
+        return others[name]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+        content = _content(self)
+        for scores in self.others.values():
+            content |= scores.to_dict()
+        return finite(content)
+
+    def table(self) -> str:
+        """The scores of boxes by class, range and visibility, and those of further results, as text for a terminal."""
+        parts = [_classes(self.detection), _ranges(self.detection)]
+        if self.detection.by_visibility:
+            parts.append(_visibilities(self.detection))
+        if self.segmentation is not None:
+            parts.append(_maps(self.segmentation))
+        for scores in self.others.values():
+            parts += scores.tables()
+        return "\n\n".join(parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,29 +84,18 @@ class Scores(FrameScores):
 
     Attributes:
         pairs: the frames that were scored.
-        driving: the scores of lines of the map, forecasts and planned paths that were asked for.
     """
 
     pairs: FramePairs
-    driving: DrivingScores = field(default_factory=DrivingScores)
-
-    def to_dict(self) -> dict[str, Any]:
-        return super().to_dict() | finite(driving_to_dict(self.driving))
 
     def table(self) -> str:
         frames = f"{counted(self.detection.frame_count, 'frames')}, matched by {self.pairs.matched_by}"
-        return "\n\n".join([frames, super().table(), *driving_tables(self.driving)])
+        return f"{frames}\n\n{super().table()}"
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
-        from bevcli.evaluation import plots  # only plots need matplotlib
-
-        figures = {
-            "precision_recall.png": plots.draw_precision_recall(self.detection),
-            "errors_by_range.png": plots.draw_errors_by_range(self.detection),
-            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.pairs),
-        }
-        return plots.save_figures(figures, Path(folder))
+        paths: list[Path] = load("bevcli.plots", "scores")(self, Path(folder))
+        return paths
 
 
 def evaluate(
@@ -64,12 +104,11 @@ def evaluate(
     max_range: float | None = None,
     count_missing: bool = False,
     *,
-    tracking: bool = False,
-    driving: Sequence[Scored] = (),
     scene: str | None = None,
     version: str | None = None,
     split: str | None = None,
     class_map: Mapping[str, str] | None = None,
+    **results: bool,
 ) -> Scores:
     """Score predictions with the nuScenes detection metrics, and maps with IoU where both sides have them.
 
@@ -80,42 +119,45 @@ def evaluate(
             class, cut where the model's BEV grid ends if the predictions state it; no limit where no frame has an
             ego pose, as in the devkit.
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
-        tracking: whether to score tracks, too: AMOTA and the metrics that come with it. Predictions and ground truth
-            need identities ("instance").
-        driving: what else to score: "map" (lines), "motion" (forecasts) and "plan" (planned paths).
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
         class_map: class names in the files -> the classes of the model, such as {"Lorry": "truck"}.
+        results: further results to score. tracking=True: AMOTA and the metrics that come with it; both sides need
+            identities ("instance"). map=True, motion=True and plan=True: lines of the map, forecasts and planned paths.
 
     Returns:
         The scores. Predictions without attributes get them from class and speed.
 
     Raises:
-        InputError: a file is missing or wrong, the two have no frame in common, `tracking` and one of them has no
-            identities, or one of them lacks what `driving` asks for.
+        InputError: a file is missing or wrong, the two have no frame in common, or one of them lacks what `results`
+            asks for.
         ConfigError: max_range is not positive.
+        TypeError: `results` has an option that no scorer has.
     """
-    found = open_predictions(Path(predictions), class_map)
-    classes = found.boxes.classes or NUSCENES_CLASSES
+    predicted = open_predictions(Path(predictions), class_map)
+    classes = predicted.boxes.classes or NUSCENES_CLASSES
     truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
-    pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
+    pairs = pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    model_range = _model_range_m(found, pairs, classes) if max_range is None else None
+    model_range = _model_range_m(predicted, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
-    detection = evaluate_detections(_with_attributes(predicted, classes), true, config, pairs.ego_xy)
-    segmentation, map_notes = _score_maps(found, truth, pairs)
-    tracked = TrackingConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    tracks, track_notes = _score_tracks(pairs, tracked) if tracking else (None, [])
-    drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
-    limits = _range_notes(max_range, model_range, pairs)
-    notes = (*pairs.notes, *map_notes, *_class_notes(predicted, true, classes), *limits, *_detection_notes(detection))
-    impossible = truth.impossible_boxes
-    left_out = (f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}",) if impossible else ()
-    notes = (*notes, *track_notes, *drives.notes, *left_out)
-    return Scores(detection, segmentation, tracks, notes, pairs=pairs, driving=drives)
+    predicted_boxes, true_boxes = pairs.boxes
+    detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
+    segmentation, map_notes = _score_maps(predicted, truth, pairs)
+    others = score_results(results, Compared(pairs, classes, limit, predicted, truth))
+    notes = (
+        *pairs.notes,
+        *map_notes,
+        *_class_notes(predicted_boxes, true_boxes, classes),
+        *_range_notes(max_range, model_range, pairs),
+        *_detection_notes(detection),
+        *(note for scores in others.values() for note in scores.notes),
+    )
+    if impossible := truth.impossible_boxes:
+        notes = (*notes, f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}")
+    return Scores(detection, segmentation, others, notes, pairs=pairs)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:
@@ -128,27 +170,6 @@ def _range_notes(max_range: float | None, model_range: float | None, pairs: Fram
         )
 
 
-def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingScores, list[str]]:
-    """The scores of the tracks, and notes about what differs from nuScenes."""
-    stamps = [frame.stamp for frame in pairs.ground_truth]
-    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
-    scores = evaluate_tracking(predicted, true, stamps, config, pairs.ego_xy)
-    notes = []
-    if pairs.frame_of_reference != "world":
-        notes.append(
-            f"tracks are scored in the {pairs.frame_of_reference} frame: gaps in tracks are interpolated there, not in "
-            "the world frame"
-        )
-    ordered = pairwise(sorted(stamps, key=lambda stamp: (stamp.scene, stamp.timestamp_ns)))
-    gaps = [(b.timestamp_ns - a.timestamp_ns) / 1e9 for a, b in ordered if a.scene == b.scene]
-    if gaps and not 0.8 < median(gaps) / config.frame_period_s < 1.25:
-        notes.append(
-            f"frames are {median(gaps):.2g} s apart, but TID and LGD count {config.frame_period_s:g} s for each of "
-            "them, as in the nuScenes devkit"
-        )
-    return scores, notes
-
-
 def _with_attributes(frames: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]) -> Sequence[Boxes3D]:
     if any(boxes.attributes is not None for boxes in frames):
         return frames
@@ -159,32 +180,32 @@ def _score_maps(
     predictions: ScoredInput, ground_truth: ScoredInput, pairs: FramePairs
 ) -> tuple[SegmentationScores | None, list[str]]:
     """The scores of the maps, and notes about frames that were left out."""
-    found, true = predictions.maps, ground_truth.maps
-    if found is None or true is None:
-        missing = "predictions" if found is None else "ground truth"
-        return None, [f"maps are not scored: the {missing} have none"] if found or true else []
+    predicted, true = predictions.maps, ground_truth.maps
+    if predicted is None or true is None:
+        missing = "predictions" if predicted is None else "ground truth"
+        return None, [f"maps are not scored: the {missing} have none"] if predicted or true else []
     indices = [
-        (one.stamp.index, other.stamp.index)
-        for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)
-        if found.has(one.stamp.index) and true.has(other.stamp.index)
+        (prediction.stamp.index, truth.stamp.index)
+        for prediction, truth in zip(pairs.predictions, pairs.ground_truth, strict=True)
+        if predicted.has(prediction.stamp.index) and true.has(truth.stamp.index)
     ]
     left_out = len(pairs.predictions) - len(indices)
     notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
-    classes = [name for name in true.classes if name in found.classes]
+    classes = [name for name in true.classes if name in predicted.classes]
     if not classes:
-        kinds = f"predictions {', '.join(found.classes)}; ground truth {', '.join(true.classes)}"
+        kinds = f"predictions {', '.join(predicted.classes)}; ground truth {', '.join(true.classes)}"
         return None, [f"maps are not scored: they have no class in common ({kinds})"]
-    unscored = [name for name in (*found.classes, *true.classes) if name not in classes]
+    unscored = [name for name in (*predicted.classes, *true.classes) if name not in classes]
     if unscored:
         notes.append(f"map classes on one side only, not scored: {', '.join(unscored)}")
-    maps = ((found.load(one), true.load(other)) for one, other in indices)
+    maps = ((predicted.load(prediction), true.load(truth)) for prediction, truth in indices)
     return evaluate_segmentation(maps, classes), notes
 
 
 def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
     stated = predictions.boxes.extras.get("range_m")
-    farthest = max(one.range_m for one in classes.values())
+    farthest = max(kind.range_m for kind in classes.values())
     if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
         return None
     return float(stated)
@@ -217,3 +238,111 @@ def _detection_notes(detection: DetectionScores) -> Iterator[str]:
         names = {"vel_err": "velocities", "attr_err": "attributes"}
         missing = " or ".join(names[name] for name in detection.unmeasured)
         yield f"the ground truth has no {missing}: NDS is the mean without that error"
+
+
+def _content(scores: FrameScores) -> dict[str, Any]:
+    detection, segmentation = scores.detection, scores.segmentation
+    present, config = detection.overall.of_classes_with_ground_truth(), detection.config
+    return {
+        **_table_to_dict(detection.overall),
+        "classes_with_ground_truth": {
+            "classes": list(present.classes),
+            "mean_ap": present.mean_ap,
+            "nd_score": present.nd_score,
+        },
+        "by_range": [
+            {"from_m": low, "to_m": high, **_table_to_dict(table)} for (low, high), table in detection.by_range.items()
+        ],
+        "recall_by_visibility": [
+            {
+                "from": low,
+                "to": high,
+                "recall": table.mean_recall,
+                "ground_truth_boxes": table.ground_truth_count,
+                "found_boxes": table.prediction_count,
+                "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
+            }
+            for (low, high), table in detection.by_visibility.items()
+        ],
+        "iou": None if segmentation is None else dict(segmentation.iou),
+        "frames": detection.frame_count,
+        "map_frames": 0 if segmentation is None else segmentation.frame_count,
+        "ground_truth_boxes": detection.overall.ground_truth_count,
+        "prediction_boxes": detection.overall.prediction_count,
+        "notes": list(scores.notes),
+        "cfg": {
+            "class_range": dict(config.class_ranges_m),
+            "dist_ths": list(config.distances_m),
+            "dist_th_tp": config.error_distance_m,
+            "min_recall": config.min_recall,
+            "min_precision": config.min_precision,
+            "mean_ap_weight": config.mean_ap_weight,
+        },
+    }
+
+
+def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
+    return {
+        "mean_ap": table.mean_ap,
+        "nd_score": table.nd_score,
+        "tp_errors": table.errors,
+        "tp_scores": table.error_scores,
+        "label_aps": {
+            name: {f"{distance:.1f}": ap for distance, ap in scores.aps.items()}
+            for name, scores in table.classes.items()
+        },
+        "mean_dist_aps": {name: scores.mean_ap for name, scores in table.classes.items()},
+        "label_tp_errors": {name: dict(scores.errors) for name, scores in table.classes.items()},
+        "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
+        "label_ground_truth_boxes": {name: scores.ground_truth_count for name, scores in table.classes.items()},
+    }
+
+
+def finite(value: Any) -> Any:
+    """The value with None in place of NaN and infinity, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _classes(detection: DetectionScores) -> str:
+    table = detection.overall
+    distances = [f"AP@{distance:g}m" for distance in next(iter(table.classes.values())).aps]
+    rows = [("class", "boxes", "AP", *distances, "recall", *_ERROR_HEADS)]
+    for name, scores in table.classes.items():
+        numbers = (scores.mean_ap, *scores.aps.values(), scores.recall, *(scores.errors[error] for error in ERRORS))
+        rows.append((name, str(scores.ground_truth_count), *map(number, numbers)))
+    means = [number(table.errors[name]) for name in ERRORS]
+    rows.append(("all", str(table.ground_truth_count), number(table.mean_ap), *[""] * len(distances), "", *means))
+    return f"{aligned(rows)}\n\nmAP {number(table.mean_ap)}   NDS {number(table.nd_score)}"
+
+
+def _ranges(detection: DetectionScores) -> str:
+    bins = detection.by_range
+    rows = [("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins))]
+    for name in detection.overall.classes:
+        of_bins = [table.classes.get(name) for table in bins.values()]
+        rows.append((name, *(number(scores.mean_ap) if scores else "-" for scores in of_bins)))
+    rows.append(("mAP", *(number(table.mean_ap) for table in bins.values())))
+    rows.append(("NDS", *(number(table.nd_score) for table in bins.values())))
+    return aligned(rows)
+
+
+def _visibilities(detection: DetectionScores) -> str:
+    rows = [("visibility", "boxes", "found", "recall, mean over classes")]
+    for (low, high), table in detection.by_visibility.items():
+        counts = (str(table.ground_truth_count), str(table.prediction_count))
+        rows.append((f"{100 * low:.0f}-{100 * high:.0f} %", *counts, number(table.mean_recall)))
+    return aligned(rows)
+
+
+def _maps(segmentation: SegmentationScores) -> str:
+    rows = [("map class", "IoU"), *((name, number(iou)) for name, iou in segmentation.iou.items())]
+    return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for a table; "-" for NaN."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"

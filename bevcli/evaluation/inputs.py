@@ -1,6 +1,6 @@
-"""Reads predictions and ground truth from files, folders or a nuScenes root."""
+"""Predictions and ground truth from files, folders or a nuScenes root, and the pairs of frames of the two."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -8,22 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.nuscenes import is_submission, read_submission
-from bevcli.evaluation.pairing import FramePairs
-from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Sequence
+from bevcli.evaluation.submission import is_submission, read_submission
+from bevcli.frame import FrameStamp, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
+from bevcli.geometry.cameras import default_ego_from_bev
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
+from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.vad.lines_file import TRUE_LINES, FrameLines, LinesFile, read_lines
 
 
 @dataclass(frozen=True)
@@ -32,16 +31,18 @@ class ScoredInput:
 
     Attributes:
         boxes: by frame.
+        path: the boxes file, or the drive.
         maps: None where there is no folder of maps.
+        open_drive: opens the ground truth as a drive; None of a boxes file.
         bicycle_racks: by sample token, in the world frame; only of a nuScenes root.
-        lines: reads the true lines of the map, and raises InputError without them; None of predictions.
         impossible_boxes: the number of boxes that were left out: a size of 0 or less, or not finite.
     """
 
     boxes: BoxesFile
+    path: Path
     maps: MapFolder | None = None
+    open_drive: Callable[[], Drive] | None = None
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
-    lines: Callable[[], LinesFile] | None = None
     impossible_boxes: int = 0
 
 
@@ -59,7 +60,7 @@ def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> 
                 f'{file}: frame {frame.stamp.index}: boxes have no "score" (expected in predictions): '
                 "is this a ground truth file?"
             )
-    return ScoredInput(boxes, _maps_next_to(file, "segmentation"))
+    return ScoredInput(boxes, file, _maps_next_to(file, "segmentation"))
 
 
 def open_ground_truth(
@@ -77,7 +78,7 @@ def open_ground_truth(
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
-    if path.is_dir() and any(one.annotated and one.recognises(path) for one in formats()):
+    if path.is_dir() and any(kind.annotated and kind.recognises(path) for kind in formats()):
         return _open_drive(path, SequenceOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, class_map, classes)
@@ -86,57 +87,12 @@ def open_ground_truth(
         if not kept:
             raise InputError(f'{file}: has no scene "{scene}"')
         boxes = replace(boxes, frames=kept)
-    return ScoredInput(boxes, _maps_next_to(file, "ground_truth_map"), lines=partial(_lines_next_to, file))
-
-
-def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes3D]) -> FramePairs:
-    """Leave out bicycles and motorcycles, of both sides, whose centre is in a bicycle rack, as the devkit does.
-
-    bicycle_racks: by sample token, in the world frame, as the pairs.
-    """
-    if not bicycle_racks:
-        return pairs
-    assert pairs.frame_of_reference == "world"
-    tokens = [frame.extras.get("sample_token", "") for frame in pairs.ground_truth]
-    racks = [bicycle_racks.get(token, Boxes3D.empty()) for token in tokens]
-    found, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
-    return replace(pairs, predictions=found, ground_truth=true)
-
-
-def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:
-    boxes = frame.boxes
-    cycles = np.isin(boxes.classes, ("bicycle", "motorcycle"))
-    if not len(racks) or not cycles.any():
-        return frame
-    inside = np.zeros(len(boxes), dtype=bool)
-    for center, size, yaw in zip(racks.centers, racks.sizes_lwh, racks.yaws, strict=True):
-        rack_from_world = np.linalg.inv(rigid(center, rotation_about_z(float(yaw))))
-        inside |= (np.abs(apply(rack_from_world, boxes.centers)) <= size / 2).all(axis=1)
-    return replace(frame, boxes=boxes[~(cycles & inside)])
+    return ScoredInput(boxes, file, _maps_next_to(file, "ground_truth_map"))
 
 
 def _maps_next_to(file: Path, name: str) -> MapFolder | None:
     folder = file.parent / name
     return open_maps(folder) if folder.is_dir() else None
-
-
-def _lines_next_to(file: Path) -> LinesFile:
-    lines = file.with_name(TRUE_LINES)
-    if not lines.exists():
-        raise InputError(f"{lines}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)")
-    return read_lines(lines)
-
-
-def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
-    """The true lines of a drive in the world frame. expected: what would have them."""
-    drive, frames = open_drive(), []
-    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
-        if (lines := frame.ground_truth_lines) is None:
-            where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
-            raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
-        ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)
-        frames.append(FrameLines(frame.stamp, replace(lines, points=tuple(map(ground.points, lines.points)))))
-    return LinesFile("world", LINE_CLASSES, tuple(frames))
 
 
 def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
@@ -154,19 +110,220 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
             frames.append(FrameBoxes(stamp, pose, names.renamed(boxes.possible()), {"sample_token": token}))
             racks[token] = index.bicycle_racks(sample)
     drive = partial(open_sequence, root, scene=only, version=options.version, split=options.split)
-    lines = partial(_lines_of, drive, f"the map expansion in {root / 'maps' / 'expansion'}")
-    return ScoredInput(BoxesFile("world", tuple(frames)), None, racks, lines, impossible)
+    return ScoredInput(BoxesFile("world", tuple(frames)), root, None, drive, racks, impossible)
 
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     drive = open_sequence(path, options)
-    found, impossible = [], 0
+    frames, impossible = [], 0
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if frame.ground_truth is not None:
             token = {"sample_token": frame.sample_token} if frame.sample_token else {}
-            found.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
+            frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
             impossible += frame.impossible_boxes
-    if not found:
+    if not frames:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
-    lines = partial(_lines_of, lambda: drive, "a drive that has them")
-    return ScoredInput(BoxesFile("world", tuple(found)), lines=lines, impossible_boxes=impossible)
+    return ScoredInput(BoxesFile("world", tuple(frames)), path, None, lambda: drive, impossible_boxes=impossible)
+
+
+@dataclass(frozen=True)
+class FramePairs:
+    """F frames that are scored, in the order of the predictions.
+
+    Attributes:
+        frame_of_reference: of all boxes, "world", "ego" or "bev".
+        predictions: F frames, without boxes where only the ground truth has the frame.
+        ground_truth: F frames.
+        reference_from_ego: (F, 4, 4), pose of the ego vehicle in the frame of reference.
+        ego_pose_known: whether each frame has an ego pose on at least one side.
+        matched_by: the key by which frames were paired.
+        notes: messages for the user, one line each.
+    """
+
+    frame_of_reference: str
+    predictions: tuple[FrameBoxes, ...]
+    ground_truth: tuple[FrameBoxes, ...]
+    reference_from_ego: Array
+    ego_pose_known: bool
+    matched_by: str
+    notes: tuple[str, ...]
+
+    @property
+    def boxes(self) -> tuple[list[Boxes3D], list[Boxes3D]]:
+        """The boxes of the predictions and of the ground truth, by frame."""
+        predicted, true = ([frame.boxes for frame in side] for side in (self.predictions, self.ground_truth))
+        return predicted, true
+
+    @property
+    def ego_xy(self) -> Array:
+        """(F, 2), position of the ego vehicle in the frame of reference, metres."""
+        return self.reference_from_ego[:, :2, 3]
+
+
+# Keys that identify a frame, the most reliable first; the first one with common values is used.
+_KEYS: dict[str, Callable[[FrameBoxes], Hashable]] = {
+    "sample_token": lambda frame: frame.extras.get("sample_token"),
+    "scene and timestamp_ns": lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns),
+    "timestamp_ns": lambda frame: frame.stamp.timestamp_ns,
+    "scene and frame index": lambda frame: (frame.stamp.scene, frame.stamp.index),
+    "frame index": lambda frame: frame.stamp.index,
+}
+_RELIABLE = ("sample_token", "scene and timestamp_ns")
+
+
+def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
+    """Pair the frames of two files.
+
+    Frames of only one file are left out, which a note reports; with count_missing, those of the ground truth are kept
+    as frames without predictions. Where one file is in the world frame and the other in the ego or bev frame, all boxes
+    are transformed to the world frame. Raises InputError where the files have no frame in common, or a pose for the
+    transformation is missing.
+    """
+    key, pairs = _common_frames(predictions.frames, ground_truth.frames)
+    notes = _notes(key, len(pairs), len(predictions.frames), len(ground_truth.frames), count_missing)
+    if count_missing:
+        paired = {id(true) for _, true in pairs}
+        missing = [true for true in ground_truth.frames if id(true) not in paired]
+        pairs += [(replace(true, world_from_ego=None, boxes=Boxes3D.empty()), true) for true in missing]
+    reference = _common_frame_of_reference(predictions, ground_truth)
+    ego_from_bev = predictions.ego_from_bev or ground_truth.ego_from_bev
+    poses = [true.world_from_ego or prediction.world_from_ego for prediction, true in pairs]
+    return FramePairs(
+        frame_of_reference=reference,
+        predictions=tuple(
+            _transformed(prediction, predictions, reference, prediction.world_from_ego or pose)
+            for (prediction, _), pose in zip(pairs, poses, strict=True)
+        ),
+        ground_truth=tuple(
+            _transformed(true, ground_truth, reference, pose) for (_, true), pose in zip(pairs, poses, strict=True)
+        ),
+        reference_from_ego=np.stack([_reference_from_ego(reference, pose, ego_from_bev) for pose in poses]),
+        ego_pose_known=all(pose is not None for pose in poses),
+        matched_by=key,
+        notes=notes,
+    )
+
+
+def _common_frames(
+    predictions: Sequence[FrameBoxes], ground_truth: Sequence[FrameBoxes]
+) -> tuple[str, list[tuple[FrameBoxes, FrameBoxes]]]:
+    """The name of the key, and the pairs."""
+    for name, side in (("predictions", predictions), ("ground truth", ground_truth)):
+        if not side:
+            raise InputError(f"the {name} contain no frame (expected at least one)")
+    for name, key in _KEYS.items():
+        of_truth, of_predictions = (list(map(key, side)) for side in (ground_truth, predictions))
+        if _ambiguous(of_truth) or _ambiguous(of_predictions):
+            continue
+        truth = dict(zip(of_truth, ground_truth, strict=True))
+        pairs = [
+            (prediction, truth[k]) for prediction, k in zip(predictions, of_predictions, strict=True) if k in truth
+        ]
+        if pairs:
+            return name, pairs
+    raise InputError(
+        f"predictions and ground truth have no frame in common: predictions start with {_described(predictions[0])}, "
+        f"ground truth with {_described(ground_truth[0])}: check that both belong to the same drive"
+    )
+
+
+def _ambiguous(keys: Sequence[Hashable]) -> bool:
+    return None in keys or len(set(keys)) < len(keys)
+
+
+def _described(frame: FrameBoxes) -> str:
+    return f'scene "{frame.stamp.scene}" frame {frame.stamp.index} at {frame.stamp.timestamp_ns} ns'
+
+
+def _common_frame_of_reference(predictions: BoxesFile, ground_truth: BoxesFile) -> str:
+    references = {predictions.frame_of_reference, ground_truth.frame_of_reference}
+    if "world" in references:
+        return "world"
+    return "bev" if references == {"bev"} and not (predictions.ego_from_bev and ground_truth.ego_from_bev) else "ego"
+
+
+def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> FrameBoxes:
+    if file.frame_of_reference == reference:
+        return frame
+    ego_from_boxes = np.eye(4)
+    if file.frame_of_reference == "bev":
+        if file.ego_from_bev is None:
+            raise InputError(
+                f"frame {frame.stamp.index}: boxes in the bev frame cannot be transformed to the {reference} frame: "
+                'add "ego_from_bev" to the boxes file'
+            )
+        ego_from_boxes = file.ego_from_bev.matrix
+    if reference == "ego":
+        return replace(frame, boxes=frame.boxes.transformed(ego_from_boxes))
+    if world_from_ego is None:
+        raise InputError(
+            f"frame {frame.stamp.index}: boxes in the {file.frame_of_reference} frame cannot be transformed to the "
+            'world frame: "world_from_ego" is missing in predictions and ground truth'
+        )
+    return replace(frame, boxes=frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes))
+
+
+def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:
+    if reference == "world":
+        assert world_from_ego is not None  # otherwise the boxes could not have been transformed
+        return world_from_ego.matrix
+    if reference == "bev":
+        return inverse(ego_from_bev.matrix if ego_from_bev else default_ego_from_bev())
+    return np.eye(4)
+
+
+def _notes(key: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
+    notes = []
+    if key not in _RELIABLE:
+        notes.append(f"timestamps or scenes differ between the files: frames are matched by {key}")
+    if pairs < ground_truth:
+        left_out = "left out (`count_missing=True` counts them)"
+        treatment = "all their boxes count as missed" if count_missing else left_out
+        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {treatment}")
+    if pairs < predictions:
+        notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")
+    return tuple(notes)
+
+
+def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes3D]) -> FramePairs:
+    """Leave out bicycles and motorcycles, of both sides, whose centre is in a bicycle rack, as the devkit does.
+
+    bicycle_racks: by sample token, in the world frame, as the pairs.
+    """
+    if not bicycle_racks:
+        return pairs
+    assert pairs.frame_of_reference == "world"
+    tokens = [frame.extras.get("sample_token", "") for frame in pairs.ground_truth]
+    racks = [bicycle_racks.get(token, Boxes3D.empty()) for token in tokens]
+    predicted, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
+    return replace(pairs, predictions=predicted, ground_truth=true)
+
+
+def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:
+    boxes = frame.boxes
+    cycles = np.isin(boxes.classes, ("bicycle", "motorcycle"))
+    if not len(racks) or not cycles.any():
+        return frame
+    inside = np.zeros(len(boxes), dtype=bool)
+    for center, size, yaw in zip(racks.centers, racks.sizes_lwh, racks.yaws, strict=True):
+        rack_from_world = np.linalg.inv(rigid(center, rotation_about_z(float(yaw))))
+        inside |= (np.abs(apply(rack_from_world, boxes.centers)) <= size / 2).all(axis=1)
+    return replace(frame, boxes=boxes[~(cycles & inside)])
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Predictions and ground truth of the same frames, for a `Scorer`.
+
+    Attributes:
+        pairs: the frames that are scored.
+        classes: of the predictions, by name.
+        max_range_m: distance from the ego vehicle beyond which nothing is scored; None for the range of each class.
+        predictions, truth: with all their frames, and where they come from; None of frames in memory.
+    """
+
+    pairs: FramePairs
+    classes: Mapping[str, ObjectClass]
+    max_range_m: float | None
+    predictions: ScoredInput | None = None
+    truth: ScoredInput | None = None

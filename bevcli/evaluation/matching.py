@@ -10,16 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.transforms import Array
-
-# Value of an optional column in frames that do not have it. Futures are scored on their own.
-_UNKNOWN: dict[str, Any] = {
-    **dict.fromkeys(("scores", "track_scores", "visibilities"), np.nan),
-    **dict.fromkeys(("attributes", "instances"), ""),
-    "duplicates": False,
-    "num_points": -1,
-}
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,9 @@ def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
 def with_all_columns(boxes: Boxes3D) -> Boxes3D:
     """The boxes with all optional columns but futures."""
     missing: dict[str, Any] = {
-        name: np.full(len(boxes), value) for name, value in _UNKNOWN.items() if getattr(boxes, name) is None
+        name: np.full(len(boxes), column.unknown)
+        for name, column in OPTIONAL_COLUMNS.items()
+        if getattr(boxes, name) is None
     }
     return replace(boxes, futures=None, future_scores=None, **missing)
 
@@ -123,10 +117,10 @@ def match_class(
     """Match the boxes of one class that are inside the range of the class."""
     limit = config.class_ranges_m[name]
     truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
-    found = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
-    found = found[descending_scores(found.column("scores"))]
-    matched = match_greedily(truth, found, config.distances_m)
-    return ClassMatches(name, truth, found, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
+    predicted = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
+    predicted = predicted[descending_scores(predicted.column("scores"))]
+    matched = match_greedily(truth, predicted, config.distances_m)
+    return ClassMatches(name, truth, predicted, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
 
 
 def descending_scores(scores: Array) -> NDArray[np.int64]:

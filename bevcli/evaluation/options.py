@@ -14,7 +14,7 @@ MAX_RANGE_HELP = (
 
 @options()
 class EvaluationOptions:
-    """The options of `evaluate`, and the folder of its plots."""
+    """The options of `evaluate` for boxes and maps, and the folder of its plots."""
 
     plot: Path | None = option(
         default=None,
@@ -27,16 +27,6 @@ class EvaluationOptions:
         metavar="METRES",
     )
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
-    tracking: bool = option(
-        default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
-    )
-    map: bool = option(default=False, help="Also score lines of the map: AP by Chamfer distance of 0.5, 1 and 1.5 m.")
-    motion: bool = option(default=False, help="Also score forecasts: EPA, minADE, minFDE and miss rate.")
-    plan: bool = option(
-        default=False,
-        help="Also score planned paths: distance to the driven path and collisions, up to 1, 2 and 3 s as VAD states "
-        "them, and at 1, 2 and 3 s as UniAD does.",
-    )
 
 
 @options()
@@ -45,9 +35,7 @@ class ExportOptions:
 
     form: str = option(
         help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
-        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. openlabel: ASAM OpenLABEL, with tracks. "
-        "kitti-raw: tracklet_labels.xml, with tracks. Or "
-        "the format of an installed package.",
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
         complete=lambda incomplete: list(entries("bevcli.box_formats")),

@@ -41,11 +41,11 @@ def evaluate_segmentation(
     names = tuple(classes)
     intersection, union, count = np.zeros(len(names)), np.zeros(len(names)), 0
     for prediction, truth in pairs:
-        found, true = _at_ground_truth_cells(prediction, truth)
+        predicted, true = _at_ground_truth_cells(prediction, truth)
         bits = [np.array([bev_map.classes.get(name, 0) for name in names], np.uint8) for bev_map in (prediction, truth)]
-        found_is, true_is = (found[:, None] & bits[0]) > 0, (true[:, None] & bits[1]) > 0  # (cells, classes)
-        intersection += (found_is & true_is).sum(axis=0)
-        union += (found_is | true_is).sum(axis=0)
+        predicted_is, true_is = (predicted[:, None] & bits[0]) > 0, (true[:, None] & bits[1]) > 0  # (cells, classes)
+        intersection += (predicted_is & true_is).sum(axis=0)
+        union += (predicted_is | true_is).sum(axis=0)
         count += 1
     both, either = (dict(zip(names, counts.tolist(), strict=True)) for counts in (intersection, union))
     return SegmentationScores(both, either, count)
@@ -62,5 +62,5 @@ def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[n
     row = np.floor((py1 - y) / (py1 - py0) * prediction.cells.shape[0]).astype(int)
     columns_inside = (column >= 0) & (column < prediction.cells.shape[1])
     rows_inside = (row >= 0) & (row < prediction.cells.shape[0])
-    found = prediction.cells[np.ix_(row[rows_inside], column[columns_inside])]
-    return found.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()
+    predicted = prediction.cells[np.ix_(row[rows_inside], column[columns_inside])]
+    return predicted.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()

@@ -1,8 +1,9 @@
 """Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from math import nan
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,27 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
 IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes3D.possible` leaves out
+
+
+@dataclass(frozen=True)
+class Column:
+    """An optional column of boxes with one value a box. Files, tables, scores and recordings take it from here.
+
+    Attributes:
+        key: its name in JSON, CSV and tables.
+        values: "score": 0 to 1, of all boxes or of none; "share": 0 to 1, or NaN; "text"; "flag": true or false;
+            "count": an integer, 0 or more.
+        recorded: its name in recordings; "" where they do not have it.
+    """
+
+    key: str
+    values: Literal["score", "share", "text", "flag", "count"]
+    recorded: str = ""
+
+    @property
+    def unknown(self) -> Any:
+        """The value of a box where it is unknown."""
+        return {"score": nan, "share": nan, "text": "", "flag": False, "count": -1}[self.values]
 
 
 @dataclass(frozen=True)
@@ -42,13 +64,13 @@ class Boxes3D:
     yaws: Array
     velocities: Array
     classes: NDArray[np.str_]
-    scores: Array | None = None
-    attributes: NDArray[np.str_] | None = None
-    instances: NDArray[np.str_] | None = None
-    track_scores: Array | None = None
-    duplicates: NDArray[np.bool_] | None = None
-    visibilities: Array | None = None
-    num_points: NDArray[np.int64] | None = None
+    scores: Annotated[Array | None, Column("score", "score", recorded="score")] = None
+    attributes: Annotated[NDArray[np.str_] | None, Column("attribute", "text")] = None
+    instances: Annotated[NDArray[np.str_] | None, Column("instance", "text", recorded="track")] = None
+    track_scores: Annotated[Array | None, Column("track_score", "share")] = None
+    duplicates: Annotated[NDArray[np.bool_] | None, Column("duplicate", "flag")] = None
+    visibilities: Annotated[Array | None, Column("visibility", "share")] = None
+    num_points: Annotated[NDArray[np.int64] | None, Column("num_points", "count")] = None
     futures: Array | None = None
     future_scores: Array | None = None
 
@@ -127,24 +149,19 @@ class Boxes3D:
     def to_dict(self) -> dict[str, list[Any]]:
         """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
 
-        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
-        duplicate, visibility and num_points, without the optional ones that are None.
-        Futures are left out.
+        The columns are TABLE_COLUMNS, without the optional ones that are None. Futures are left out.
         """
-        numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
-        columns = {
-            "class": self.classes,
-            "score": self.scores,
-            **dict(zip(numbers, self.to_numpy().T, strict=True)),
-            "attribute": self.attributes,
-            "instance": self.instances,
-            "track_score": self.track_scores,
-            "duplicate": self.duplicates,
-            "visibility": self.visibilities,
-            "num_points": self.num_points,
-        }
-        return {name: column.tolist() for name, column in columns.items() if column is not None}
+        values = {"class": self.classes, **dict(zip(NUMBERS, self.to_numpy().T, strict=True))}
+        values |= {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
+        return {key: values[key].tolist() for key in TABLE_COLUMNS if values[key] is not None}
 
+
+OPTIONAL_COLUMNS: dict[str, Column] = {
+    field.name: column for field in fields(Boxes3D) for column in getattr(field.type, "__metadata__", ())
+}
+NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")  # of `Boxes3D.to_numpy`
+_KEYS = [column.key for column in OPTIONAL_COLUMNS.values()]
+TABLE_COLUMNS = ("class", _KEYS[0], *NUMBERS, *_KEYS[1:])  # class, score, x, …, vy, attribute, …
 
 # The twelve edges of `Boxes3D.corners`, as pairs of corner indices.
 BOX_EDGES = (
@@ -162,3 +179,43 @@ def attributes_by_speed(boxes: Boxes3D, classes: Mapping[str, ObjectClass] = NUS
     moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
     choices = [classes[name].attributes if name in classes else ("", "") for name in boxes.classes.tolist()]
     return np.array([pair[0 if fast else 1] for pair, fast in zip(choices, moving, strict=True)], dtype=np.str_)
+
+
+MAX_GAP_S = 1.5  # longest time between two annotations of an object from which a velocity is derived
+
+
+def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
+    """(A, 3) m/s, NaN if unknown: central differences, one-sided for an object's first and last annotation.
+
+    As in the official nuScenes devkit, a velocity is known if each time gap is at most 1.5 s on average.
+
+    centers: (A, 3) metres, world frame. times_s: (A,) seconds. first, last: (A,) rows of the annotations of the same
+    object before and after; the own row where there is none.
+    """
+    rows = np.arange(len(centers))
+    seconds = times_s[last] - times_s[first]
+    longest = MAX_GAP_S * ((first != rows).astype(int) + (last != rows))
+    known = (seconds > 0) & (seconds <= longest)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
+    return np.where(known[:, None], velocities, np.nan)
+
+
+def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int]) -> list[Boxes3D]:
+    """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`; "" is none.
+
+    timestamps_ns: (T,) increasing.
+    """
+    together = Boxes3D.concatenate(frames)
+    if together.instances is None:
+        return list(frames)
+    counts = [len(boxes) for boxes in frames]
+    seconds = np.repeat((np.asarray(timestamps_ns) - timestamps_ns[0]) * 1e-9, counts)
+    order = np.lexsort((seconds, together.instances))
+    names = together.instances[order]
+    same = (names[1:] == names[:-1]) & (names[1:] != "")
+    first, last = np.arange(len(order)), np.arange(len(order))
+    first[order[1:][same]], last[order[:-1][same]] = order[:-1][same], order[1:][same]
+    velocities = velocities_between(together.centers, seconds, first, last)[:, :2]
+    parts = np.split(velocities, np.cumsum(counts)[:-1])
+    return [replace(boxes, velocities=own) for boxes, own in zip(frames, parts, strict=True)]

@@ -1,10 +1,9 @@
 """Commands of the driver, such as "straight": each chooses one of the paths that a model plans."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameResult, Plan
+from bevcli.frame import FrameResult
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
 
@@ -15,7 +14,7 @@ Commands = tuple[tuple[int, str], ...]
 def with_command(results: tuple[FrameResult, ...], commands: Commands, frame: int) -> tuple[FrameResult, ...]:
     """The results, plans with the command at a frame, "" for none."""
     command = next((command for first, command in reversed(commands) if first <= frame), "")
-    return tuple(replace(each, command=command) if isinstance(each, Plan) else each for each in results)
+    return tuple(result.with_command(command) for result in results)
 
 
 def read_commands(command: str | None, config: ModelConfig) -> Commands:
@@ -48,7 +47,7 @@ def one_command(command: str, config: ModelConfig) -> Commands:
 
 
 def _known(command: str, config: ModelConfig) -> tuple[str, ...]:
-    known = config.results.get(Plan, ())
+    known = next((names for kind, names in config.results.items() if kind.takes_command), ())
     if not known:
         raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
     return known

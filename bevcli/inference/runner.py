@@ -131,8 +131,8 @@ class Runner:
                 self.clock.mark("map_merging")
             else:
                 results.append(decoded)
-        results_with_command = with_command(tuple(results), self.options.commands, frame)
-        return {"boxes": boxes, "results": results_with_command, "segmentation": segmentation}
+        shown = with_command(tuple(results), self.options.commands, frame)
+        return {"boxes": boxes, "results": shown, "segmentation": segmentation}
 
     def frames(
         self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor

@@ -1,8 +1,7 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError
@@ -16,8 +15,9 @@ from bevcli.model.fpn import FPN
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.segmentation import SegmentationHead
-from bevcli.model.step import FrameTruth, ModelOutputs
+from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
+from bevcli.model.tensors import without_autocast
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -58,25 +58,13 @@ class Network(TemporalModel):
 
     def detect(self, bev: Tensor) -> ModelOutputs:
         """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""
-        # In float32: half precision is too coarse for the refinement of boxes. PyTorch has no autocast for "meta".
-        with torch.autocast("cpu" if bev.is_meta else bev.device.type, enabled=False):
+        # In float32: half precision is too coarse for the refinement of boxes.
+        with without_autocast(bev.device):
             class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return ModelOutputs(bev, class_logits, box_codes, segmentation)
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        """The weighted scalar losses, by name, of heads that make `ModelConfig.results`; by default none.
-
-        Args:
-            outputs: of B frames.
-            truths: B, with places at `ModelConfig.future_times_s`.
-            matches: of each frame the queries that the detection loss matches to boxes, and the indices of these.
-        """
-        return {}
 
 
 def build_network(config: ModelConfig) -> Network:

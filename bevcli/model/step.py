@@ -10,9 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, MapLines
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.frame import Frame
+from bevcli.geometry.transforms import Pose
 from bevcli.model.camera_assignment import CameraAssignment
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import ego_motion_inputs
@@ -113,24 +112,6 @@ class ModelOutputs:
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()
         logits, codes = self.class_logits[-1:], self.box_codes[-1:]
         return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
-
-
-@dataclass(frozen=True)
-class FrameTruth:
-    """The ground truth of one frame, bev frame.
-
-    Attributes:
-        boxes: the G boxes to be found, each with one future of T steps; NaN from the step on in which the object is
-            not there.
-        lines: of the map.
-        driven: (T, 2) places where the vehicle was at the same times, metres; NaN after the end of the scene.
-        command: the driver's command that the driven path follows; "" where no place is known.
-    """
-
-    boxes: Boxes3D
-    lines: MapLines
-    driven: Array
-    command: str
 
 
 def model_inputs(

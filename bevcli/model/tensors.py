@@ -1,11 +1,18 @@
-"""The tensors in nested tuples, lists and dataclasses."""
+"""The tensors in nested tuples, lists and dataclasses; and where they are computed in float32."""
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any
 
+import torch
 from torch import Tensor
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[object]:
+    """Inside, nothing is cast to half precision: it is too coarse for the refinement of boxes."""
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
 def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:

@@ -1,13 +1,14 @@
 """Writes frames and predictions into a rerun recording (.rrd).
 
-    writer          the class `Recording`; its settings are in `options`, its file in `rrd_file`
+    writer          the class `Recording` and its file; its settings are in `options`
     entities        the entity paths, shared with the viewer
     blueprint       the layout of the views and the order of the cameras
-    log_static      all that is written once: rig, vehicle (`vehicle`), range rings, pillars, legend, the page "About"
-    log_cameras     one camera's pose, image and overlays; `box_lines` projects boxes and places their labels
-    log_boxes       boxes and ground truth in 3D, from above and on the street map; misses and false positives
-    log_tracks      a trail for each track
-    log_bev         BEV features as images, segmentation, history, probed cells
+    frame_log       all that is written about a frame, in order
+    log_static      all that is written once: rig, vehicle, range rings, pillars, legend, the page "About"
+    log_cameras     one camera's pose, image and overlays; boxes in its image, with labels
+    log_boxes       boxes and ground truth in 3D, from above and on the street map; misses, false positives, trails
+    log_bev         BEV features as images, segmentation, history, probed cells, lines on the ground
+    meshes          the vehicle, and meshes of classes; `mesh_file` reads them
     components      the rows of all these as Arrow arrays
     colors          the colours of classes and states
 

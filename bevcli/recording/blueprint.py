@@ -7,14 +7,22 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevcli.frame import FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.ground_lines import KINDS
-from bevcli.recording.log_static import legend_entries, legend_size
-from bevcli.recording.recorded import Recorded, frame_rate_hz
+from bevcli.recording.log_static import Recorded, legend_entries, legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
+HIDDEN = rrb.EntityBehavior(visible=False)
+EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
+VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
+WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
+TITLE_HEIGHT = 24  # pixels of a view's title
+TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
+CAMERAS_WIDTH = WINDOW[0] * (1 - TEXTS_SHARE)
+LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
+MAP_ZOOM = 17.0
 
 
 def camera_rows(rig: CameraRig) -> tuple[tuple[str, ...], ...]:
@@ -49,17 +57,6 @@ def rows_by_yaw(yaws: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
     ahead = sorted((name for name, yaw in yaws.items() if abs(yaw) <= SIDEWAYS), key=lambda name: -yaws[name])
     back = sorted(yaws.keys() - set(ahead), key=lambda name: yaws[name] % (2 * np.pi))
     return tuple(tuple(row) for row in (ahead, back) if row)
-
-
-HIDDEN = rrb.EntityBehavior(visible=False)
-EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
-VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
-WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
-TITLE_HEIGHT = 24  # pixels of a view's title
-TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
-CAMERAS_WIDTH = WINDOW[0] * (1 - TEXTS_SHARE)
-LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
-MAP_ZOOM = 17.0
 
 
 class Layout(rrb.Blueprint):
@@ -108,6 +105,13 @@ def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:
     )
 
 
+def frame_rate_hz(stamps: tuple[FrameStamp, ...]) -> float:
+    """Frames per second: 1 / the median time between frames; 2 where there are less than two frames."""
+    steps = np.diff([stamp.timestamp_ns for stamp in stamps])
+    steps = steps[steps > 0]
+    return float(1e9 / np.median(steps)) if len(steps) else 2.0
+
+
 def camera_row_shares(rig: CameraRig) -> list[float]:
     """The share of the window's height of each row of cameras: images are as wide in all rows as in the longest one."""
     rows = camera_rows(rig)
@@ -118,13 +122,13 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
 
 
 def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
-    drawn_in_images, names = ("boxes", "ground_truth", "pillars", "probes", *KINDS), recorded.drive.rig.names
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in names for kind in drawn_in_images]
+    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", *entities.line_kinds())
+    overlays = [entities.overlay(name, kind) for name in recorded.drive.rig.names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
-        contents=[f"/{entities.WORLD}/**", *excluded],
+        contents=[f"/{entities.WORLD}/**", *(f"- /{overlay}/**" for overlay in overlays)],
         name=f"3D scene{titled}",
         background=list(BACKGROUND),
         line_grid=False,

@@ -36,18 +36,11 @@ OTHER_MAP_COLORS: tuple[Color, ...] = (
     (85, 45, 20), (90, 125, 80), (75, 40, 80), (65, 70, 20), (35, 55, 100), (125, 85, 80), (20, 80, 55), (90, 40, 55),
 )  # fmt: skip
 BACKGROUND: Color = (18, 20, 25)
-# Bright, because lines of the map are thin.
-LINE_COLORS: dict[str, Color] = {
-    "divider": (250, 225, 120),
-    "ped_crossing": (205, 140, 255),
-    "boundary": (90, 225, 130),
-}
-OTHER_LINE_COLORS: tuple[Color, ...] = ((120, 170, 255), (255, 170, 120), (160, 235, 225), (235, 150, 205))
 
 
 def class_colors(classes: Iterable[ObjectClass]) -> dict[str, Color]:
     """The colours of a model's classes, in their order. A class without a colour takes one by its index."""
-    return {one.name: one.color or index_color(index) for index, one in enumerate(classes)}
+    return {object_class.name: object_class.color or index_color(index) for index, object_class in enumerate(classes)}
 
 
 def index_color(index: int) -> Color:
@@ -62,11 +55,6 @@ def map_colors(
     """Map class -> colour, in the order of the classes. Classes that are not in `named` take `others` in turn."""
     rest = cycle(others)
     return {name: named[name] if name in named else next(rest) for name in classes}
-
-
-def line_colors(classes: Iterable[str]) -> dict[str, Color]:
-    """Class of map lines -> colour, in the order of the classes."""
-    return map_colors(classes, LINE_COLORS, OTHER_LINE_COLORS)
 
 
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:

@@ -40,20 +40,18 @@ def components(archetype: Any, **fields: Any) -> Components:
     type, an array of numbers (colours as `packed` takes or returns them), a list of texts, or whatever rerun takes. A
     value that can be hashed is converted once.
     """
-    found: Components = []
+    batches: Components = []
     for name, value in fields.items():
         if value is not None:
             descriptor, kind = _field(archetype, name)
-            found.append(_Component(_converted(archetype, name, kind, value), descriptor))
-    return found
+            batches.append(_Component(_converted(archetype, name, kind, value), descriptor))
+    return batches
 
 
 def any_values(**values: Any) -> Components:
     """As `rr.AnyValues`, with the same type in every row: arrays of numbers, Arrow arrays, or single values."""
-    return [
-        _Component(value if isinstance(value, pa.Array) else pa.array(np.atleast_1d(value)), _plain(name))
-        for name, value in values.items()
-    ]
+    arrays = {name: v if isinstance(v, pa.Array) else pa.array(np.atleast_1d(v)) for name, v in values.items()}
+    return [_Component(array, rr.ComponentDescriptor(name)) for name, array in arrays.items()]
 
 
 @lru_cache(maxsize=64)
@@ -86,11 +84,6 @@ def rgb_format(width: int, height: int) -> pa.Array:
 def _field(archetype: Any, name: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     (batch,) = archetype.from_fields(**{name: []}).as_component_batches()
     return batch.component_descriptor(), batch.as_arrow_array().type
-
-
-@cache
-def _plain(name: str) -> rr.ComponentDescriptor:
-    return rr.ComponentDescriptor(name)
 
 
 def _converted(archetype: Any, name: str, kind: pa.DataType, value: Any) -> pa.Array:

@@ -2,11 +2,13 @@
 
 `world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
 in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and
-longitudes, where the drive states its place on Earth. Lines on the ground of one of
-`bevcli.recording.ground_lines.KINDS` are directly below `world` and `bev`, such as "bev/map_lines".
+longitudes, where the drive states its place on Earth. Lines on the ground are directly below `world` and `bev`, by
+their kind (`line_kinds`), such as "bev/map_lines".
 """
 
 import rerun as rr
+
+from bevcli.registry import entries
 
 WORLD = "world"
 EGO = "world/ego"
@@ -52,6 +54,7 @@ SPEED_CURVE = "curves/speed"
 LEGEND = "legend"
 EVENTS = "events"
 RUN = "run"
+FUTURES = "futures"  # a kind of lines on the ground
 
 FRAME_TIMELINE = "frame"
 TIME_TIMELINE = "time"
@@ -79,6 +82,11 @@ def class_mesh(class_name: str) -> str:
 
 def overlay(name: str, kind: str) -> str:
     """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars", "probes",
-    or one of `bevcli.recording.ground_lines.KINDS`.
+    or a kind of lines on the ground.
     """
     return f"{camera(name)}/{kind}"
+
+
+def line_kinds() -> tuple[str, ...]:
+    """The last parts of the entities of lines on the ground, such as "map_lines"."""
+    return (*entries("bevcli.results"), FUTURES)

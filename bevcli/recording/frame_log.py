@@ -9,19 +9,17 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
-from bevcli.recording.box_lines import box_labels
-from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.components import any_values, components, packed
-from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
-from bevcli.recording.log_bev import BevColors, BevImages
-from bevcli.recording.log_cameras import CameraImages, PosedCamera
-from bevcli.recording.log_tracks import TrackHistory, log_tracks
-from bevcli.recording.recorded import WARNINGS, Recorded
+from bevcli.recording.components import any_values, components
+from bevcli.recording.log_bev import BevColors, BevImages, future_lines, log_ground_lines
+from bevcli.recording.log_boxes import TrackHistory, log_tracks
+from bevcli.recording.log_cameras import CameraImages, PosedCamera, box_labels
+from bevcli.recording.log_static import WARNINGS, Recorded
+from bevcli.recording.meshes import log_class_meshes
 
 PosedCameras = tuple[PosedCamera, ...]
 
@@ -53,7 +51,7 @@ class FrameLog:
         self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
-        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # positions (cells, Z, 3), and packed colours
+        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
         self._object_classes = recorded.model.config.object_classes
         self._images = CameraImages(stream, as_video=self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
@@ -175,7 +173,7 @@ class FrameLog:
         stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
     def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
-        """Writes lines of the map, futures and planned paths of a model that has further results."""
+        """Writes the results and futures of a model that has further results."""
         kinds = self._recorded.model.config.results
         if not kinds:
             return
@@ -183,17 +181,19 @@ class FrameLog:
         moved = Pose.from_matrix(self._moved_to_origin(prediction.world_from_ego.matrix))
         ground = replace(prediction.ground, world_from_ego=moved)
         shown = prediction.boxes.scored(score).transformed(world_from_bev)
-        of_results = result_lines(prediction.results, ground, kinds, score)
-        for lines in (*of_results, future_lines(shown, self._recorded.classes)):
-            log_ground_lines(self._stream, lines, world_from_bev, cameras)
+        for kind, names in kinds.items():
+            result = result_of(kind, prediction.results)
+            lines = GroundLines() if result is None else result.drawn(ground, names, score)
+            log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+        futures = future_lines(shown, self._recorded.classes)
+        log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
     def _log_ground_truth(
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
         colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
-        log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
-        log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
+        log_boxes.log_ground_truth(self._stream, in_world, truth, found, colors)
         log_cameras.log_ground_truth_in_images(self._stream, cameras, in_world, colors)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
@@ -228,11 +228,10 @@ class FrameLog:
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            drawn = log_static.drawn_pillars(prediction.grid, all_cells=self._options.level == "full")
-            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, drawn)
-            self._pillars = drawn, packed(log_static.pillar_colors(prediction.grid, len(drawn)))
+            grid, all_cells = prediction.grid, self._options.level == "full"
+            self._pillars = log_static.log_pillars(self._stream, grid, prediction.ego_from_bev, all_cells=all_cells)
         pillars, colors = self._pillars
-        points = apply(self._world_from_bev(prediction), pillars.reshape(-1, 3))
+        points = apply(self._world_from_bev(prediction), pillars)
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)

@@ -1,6 +1,10 @@
-"""Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
+"""Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map, and the trails of their tracks.
+
+It finds misses and duplicates.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,12 +14,11 @@ from numpy.typing import NDArray
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_greedily
+from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
+from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
-from bevcli.recording.box_lines import labels_in_scene
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,
     EGO_COLOR,
@@ -26,9 +29,18 @@ from bevcli.recording.colors import (
     Color,
     index_color,
 )
-from bevcli.recording.components import any_values, components, line_strips, ui_points
+from bevcli.recording.components import Components, any_values, components, line_strips, ui_points
+from bevcli.recording.log_cameras import labels_in_scene
 
 MATCH_DISTANCE_M = DetectionConfig().error_distance_m
+MOVING_M_S = 0.5  # slower objects get no velocity arrow
+THIN, THICK = ui_points(0.8), ui_points(1.6)
+PAST_S = 5.0  # length of a trail
+AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
+LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
+PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
+ABOVE_GROUND_M = 0.05
+TRAIL_WIDTH = ui_points(1.2)
 
 
 def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
@@ -90,10 +102,6 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     return is_true, is_found
 
 
-MOVING_M_S = 0.5  # slower objects get no velocity arrow
-THIN, THICK = ui_points(0.8), ui_points(1.6)
-
-
 def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
     """(N, 3) uint8 RGB: the colour of each box's class."""
     other = index_color(len(classes))
@@ -107,17 +115,21 @@ def log_boxes_3d(
 
     boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
-    places = {name: place for place, name in enumerate(classes, 1)}
-    ids = np.array([places.get(name, 0) for name in boxes.classes.tolist()])
+    ids_of_classes = {name: index for index, name in enumerate(classes, 1)}
+    ids = np.array([ids_of_classes.get(name, 0) for name in boxes.classes.tolist()])
     labels = labels_in_scene(boxes, ego_xy)
     row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
-    track = {} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}
+    scored = boxes if boxes.scores is not None else replace(boxes, scores=np.ones(len(boxes)))
+    columns = {column.recorded: getattr(scored, name) for name, column in OPTIONAL_COLUMNS.items() if column.recorded}
     facts = any_values(
-        score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
-        name=_names(boxes),
-        **track,
+        name=_texts(boxes.classes),
+        **{
+            name: _texts(values) if values.dtype.kind == "U" else values
+            for name, values in columns.items()
+            if values is not None
+        },
     )
     stream.log(entities.BOXES, row, facts)
     moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
@@ -142,17 +154,6 @@ def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
-def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the recording's world) into the scene; found and missed ones are two entities.
-
-    found: (M,) bool. colors: (M, 3) uint8.
-    """
-    pale = _with_alpha(colors[found], 150)
-    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
-        row = components(rr.Boxes3D, **_shape(truth[chosen]), colors=color, radii=THIN)
-        stream.log(entity, row, any_values(name=_names(truth[chosen])))
-
-
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, classes)
@@ -171,11 +172,20 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, clas
         stream.log(entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
-def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
+def log_ground_truth(
+    stream: rr.RecordingStream, in_world: Boxes3D, in_bev: Boxes3D, found: np.ndarray, colors: np.ndarray
+) -> None:
+    """Writes ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
+
+    in_world, in_bev: in the recording's world, and in the bev frame. found: (M,) bool. colors: (M, 3) uint8.
+    """
+    pale = _with_alpha(colors[found], 150)
+    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
+        row = components(rr.Boxes3D, **_shape(in_world[chosen]), colors=color, radii=THIN)
+        stream.log(entity, row, any_values(name=_texts(in_world.classes[chosen])))
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = footprints(truth[chosen])
+        strips = footprints(in_bev[chosen])
         stream.log(entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
@@ -205,8 +215,8 @@ def quaternions(boxes: Boxes3D) -> Array:
     return np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)
 
 
-def _names(boxes: Boxes3D) -> pa.Array:
-    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that an empty list is a value too
+def _texts(values: NDArray[np.str_]) -> pa.Array:
+    return pa.array(values.tolist(), pa.utf8())  # typed, so that an empty list is a value too
 
 
 def _marks(boxes: Boxes3D, marks: Marks) -> tuple[tuple[NDArray[np.float32], ...], tuple[Color, ...]]:
@@ -234,3 +244,107 @@ def log_boxes_on_map(
     """Writes the centres of boxes, in the sequence's world frame, in the colours of their classes."""
     places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, classes) if len(boxes) else None
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))
+
+
+@dataclass
+class TrackHistory:
+    """The positions of each track on the ground, kept for PAST_S, and the entities that an interrupted recording needs.
+
+    Attributes:
+        scene: the scene of the last frame; a new scene has new tracks.
+        times_ns: by track, the times of its positions.
+        positions: by track, positions (3,) in the recording's world, the oldest first.
+        shown: the entities that show a track now, sorted.
+    """
+
+    scene: str = ""
+    times_ns: dict[str, list[int]] = field(default_factory=dict)
+    positions: dict[str, list[Array]] = field(default_factory=dict)
+    shown: list[str] = field(default_factory=list)
+
+    def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
+        """Adds the boxes of a frame, in the recording's world; forgets what is too old."""
+        if stamp.scene != self.scene:
+            self.times_ns, self.positions = {}, {}
+        self.scene = stamp.scene
+        for name, foot in zip(track_names(boxes), _feet(boxes), strict=True):
+            if name:
+                self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
+                self.positions.setdefault(name, []).append(foot)
+        for name, times in list(self.times_ns.items()):
+            kept = sum(stamp.timestamp_ns - time <= PAST_S * 1e9 for time in times)
+            self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
+            if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
+                del self.times_ns[name], self.positions[name]
+
+
+def track_names(boxes: Boxes3D) -> list[str]:
+    """The identity of each box's track, "" for a box without one."""
+    if boxes.instances is None:
+        return [""] * len(boxes)
+    return [str(instance) for instance in boxes.instances]
+
+
+def log_tracks(
+    stream: rr.RecordingStream,
+    history: TrackHistory,
+    boxes: Boxes3D,
+    stamp: FrameStamp,
+    bev_from_world: Array,
+    classes: Mapping[str, Color],
+) -> None:
+    """Writes the tracks of a frame, and clears the entities of tracks without a box. Without tracks: nothing.
+
+    history: gets the boxes. boxes: in the recording's world. bev_from_world: (4, 4).
+    """
+    if boxes.instances is None:
+        return
+    # Anew in each scene: the times of a scene may lie before those of the one before.
+    styled = history.shown if stamp.scene == history.scene else []
+    history.add(boxes, stamp)
+    ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
+    shown: set[str] = set()
+    drawn, flat_colors = [], []
+    for i, name in enumerate(track_names(boxes)):
+        if not name:
+            continue
+        entity = entities.track(str(boxes.classes[i]), name)
+        past = np.array(history.positions[name])  # (K, 3)
+        trail = [past] if len(past) > 1 else []
+        own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+        style: Components = []
+        if entity not in styled:  # what stays is written once: its bytes are more than those of the points
+            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
+            style = of_lines + any_values(track=name)
+        strips = line_strips([ahead[i], outlines[i], *trail], 3)
+        stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)
+        shown.add(entity)
+        drawn += [ahead[i], *trail]
+        flat_colors += own_colors[:: 2 if trail else 3]
+    of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
+    flat = apply(bev_from_world, np.concatenate([np.zeros((0, 3)), *drawn]))[:, :2] * (1, -1)
+    strips = line_strips(np.split(flat, np.cumsum([len(strip) for strip in drawn])[:-1]) if drawn else (), 2)
+    trails = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
+    stream.log(entities.BEV_TRACKS, trails)
+    for entity in set(history.shown) - shown:
+        stream.log(entity, rr.Clear(recursive=False))
+    history.shown = sorted(shown)
+
+
+def _feet(boxes: Boxes3D) -> Array:
+    """(N, 3) the points on the ground below the centres."""
+    heights = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2 + ABOVE_GROUND_M
+    return np.column_stack([boxes.centers[:, :2], heights])
+
+
+def _ahead(boxes: Boxes3D) -> Array:
+    """(N, 2, 3) from the place on the ground to the one a second later."""
+    feet = _feet(boxes)
+    steps = np.column_stack([np.nan_to_num(boxes.velocities), np.zeros(len(boxes))]) * AHEAD_S
+    return np.stack([feet, feet + steps], axis=1)
+
+
+def _footprints(boxes: Boxes3D) -> Array:
+    """(N, 5, 3) the closed outlines on the ground."""
+    bottoms = boxes.corners()[:, :4] + [0, 0, ABOVE_GROUND_M]
+    return np.concatenate([bottoms, bottoms[:, :1]], axis=1)

@@ -1,13 +1,18 @@
-"""Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
+"""What is recorded, and the static parts: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
+
+from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevcli._version import __version__
-from bevcli.frame import MapLines, Plan
+from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import hex_of_color
@@ -15,7 +20,6 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
 from bevcli.recording import entities
-from bevcli.recording.box_lines import UNSEEN, labels_2d
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,
     EGO_COLOR,
@@ -24,15 +28,22 @@ from bevcli.recording.colors import (
     RING_COLOR,
     STAGE_COLORS,
     Color,
+    class_colors,
     colormap,
-    line_colors,
     map_colors,
 )
-from bevcli.recording.components import components
+from bevcli.recording.components import components, packed
+from bevcli.recording.log_cameras import UNSEEN, labels_2d
 from bevcli.recording.mesh_file import Mesh
-from bevcli.recording.recorded import Recorded
-from bevcli.recording.vehicle import VehicleMesh, default_vehicle
+from bevcli.recording.meshes import VehicleMesh, default_vehicle
+from bevcli.recording.options import RecordingOptions
 
+UNTRAINED = "untrained weights"
+FROM_RENDERED = "trained on renderings"
+WARNINGS = {
+    UNTRAINED: "The weights are UNTRAINED: boxes and maps are meaningless.",
+    FROM_RENDERED: "The weights were trained on rendered streets; these images are not rendered.",
+}
 RING_STEP_M = 10
 DEFAULT_RANGE_M = 50.0  # of the range rings without a model
 FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
@@ -54,6 +65,69 @@ HOW_TO_READ = """\
 - **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
   first: click the eye next to `pillars` in the left panel.
 """
+LEGEND_COLUMNS = 2
+COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
+TEXT_COLOR: Color = (225, 228, 235)
+
+
+class RecordedModel(Protocol):
+    """The facts about a model that go into a recording."""
+
+    @property
+    def config(self) -> ModelConfig:
+        """The model's configuration; its name and its classes are written."""
+
+    @property
+    def untrained(self) -> bool:
+        """True for random weights. Then titles, events and the page "About" say so."""
+
+    @property
+    def bundled(self) -> bool:
+        """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
+
+
+class RecordedDrive(Protocol):
+    """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
+
+    name: str
+    rig: CameraRig
+    has_ego_motion: bool
+    facts: DriveFacts
+
+    @property
+    def stamps(self) -> tuple[FrameStamp, ...]:
+        """The frames that are known in advance; their rate is written."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A drive, the model that runs on it, and how much of both a recording holds."""
+
+    drive: RecordedDrive
+    model: RecordedModel
+    options: RecordingOptions
+
+    @property
+    def title(self) -> str:
+        """The names of the drive and of the model."""
+        return f"{self.drive.name} · {self.model.config.name}"
+
+    @property
+    def note(self) -> str:
+        """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
+        if self.model.untrained:
+            return UNTRAINED
+        return FROM_RENDERED if self.model.bundled and not self.drive.facts.rendered else ""
+
+    @cached_property
+    def classes(self) -> Mapping[str, Color]:
+        """The model's classes and their colours."""
+        return class_colors(self.model.config.object_classes.values())
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that is written; none without a map."""
+        return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
 
 
 def log_scene(
@@ -79,6 +153,7 @@ def log_scene(
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     """Writes the page "About", and the facts of the run that readers of the file need."""
+    cameras, untrained = recorded.drive.rig.names, recorded.model.untrained
     maps, lines = recorded.map_classes, line_entries(recorded.model.config)
     of_map: dict[str, Any] = {"map_classes": list(maps)} if maps else {}
     if lines:
@@ -86,27 +161,21 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
         of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
     facts = rr.AnyValues(
         title=recorded.title,
-        untrained=recorded.model.untrained,
+        untrained=untrained,
         note=recorded.note,
         score=recorded.options.score,
         class_names=list(recorded.classes),
         class_colors=list(map(hex_of_color, recorded.classes.values())),
-        camera_names=list(recorded.drive.rig.names),
+        camera_names=list(cameras),
         **of_map,
     )
-    page = rr.TextDocument(_about_text(recorded), media_type="text/markdown")
-    stream.log(entities.RUN, page, facts, static=True)
-
-
-def _about_text(recorded: Recorded) -> str:
-    """The page "About" in Markdown: the run, and how to read the views."""
-    names, untrained = recorded.drive.rig.names, recorded.model.untrained
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
-    facts = (
-        f"bevcli {__version__}; {counted(len(names), 'cameras')}: {', '.join(names)}. "
+    summary = (
+        f"bevcli {__version__}; {counted(len(cameras), 'cameras')}: {', '.join(cameras)}. "
         f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
     )
-    return f"# {recorded.title}\n\n{warning}{facts}\n{HOW_TO_READ}"
+    page = rr.TextDocument(f"# {recorded.title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
+    stream.log(entities.RUN, page, facts, static=True)
 
 
 def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
@@ -126,26 +195,21 @@ def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
     stream.log(entities.SPEED, components(rr.Points3D, positions=np.array([SPEED_LABEL_M]), **facts))
 
 
-def drawn_pillars(grid: BevGrid, *, all_cells: bool = False) -> Array:
-    """The pillars to draw: (cells, Z, 3) 3D reference points in the bev frame, metres.
+def log_pillars(
+    stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, *, all_cells: bool
+) -> tuple[Array, NDArray[np.uint32]]:
+    """Writes the 3D reference points of the grid's pillars into the scene, coloured by height from blue to red.
 
-    At most PILLARS_PER_SIDE along each side of the grid, evenly spaced, unless `all_cells`.
+    At most PILLARS_PER_SIDE pillars along each side of the grid, evenly spaced, unless `all_cells`.
+
+    Returns the points (K, 3) in the bev frame, and their colours (K,) of `packed`.
     """
     steps = [1 if all_cells else max(1, -(-side // PILLARS_PER_SIDE)) for side in (grid.rows, grid.columns)]
-    pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]]
-    return pillars.reshape(-1, grid.pillar_points, 3)
-
-
-def log_pillars(stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, pillars: Array) -> None:
-    """Writes pillars (cells, Z, 3), in the bev frame, into the scene, coloured by height."""
-    points = apply(ego_from_bev, pillars).reshape(-1, 3)
-    colors = pillar_colors(grid, len(pillars))
+    pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]].reshape(-1, grid.pillar_points, 3)
+    of_pillar = colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo")
+    colors, points = np.tile(of_pillar, (len(pillars), 1)), apply(ego_from_bev, pillars).reshape(-1, 3)
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-
-
-def pillar_colors(grid: BevGrid, cells: int) -> np.ndarray:
-    """(cells * Z, 3) uint8 RGB: the lowest point of each pillar is blue, the highest red."""
-    return np.tile(colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo"), (cells, 1))
+    return pillars.reshape(-1, 3), packed(colors)
 
 
 def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
@@ -205,11 +269,6 @@ def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     return points[:, :2] * (1, -1)
 
 
-COLUMNS = 2
-COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
-TEXT_COLOR: Color = (225, 228, 235)
-
-
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
@@ -220,20 +279,18 @@ def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
 
 def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds."""
-    of_map = line_colors(config.results.get(MapLines, ()))
-    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in of_map.items()]
-    plans = [("planned path", EGO_COLOR)] if Plan in config.results else []
-    return [*lines, *plans, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
+    of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
+    return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:
     """Width and height of the legend with this number of entries, in the units of its view."""
-    return COLUMNS * COLUMN_WIDTH, -(-entries // COLUMNS) * ROW_HEIGHT
+    return LEGEND_COLUMNS * COLUMN_WIDTH, -(-entries // LEGEND_COLUMNS) * ROW_HEIGHT
 
 
 def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
     """Writes the legend: a filled circle and a text for each entry, in columns."""
-    rows = -(-len(entries) // COLUMNS)
+    rows = -(-len(entries) // LEGEND_COLUMNS)
     places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
     texts, colors = [text for text, _ in entries], [color for _, color in entries]
     circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import MIB, read_bytes
-from bevcli.parsing.own_process import run_python
+from bevcli.parsing.files import MIB, read_bytes, run_python
 from bevcli.printing import reason_of
 from bevcli.recording.colors import EGO_COLOR, Color
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from bevcli.errors import InputError
+from bevcli.errors import BevcliError, InputError
 from bevcli.options import option, options
 
 Images = Literal["jpeg", "av1"]
@@ -21,6 +21,21 @@ def parse_position(text: str) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)') from None
     return x, y
+
+
+def require_av(purpose: str) -> None:
+    """Raises BevcliError, which says how to install it, if PyAV is missing. purpose: begins the message."""
+    if not has_av():
+        raise BevcliError(f"{purpose}: PyAV is not installed: pip install 'bevcli[video]'")
+
+
+def has_av() -> bool:
+    """True if PyAV can be imported."""
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 @options("Recording")
@@ -74,8 +89,6 @@ class RecordingOptions:
         if self.images not in ("jpeg", "av1"):
             raise InputError(f'`images`: unknown format "{self.images}" (expected jpeg or av1)')
         if self.images == "av1":
-            from bevcli.recording.video_images import require_av  # imports NumPy
-
             require_av('`images="av1"`')
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
             raise InputError(f"`vehicle_mesh={self.vehicle_mesh}`: there is no such file")

@@ -15,18 +15,16 @@ from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.parsing.files import is_there
-from bevcli.rig.coverage import Coverage
-from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
+from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_camera_times, check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
+from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.format import FORMAT as NATIVE
 from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.formats.ros.format import is_ros_bag
 from bevcli.writing import write_whole
-
-_Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
 
 
 @dataclass(frozen=True)
@@ -103,19 +101,25 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    if is_ros_bag(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
+    if _is_other_drive(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
         return _check_other_sequence(path, frame, options)
     file = path / CALIBRATION if path.is_dir() else path
     draft = draft_calibration(file)
-    if folder is not None and is_ros_bag(folder):
+    if folder is not None and _is_other_drive(folder):
         return _check_other_sequence(folder, frame, {**options, "calibration": file})
     if folder is None and path.is_dir():
         folder = path
-    found: _Found = ((), {})
+    of_drive: tuple[Finding, ...] = ()
+    images: Mapping[str, NDArray[np.uint8]] = {}
     if folder is not None and draft.rig.cameras:
-        found = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
+        of_drive, images = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
     name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
-    return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), found[0]), found[1])
+    return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), of_drive), images)
+
+
+def _is_other_drive(path: Path) -> bool:
+    """True for a drive that is not a native folder, such as a bag."""
+    return is_drive(path) and format_of(path) is not NATIVE
 
 
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
@@ -132,15 +136,16 @@ def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
 
 
 def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationCheck:
-    """A sequence that is not a native folder, such as a nuScenes root or a bag, read as `bevcli run` reads it."""
     sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
     report = with_findings(check_rig(shown.rig), _missing_images(shown))
     return CalibrationCheck(sequence.name, shown.rig, report, _pixels(shown))
 
 
-def _read_folder(folder: Path, rig: CameraRig, frame: int, allow_outside: bool) -> _Found:
-    """The findings about a native folder, and the images of one of its frames."""
+def _read_folder(
+    folder: Path, rig: CameraRig, frame: int, allow_outside: bool
+) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
+    """The findings about a native folder, and the images by camera of one of its frames."""
     findings: list[Finding] = []
     options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=allow_outside)
     try:

@@ -1,4 +1,7 @@
-"""cameras.png: all cameras' images with their overlay around the coverage map. coverage.png: the map alone."""
+"""cameras.png: all images with pillars, ground grid and horizon, around the coverage map. coverage.png: the map alone.
+
+The overlay is drawn as the calibration projects it.
+"""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -13,15 +16,140 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from bevcli.findings import Finding
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.transforms import apply, inverse
-from bevcli.rig.coverage import Coverage
-from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
-from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Pixels, draw_overlay, height_colors
-from bevcli.rig.rig_report import RigReport
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.recording.colors import Color, colormap
+from bevcli.rig.pose_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
+from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
 from bevcli.writing import whole_file
+
+GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
+PILLAR_LINES_M = 25.0  # lines of farther pillars would be too dense
+PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m; a denser grid would hide the image
+LABELLED_M = (5.0, 10.0, 20.0, 40.0)
+GROUND: Color = (120, 205, 140)
+HORIZON: Color = (255, 214, 64)
+PILLAR: Color = (235, 238, 245)
+BACKDROP: Color = (44, 49, 58)
+Pixels = NDArray[np.uint8]
+
+
+def pillars_in(camera: Camera, ego_from_bev: Array) -> tuple[Array, Array, NDArray[np.uint8]]:
+    """The M pillar points that are inside the camera's image, the farthest first. ego_from_bev: (4, 4).
+
+    Returns pixels (M, 2), distances (M,) in metres, and RGB (M, 3) by height.
+    """
+    points = apply(ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
+    pixels = pixels_in_image(camera, points)
+    distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
+    colors = np.tile(height_colors(), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
+    order = np.argsort(-distances)
+    order = order[np.isfinite(pixels[order]).all(-1)]
+    return pixels[order], distances[order], colors[order]
+
+
+def height_colors() -> NDArray[np.uint8]:
+    """(Z, 3) RGB, the colours of a pillar's points, the lowest first."""
+    return colormap(np.linspace(0.12, 0.9, PILLAR_GRID.pillar_points), "turbo")
+
+
+def ground_lines(camera: Camera) -> list[Array]:
+    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, cut near the image border."""
+    along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
+    lines: list[Array] = []
+    for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
+        across, flat = np.full_like(along, offset), np.zeros_like(along)
+        for line in (np.stack([along, across, flat], axis=-1), np.stack([across, along, flat], axis=-1)):
+            lines += visible_runs(_near_image(camera, line))
+    return lines
+
+
+def pillar_lines(camera: Camera, ego_from_bev: Array) -> list[Array]:
+    """Lines (P, 2) in pixels from the lowest to the highest point of each pillar within 25 m."""
+    pillars = PILLAR_GRID.pillars().reshape(-1, PILLAR_GRID.pillar_points, 3)
+    low, high = pillars[:, :1], pillars[:, -1:]
+    points = apply(ego_from_bev, low + np.linspace(0, 1, 24)[:, None] * (high - low))  # (Y X, 24, 3)
+    near = np.linalg.norm(points[:, 0, :2] - camera.ego_from_camera[:2, 3], axis=-1) < PILLAR_LINES_M
+    return [run for line in points[near] for run in visible_runs(_near_image(camera, line))]
+
+
+def _near_image(camera: Camera, points_ego: Array) -> Array:
+    """Points (P, 3) in the ego frame -> pixels (P, 2), NaN where they are more than an image size outside the image."""
+    pixels, depth = camera.project_ego(points_ego)
+    size = np.array([camera.width, camera.height])
+    with np.errstate(invalid="ignore"):
+        near = ((pixels > -size) & (pixels < 2 * size)).all(-1) & (depth > 0.1)
+    return np.where(near[:, None], pixels, np.nan)
+
+
+def horizon(camera: Camera) -> Array:
+    """(P, 2) pixels of points 100 km away at the camera's own height; NaN where they are outside the image."""
+    yaws = np.radians(np.arange(0, 360, 0.25))
+    far = np.stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)], axis=-1) * 1e5
+    pixels, depth = camera.project_ego(far + camera.ego_from_camera[:3, 3])
+    seen = np.where(camera.contains(pixels, depth)[:, None], pixels, np.nan)
+    start = int(np.argmax(depth < 0))  # start behind the camera, so that the line is not cut inside the image
+    return np.roll(seen, -start, axis=0)
+
+
+def visible_runs(pixels: Array) -> list[Array]:
+    """A line (P, 2), split where it has NaN, into parts of two points or more."""
+    seen = np.isfinite(pixels).all(-1)
+    cuts = np.flatnonzero(np.diff(seen.astype(int))) + 1
+    return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
+
+
+def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, width: int) -> Pixels:
+    """The camera's image with the overlay, (h, width, 3) RGB.
+
+    image_bgr: (H, W, 3); a dark image is used where it is None. width: of the result, pixels.
+    """
+    shown = camera.scaled(width / camera.width)
+    if image_bgr is None:
+        canvas = np.full((shown.height, shown.width, 3), BACKDROP, dtype=np.uint8)
+    else:
+        resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
+        canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
+    _blend_lines(canvas, ground_lines(shown), GROUND, 0.55)
+    _blend_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
+    _blend_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
+    for pixel, distance, color in zip(*pillars_in(shown, ego_from_bev), strict=True):
+        radius = float(np.clip(60 / distance, 1.2, 6)) * (width / 800)
+        center = tuple(np.round(pixel * 16).astype(int).tolist())
+        cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
+    _draw_distances(canvas, shown)
+    return canvas
+
+
+def draw_lines(canvas: Pixels, lines: list[Array], color: Color, thickness: int) -> None:
+    """Draw lines (P, 2) in pixels on an image (H, W, 3), in place."""
+    points = [np.round(line * 16).astype(np.int32) for line in lines]
+    cv2.polylines(canvas, points, False, color, thickness, cv2.LINE_AA, 4)
+
+
+def _blend_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
+    layer = canvas.copy()
+    draw_lines(layer, lines, color, thickness)
+    cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
+
+
+def _draw_distances(canvas: Pixels, camera: Camera) -> None:
+    """Label distances on the ground along the viewing direction, where the labels do not overlap."""
+    ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
+    start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
+    font, size, last = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800, np.inf
+    for distance in LABELLED_M:
+        pixel = pixels_in_image(camera, start + distance * ahead)
+        if np.isfinite(pixel).all() and last - pixel[1] > 22:
+            last = float(pixel[1])
+            corner = (round(pixel[0]), round(pixel[1]))
+            for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
+                cv2.putText(canvas, f"{distance:g} m", corner, font, size, color, thickness, cv2.LINE_AA)
+
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
 SIDE_DEG = (75.0, 105.0)  # cameras with a yaw in this range are placed beside the map
@@ -51,8 +179,8 @@ def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Ma
     tops = GAP + np.cumsum([0.0, *heights[:2]])
     for row, top in ((front, tops[0]), (back, tops[2])):
         start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
-        for place, camera in enumerate(row):
-            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, images)
+        for column_index, camera in enumerate(row):
+            _draw_camera(sheet, (start + column_index * (SLOT + GAP), top), camera, rig, report, images)
     for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
         top = tops[1]
         for camera in column:
@@ -228,12 +356,12 @@ def _draw_vehicle(axes: Axes, rig: CameraRig) -> None:
 
 def _draw_field_of_view(axes: Axes, camera: Camera, rig: CameraRig) -> None:
     bev_from_camera = inverse(rig.ego_from_bev) @ camera.ego_from_camera
-    place, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
+    position, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
     yaw = float(np.degrees(np.arctan2(forward[1], forward[0])))
     for angle in np.radians(yaw - np.array(seen_range_deg(camera, 0))):
-        end = place + 80 * np.array([np.cos(angle), np.sin(angle)])
-        axes.plot([place[0], end[0]], [place[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
-    label = place + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
+        end = position + 80 * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot([position[0], end[0]], [position[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
+    label = position + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
     box = {"facecolor": PAPER, "edgecolor": "none", "alpha": 0.75, "boxstyle": "round,pad=0.25"}
     style: dict[str, Any] = {"color": INK, "fontsize": 8, "ha": "center", "va": "center", "bbox": box}
     axes.text(float(label[0]), float(label[1]), camera.name, zorder=5, clip_on=True, **style)

@@ -15,7 +15,67 @@ import numpy as np
 from bevcli.findings import Finding, rig_error
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
-from bevcli.rig.mounting import mounting_of, seen_fov_deg
+
+_STEP_DEG = 0.1
+_ANGLES = np.radians(np.arange(-90 + _STEP_DEG / 2, 90, _STEP_DEG))
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Position and angles of a camera in the ego frame."""
+
+    position: Array  # (3,), metres
+    yaw_deg: float  # viewing direction, counter-clockwise from straight ahead
+    pitch_deg: float  # positive upwards
+    roll_deg: float  # positive when the camera leans to its right; 180 is upside down
+
+    @property
+    def height(self) -> float:
+        """Height above the ground plane of the ego frame, metres."""
+        return float(self.position[2])
+
+
+def mounting_of(ego_from_camera: Array) -> Mounting:
+    """The mounting of a camera with this pose (4, 4)."""
+    right, down, forward = ego_from_camera[:3, 0], ego_from_camera[:3, 1], ego_from_camera[:3, 2]
+    return Mounting(
+        position=ego_from_camera[:3, 3],
+        yaw_deg=float(np.degrees(np.arctan2(forward[1], forward[0]))),
+        pitch_deg=float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1)))),
+        roll_deg=float(np.degrees(np.arctan2(-right[2], -down[2]))),
+    )
+
+
+def degrees_text(angle_deg: float, digits: int = 1) -> str:
+    """An angle as text, such as "0.4°"; zero has no sign."""
+    return f"{round(angle_deg, digits) + 0.0:.{digits}f}°"
+
+
+def seen_fov_deg(camera: Camera) -> tuple[float, float]:
+    """Horizontal and vertical field of view through the optical axis, in degrees, lens distortion included.
+
+    At most 180, because points behind the camera's plane are not projected.
+    """
+    (left, right), (up, down) = seen_range_deg(camera, 0), seen_range_deg(camera, 1)
+    return right - left, down - up
+
+
+def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
+    """Smallest and largest angle to the optical axis that is inside the image, degrees.
+
+    axis: 0 counts angles to the right, 1 downwards. (0, 0) where no ray is inside the image.
+    """
+    rays = np.zeros((len(_ANGLES), 3))
+    rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
+    pixels, _ = camera.project(rays)
+    size = (camera.width, camera.height)[axis]
+    with np.errstate(invalid="ignore"):
+        inside = (pixels[:, axis] > 0) & (pixels[:, axis] < size)
+    seen = np.degrees(_ANGLES[inside])
+    if len(seen) == 0:
+        return 0.0, 0.0
+    return float(seen[0]) - _STEP_DEG / 2, float(seen[-1]) + _STEP_DEG / 2
+
 
 WORDS = {"front": "front", "forward": "front", "fwd": "front", "back": "back", "rear": "back", "backward": "back"}
 # Centre of each sector, degrees counter-clockwise from straight ahead.
@@ -82,8 +142,7 @@ def _contains(words: Sequence[str], word: str) -> bool:
 
 
 def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Finding]]:
-    """Pairs of cameras with the same pose and field of view."""
-    found = []
+    copies = []
     for a, b in combinations(cameras, 2):
         distance = float(np.linalg.norm(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]))
         cosine = np.clip((np.trace(a.ego_from_camera[:3, :3].T @ b.ego_from_camera[:3, :3]) - 1) / 2, -1, 1)
@@ -96,8 +155,8 @@ def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Find
                 f"{distance:.3f} m and {turn:.2f}° apart", "different positions or viewing directions",
                 "one pose is a copy of the other: give each camera its own",
             )  # fmt: skip
-            found.append(((a.name, b.name), finding))
-    return found
+            copies.append(((a.name, b.name), finding))
+    return copies
 
 
 def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> Finding | None:
@@ -106,7 +165,7 @@ def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> 
         return None
     turns = np.exp(1j * np.radians([yaws[name] - named[name] for name in named]))
     turn = float(np.degrees(np.angle(turns.mean())))
-    spread = max(turn_deg(float(np.degrees(np.angle(one))), turn) for one in turns)
+    spread = max(turn_deg(float(np.degrees(np.angle(turned))), turn) for turned in turns)
     if abs(turn) < EGO_TURN_DEG[0] or spread > EGO_TURN_DEG[1]:
         return None
     return rig_error(
@@ -150,7 +209,6 @@ def _swap_finding(moved: Sequence[str], named: Mapping[str, float], yaws: Mappin
 
 
 def _direction_text(yaw_deg: float) -> str:
-    """A direction as text, such as "back left (109°)"."""
     return f"{side_of(yaw_deg)} ({yaw_deg:.0f}°)"
 
 
@@ -241,7 +299,6 @@ def units_per_metre(length: float) -> float:
 
 
 def _defects(camera: Camera) -> list[Finding]:
-    """The implausible properties of a pose, the most severe first."""
     mounting, name = mounting_of(camera.ego_from_camera), camera.name
     (low, high), away_m = HEIGHTS_M, np.hypot(*mounting.position[:2])
     defects = []

@@ -10,7 +10,7 @@ from bevcli.findings import Finding, errors_of, rig_error
 from bevcli.frame import DerivedSequence, FrameStamp, Sequence as Drive
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig.rig_report import rig_errors
+from bevcli.rig.rig_checks import rig_errors
 
 MAX_SPEED = 70.0  # m/s, 250 km/h
 MIN_MOVING_SPEED = 1.0  # m/s; at lower speeds the direction of motion is noise
@@ -60,17 +60,11 @@ def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Drive:
-    """T poses of a drive.
+    """T poses of a drive."""
 
-    Attributes:
-        rotations: (T, 3, 3), world_from_ego.
-        steps: (T-1, 3), from each pose to the next, metres in the world frame.
-        seconds: (T-1,), duration of each step.
-    """
-
-    rotations: Array
-    steps: Array
-    seconds: Array
+    rotations: Array  # (T, 3, 3), world_from_ego
+    steps: Array  # (T-1, 3), from each pose to the next, metres in the world frame
+    seconds: Array  # (T-1,), duration of each step
 
     @property
     def speeds(self) -> Array:
@@ -112,8 +106,11 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
 
 
 def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[Finding, ...]:
-    """Findings of `check_ego_motion` about each scene of a drive."""
-    return tuple(finding for part in _split_by_scene(ego_motion, stamps) for finding in check_ego_motion(part))
+    """Findings of `check_ego_motion` about each scene of a drive: cut midway between frames of different scenes."""
+    changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
+    times = ego_motion.timestamps_ns
+    rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
+    return tuple(f for part in rows if len(part) > 1 for f in check_ego_motion(ego_motion.of_rows(part)))
 
 
 def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence[int | None]]) -> tuple[Finding, ...]:
@@ -123,14 +120,6 @@ def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence
     An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
     """
     return tuple(filter(None, (_check_times_of(name, frame_ns, times) for name, times in camera_ns.items())))
-
-
-def _split_by_scene(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> list[EgoMotion]:
-    """The ego-motion of each scene: cut midway between frames of different scenes, where the pose may jump."""
-    changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
-    times = ego_motion.timestamps_ns
-    rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
-    return [ego_motion.of_rows(part) for part in rows if len(part) > 1]
 
 
 def _drive(ego_motion: EgoMotion) -> _Drive:

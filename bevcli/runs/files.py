@@ -1,11 +1,8 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
 import contextlib
-import hashlib
 import json
-import sys
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,14 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bevcli.config import as_table
-from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.formats.csv_table import CsvWriter
-from bevcli.evaluation.formats.nuscenes import SubmissionWriter
-from bevcli.frame import Frame, MapLines, Plan, Prediction, Sequence
+from bevcli.errors import OutputError
+from bevcli.evaluation.box_format import CsvWriter
+from bevcli.evaluation.submission import SubmissionWriter
+from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
@@ -29,55 +25,11 @@ from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibrati
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
-from bevcli.viewer.recording_file import restore_index
-from bevcli.workshop.vad.lines_file import LinesWriter
-from bevcli.workshop.vad.plan_file import PlanWriter
 from bevcli.writing import whole_file, write_whole
 
-BEV = "BEV features"
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
-BLOCK = 1 << 20  # bytes
 Growing = TypeVar("Growing", bound=GrowingFile)
-ResultWriter = LinesWriter | PlanWriter
-RESULT_WRITERS: Mapping[type, type[ResultWriter]] = {MapLines: LinesWriter, Plan: PlanWriter}  # by the type of results
-
-
-@dataclass(frozen=True)
-class Kept:
-    """The bytes of a file, or of the files of all frames one after the other, that a state keeps: size and SHA-256."""
-
-    size: int
-    sha256: str
-
-
-class _Growing:
-    """The hash of a file's bytes, computed as it grows, and of files of single frames."""
-
-    def __init__(self) -> None:
-        self._size, self._hash = 0, hashlib.sha256()
-
-    def add(self, path: Path) -> None:
-        """Hash one more file; a missing one has no bytes."""
-        self._hash_from(path, 0, sys.maxsize)
-
-    def up_to(self, path: Path, size: int) -> Kept:
-        """What the file holds in its first `size` bytes; fewer if it is shorter."""
-        self._hash_from(path, self._size, size)
-        return self.kept
-
-    def _hash_from(self, path: Path, start: int, size: int) -> None:
-        """Hash a regular file from a place on, until `size` bytes are hashed. A pipe or a device has no bytes."""
-        with contextlib.suppress(OSError, InputError), open_regular(path) as file:
-            file.seek(start)
-            while self._size < size and (block := file.read(min(BLOCK, size - self._size))):
-                self._hash.update(block)
-                self._size += len(block)
-
-    @property
-    def kept(self) -> Kept:
-        """What was hashed so far."""
-        return Kept(self._size, self._hash.hexdigest())
 
 
 @dataclass(frozen=True)
@@ -87,14 +39,12 @@ class FilesState:
     Attributes:
         recording: of recording.rrd.
         sizes: name -> bytes of each other file that grows.
-        kept: what each file holds, by its name; the files of single frames by the name of their folder.
         map_frames: indices of the frames that have a map.
         bev_frames: indices of the frames that have BEV features.
     """
 
     recording: RecordingState
     sizes: Mapping[str, int]
-    kept: Mapping[str, Kept]
     map_frames: tuple[int, ...]
     bev_frames: tuple[int, ...]
 
@@ -123,12 +73,11 @@ class RunFiles:
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
-        self._results: dict[type[Any], ResultWriter] = {}
-        self._growing: defaultdict[str, _Growing] = defaultdict(_Growing)  # by the names of `FilesState.kept`
+        self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
         self._map_frames = [] if resume is None else list(resume.map_frames)
         self._bev_frames = [] if resume is None else list(resume.bev_frames)
         if resume is not None:
-            self._check_kept(resume)
+            self._check_files(resume)
 
     def __enter__(self) -> "RunFiles":
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
@@ -152,9 +101,8 @@ class RunFiles:
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
             for kind, names in config.results.items():
-                write: Callable[..., ResultWriter] = RESULT_WRITERS[kind]
                 facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
-                self._results[kind] = self._open(RESULT_WRITERS[kind].file_name, write, **facts)
+                self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
             if resume is not None and SUBMISSION in resume.sizes:
                 self._submission = self._open(SUBMISSION, SubmissionWriter)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
@@ -168,6 +116,8 @@ class RunFiles:
     def __exit__(self, *raised: Any) -> None:
         self._stack.__exit__(*raised)
         if self._resume is not None and self._is_complete:  # else its bytes must stay for the next resume
+            from bevcli.viewer.recording_file import restore_index
+
             restore_index(self._out / RECORDING)
 
     def write(self, frame: Frame, prediction: Prediction) -> None:
@@ -177,11 +127,9 @@ class RunFiles:
             self._folder.add(map_path(maps, frame.stamp.index))
             write_map(maps, frame.stamp.index, prediction.segmentation)
             self._map_frames.append(frame.stamp.index)
-            self._growing[SEGMENTATION].add(map_path(maps, frame.stamp.index))
         if self._options.save_bev is not None and prediction.bev is not None:
             _save_bev(self._options.save_bev, prediction, self._model)
             self._bev_frames.append(frame.stamp.index)
-            self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
         boxes = self._boxes_of(frame, prediction)
         if self._tracks is not None:
@@ -193,7 +141,7 @@ class RunFiles:
             self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
-            writer.write(ground, next((result for result in prediction.results if isinstance(result, kind)), None))
+            writer.write(ground, result_of(kind, prediction.results))
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
         self._check_that_files_exist()
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
@@ -218,36 +166,19 @@ class RunFiles:
         if recording is None:
             return None
         sizes = {name: file.size for name, file in self._files.items()}
-        state = FilesState(recording, sizes, {}, tuple(self._map_frames), tuple(self._bev_frames))
-        return replace(state, kept=dict(self._kept(state)))
+        return FilesState(recording, sizes, tuple(self._map_frames), tuple(self._bev_frames))
 
-    def _kept(self, state: FilesState) -> Iterator[tuple[str, Kept]]:
-        """What the files hold up to the sizes of a state, by name."""
-        for name, size in {RECORDING: state.recording.size, **state.sizes}.items():
+    def _check_files(self, resume: FilesState) -> None:
+        """Raises OutputError where a file of the finished frames is missing, or shorter than it was."""
+        for name, size in {RECORDING: resume.recording.size, **resume.sizes}.items():
             unfinished = partial_path(self._out / name)
-            yield name, self._growing[name].up_to(unfinished if unfinished.exists() else self._out / name, size)
-        yield SEGMENTATION, self._growing[SEGMENTATION].kept
-        yield BEV, self._growing[BEV].kept
-
-    def _check_kept(self, resume: FilesState) -> None:
-        """Raises OutputError where the files do not hold what the state says."""
+            _check_size(unfinished if unfinished.exists() else self._out / name, size)
         for index in resume.map_frames:
-            self._growing[SEGMENTATION].add(map_path(self._out / SEGMENTATION, index))
+            _check_size(map_path(self._out / SEGMENTATION, index), 1)
         for index in resume.bev_frames:
-            self._add_bev(index)
-        for name, found in self._kept(resume):
-            if found != resume.kept.get(name):
-                where = self._options.save_bev if name == BEV else self._out / name
-                raise OutputError(
-                    f"{where}: `resume`: was changed or damaged since the interruption (expected "
-                    f"{resume.kept[name].size if name in resume.kept else 0} bytes as they were written, found "
-                    f"{found.size}): pass `force=True` to start anew"
-                )
-
-    def _add_bev(self, index: int) -> None:
-        assert self._options.save_bev is not None
-        for ending in ("npy", "json"):
-            self._growing[BEV].add(self._options.save_bev / f"{index:06d}.{ending}")
+            assert self._options.save_bev is not None
+            for ending in ("npy", "json"):
+                _check_size(self._options.save_bev / f"{index:06d}.{ending}", 1)
 
     def _open(self, name: str, write: Callable[..., Growing], **how: Any) -> Growing:
         """Open a file that grows; of a resumed run, where it ended. write: takes its path, `resume_at` and `how`."""
@@ -264,8 +195,17 @@ class RunFiles:
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
-        paths += [self._out / writer.file_name for writer in self._results.values()]
+        paths += [self._out / kind.file_name for kind in self._results]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
+
+
+def _check_size(path: Path, size: int) -> None:
+    found = path.stat().st_size if path.is_file() else 0
+    if found < size:
+        raise OutputError(
+            f"{path}: `resume`: was cut or removed since the interruption (expected {size} bytes or more, found "
+            f"{found}): pass `force=True` to start anew"
+        )
 
 
 def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:

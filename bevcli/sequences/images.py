@@ -1,11 +1,12 @@
 """A listed frame -> a Frame: its images, read from files or videos and decoded in parallel, and its poses."""
 
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -15,13 +16,103 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import GRAVITY, Kinematics
+from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.files import MIB, read_bytes
+from bevcli.parsing.files import MIB, open_regular, plain_name, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.video import MOST_PIXELS, VideoReader
 from bevcli.waiting import result_within
+
+# Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
+# H.265, VP9 and AV1.
+CONTAINERS = (
+    (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
+    (0, b"\x1a\x45\xdf\xa3"),
+    (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
+)  # fmt: skip
+MOST_PIXELS = 1 << 26  # of an image in a video or a bag
+SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
+
+
+class VideoReader:
+    """Reads the images of one video by index. In order, each image is decoded once; going back reopens the video."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._capture: cv2.VideoCapture | None = None
+        self._at = -1  # index of the image in `_pixels`
+        self._pixels: NDArray[np.uint8] | None = None
+        self._end: int | None = None  # number of images, known once the end was reached
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR of image `index`, from 0.
+
+        Raises InputError if the file is missing, is not a video, or does not have the image.
+        """
+        if self._end is not None and index >= self._end:
+            raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
+        if self._capture is None or index < self._at:
+            self._capture, self._at, self._pixels = open_capture(self.path), -1, None
+        if index == self._at and self._pixels is not None:
+            return self._pixels
+        while self._at < index:
+            grabbed = False
+            with contextlib.suppress(cv2.error):  # a damaged stream
+                grabbed = self._capture.grab()
+            if not grabbed:
+                self._end, self._capture = self._at + 1, None
+                raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
+            self._at += 1
+        with contextlib.suppress(cv2.error):
+            readable, pixels = self._capture.retrieve()
+            if readable:
+                self._pixels = pixels.astype(np.uint8, copy=False)
+                return self._pixels
+        raise InputError(f"{self.path}: image {index} cannot be decoded")
+
+
+def open_capture(path: Path) -> cv2.VideoCapture:
+    """Open a video. Raises InputError if it is missing or OpenCV cannot read it."""
+    with open_regular(path, missing="is missing") as file:
+        start = file.read(12)
+    # FFmpeg recognises playlists too, which could lead it to other files and to servers.
+    if not any(start[place:].startswith(magic) for place, magic in CONTAINERS):
+        raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
+    try:
+        with plain_name(path) as name:
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
+    except cv2.error:
+        capture = cv2.VideoCapture()
+    if not capture.isOpened():
+        raise InputError(f"{path} cannot be opened as a video (expected a codec such as H.264 or FFV1)")
+    # The calibration is that of the pixels as they are stored, and versions of OpenCV differ in whether they turn them.
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    width, height = (capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if not 0 < width * height <= MOST_PIXELS:
+        capture.release()
+        raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
+    return capture
+
+
+def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:
+    """A note on each video with a tag by which players turn its images. Videos that cannot be read have none."""
+    for path in paths:
+        with contextlib.suppress(InputError):
+            degrees = open_capture(path).get(cv2.CAP_PROP_ORIENTATION_META)
+            if degrees % 360:
+                yield f"{path}: has a rotation tag ({degrees:.0f} degrees): its images are read as they are stored"
+
+
+def count_and_rate(path: Path) -> tuple[int, float]:
+    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
+    capture = open_capture(path)
+    count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+    capture.release()
+    if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
+        raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
+    return int(count), rate
+
 
 DECODING_THREADS = 6
 READING_TIMEOUT_S = 120.0
@@ -215,23 +306,11 @@ class FrameEntry:
     origin: str
 
 
-class Motion(Protocol):
-    """The vehicle's poses over time, such as `EgoMotion`."""
-
-    def pose_at(self, timestamp_ns: int) -> Pose:
-        """world_from_ego at a time."""
-        ...
-
-    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """Acceleration, angular rate and velocity at a time."""
-        ...
-
-
 def read_frame(
     entry: FrameEntry,
     rig: CameraRig,
     reader: ImageReader,
-    motion: Motion | None,
+    motion: EgoMotion | None,
     ground_truth: Boxes3D | None = None,
     ground_truth_map: BevMap | None = None,
 ) -> Frame:
@@ -266,23 +345,64 @@ def leads_out(path: Path, folder: Path) -> bool:
     return not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
 
 
-class ListedSequence(Sequence):
-    """Base of a `Sequence` of a folder whose frames are entries: a subclass calls `_list`, and has `_frame`."""
+def bev_frame_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ...]:
+    """Tells the user that the bev frame is the default, if it is. source: what does not state it."""
+    if not rig.ego_from_bev_assumed:
+        return ()
+    return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
 
-    def _list(self, entries: tuple[FrameEntry, ...], folder: Path, common: SequenceOptions) -> None:
-        self._entries, self.stamps = entries, tuple(entry.stamp for entry in entries)
-        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else folder)
+
+class ListedSequence(Sequence):
+    """A drive whose frames are listed, and whose images are read when a frame is loaded.
+
+    Args:
+        path: the drive, below which the images lie.
+        common: the options of every format.
+        rigs: the rig of all frames, or of each.
+        entries: the frames.
+        motion: the vehicle's poses; None if they are not known.
+        truth: the boxes of frames in the world frame, by their places in the drive.
+        notes: for the user.
+        input_files: see `Sequence`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        common: SequenceOptions,
+        rigs: CameraRig | tuple[CameraRig, ...],
+        entries: tuple[FrameEntry, ...],
+        motion: EgoMotion | None,
+        truth: Mapping[int, Boxes3D] | None = None,
+        notes: tuple[str, ...] = (),
+        input_files: tuple[Path, ...] = (),
+    ) -> None:
+        self.path, self.name, self.notes = path, path.resolve().name, notes
+        self._rigs = (rigs,) * len(entries) if isinstance(rigs, CameraRig) else rigs
+        self.rig, self.stamps, self._entries = self._rigs[0], tuple(entry.stamp for entry in entries), entries
+        self.ego_motion, self.has_ego_motion, self._truth = motion, motion is not None, truth or {}
+        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
+        self._input_files = input_files
+
+    @property
+    def input_files(self) -> tuple[Path, ...]:
+        return self._input_files
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        return count_classes(self._truth.values())
 
     def image_files(self, place: int) -> tuple[Path, ...]:
         sources = self._entries[place].sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def ground_truth_frame(self, place: int) -> Frame:
-        return self._frame(place, replace(self._entries[place], sources={}))
+        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
+        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
 
     def load(self, place: int) -> Frame:
         return self._frame(place, self._entries[place])
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
         """The frame at a place, of its entry or of one without images."""
-        raise NotImplementedError
+        return read_frame(entry, self._rigs[place], self._images, self.ego_motion, self._truth.get(place))

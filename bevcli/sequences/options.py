@@ -127,11 +127,6 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
-def _complete_format(incomplete: str) -> list[str]:
-    """The known formats of written drives that start with a text, for completion in a shell."""
-    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
-
-
 @options("Input")
 class LabelOptions:
     """Ground truth from a file of labels."""
@@ -139,8 +134,8 @@ class LabelOptions:
     labels: Path | None = option(
         reads="path",
         default=None,
-        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, an "
-        "OpenLABEL file, KITTI labels or tracklets, or CVAT's cuboids.",
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, "
+        "KITTI labels or tracklets, or CVAT's cuboids.",
         metavar="FILE",
     )
     unlisted_frames: UnlistedFrames | None = option(
@@ -165,7 +160,7 @@ class WriteOptions:
         "Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
-        complete=_complete_format,
+        complete=lambda incomplete: list(entries("bevcli.drive_writers")),
     )
     force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
     boxes: Path | None = option(
@@ -214,11 +209,14 @@ class RigOptions(FormatOptions):
 
     def rig(self) -> CameraRig | None:
         """The rig of the given files; None if none is given. Raises InputError."""
+        given = self.intrinsics is not None or self.extrinsics is not None
+        if self.calibration is None and not given:
+            return None
         from bevcli.sequences.files.calibration_file import read_calibration
         from bevcli.sequences.files.kalibr_ros import read_rig
 
         if self.calibration is None:
             return read_rig(self.intrinsics, self.extrinsics)
-        if self.intrinsics or self.extrinsics:
+        if given:
             raise InputError("`calibration` excludes `intrinsics` and `extrinsics`: pass one of them")
         return read_calibration(self.calibration)

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import rerun as rr
 
 from bevcli.errors import BevcliError, InputError, OutputError
-from bevcli.parsing.files import plain_name
-from bevcli.parsing.own_process import run_program, run_python
+from bevcli.parsing.files import plain_name, run_program, run_python
 from bevcli.viewer.native import viewer_binary, viewer_environment
 from bevcli.writing import whole_file
 
@@ -156,14 +155,14 @@ def _is_whole(path: Path) -> bool:
 
 def _ends_with_a_message(file: BinaryIO, size: int) -> bool:
     """True if a file without an index ends after a whole message and has one at least."""
-    place = FILE_HEADER
-    while place + MESSAGE_HEADER.size <= size:
-        file.seek(place)
+    position = FILE_HEADER
+    while position + MESSAGE_HEADER.size <= size:
+        file.seek(position)
         kind, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
         if kind not in MESSAGE_KINDS:
             return False
-        place += MESSAGE_HEADER.size + length
-    return place == size > FILE_HEADER
+        position += MESSAGE_HEADER.size + length
+    return position == size > FILE_HEADER
 
 
 def show(

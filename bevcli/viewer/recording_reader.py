@@ -1,10 +1,11 @@
-"""Reads a recording frame by frame, in the order of frames, with as few frames in memory as the file's order allows."""
+"""Reads a recording frame by frame, with as few frames in memory as the file's order allows; boxes; the summary."""
 
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,11 @@ import pyarrow as pa
 from rerun.chunk import Chunk, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording import entities
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 Row = dict[str, pa.Scalar]
 
@@ -23,6 +27,8 @@ Row = dict[str, pa.Scalar]
 Logged = tuple[bytes, str, Row]  # the row's identity, which grows with the time of logging; its entity; its components
 OF_EACH_FRAME = (entities.EGO, entities.BOXES)  # never those of an earlier frame
 NO_FRAME = np.inf  # after all frames
+MOST_SKEW = 1e-3  # of a rotation: difference of R Rᵀ and the identity
+SHOWN_ENTITIES = 15
 
 
 @dataclass(frozen=True)
@@ -71,13 +77,13 @@ class RecordedFrame:
         count: the N that is expected, if any is. nan: NaN, for a number that is not known, may be among them.
         """
         flat = self._flat(entity, component, width)
-        numbers = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
-        found = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if numbers else np.zeros(1)
-        if not numbers or len(found) % width or count not in (None, len(found) // width):
+        is_numeric = pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)
+        values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64) if is_numeric else np.zeros(1)
+        if not is_numeric or len(values) % width or count not in (None, len(values) // width):
             raise self.wrong(entity, component, f"values of {width} numbers", flat, count)
-        if not (np.isfinite(found) | (nan & np.isnan(found))).all():
+        if not (np.isfinite(values) | (nan & np.isnan(values))).all():
             raise self.wrong(entity, component, "finite numbers", "NaN or infinity")
-        return found.reshape(-1, width)
+        return values.reshape(-1, width)
 
     def strips(self, entity: str, component: str) -> list[Array]:
         """The values of a component that are lists of points, (P, 2) each."""
@@ -192,3 +198,124 @@ def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
         else:
             state[entity] = {**state.get(entity, {}), **{n: value for n, value in row.items() if value.is_valid}}
     return state
+
+
+def read_recording(recording: Path) -> BoxesFile:
+    """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
+    frames = tuple(recorded_boxes(frame) for frame in RecordingReader(recording).frames())
+    if not frames:
+        raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
+    return BoxesFile("world", frames)
+
+
+def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
+    """The shown boxes of a frame in the sequence's world frame, highest score first; recordings store float32."""
+    entity, world = entities.BOXES, frame.array(entities.WORLD, "origin", 3)
+    origin = world[0] if len(world) else np.zeros(3)
+    centers = frame.array(entity, "Boxes3D:centers", 3)
+    count = len(centers)
+    quaternions = frame.array(entity, "Boxes3D:quaternions", 4, count)  # x, y, z, w
+    boxes = Boxes3D(
+        centers=centers + origin,
+        sizes_lwh=2 * frame.array(entity, "Boxes3D:half_sizes", 3, count),
+        yaws=2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]),
+        velocities=np.hstack([frame.array(entity, f"velocity_{axis}", 1, count, nan=True) for axis in "xy"]),
+        classes=np.array(frame.texts(entity, "name", count), dtype=np.str_),
+        **{name: _column(frame, column, count) for name, column in OPTIONAL_COLUMNS.items() if column.recorded},
+    )
+    if (boxes.sizes_lwh <= 0).any():
+        raise frame.wrong(entity, "Boxes3D:half_sizes", "sizes above 0", boxes.sizes_lwh.min() / 2)
+    (time,) = frame.integers(entities.EGO, "timestamp_ns", 1)
+    stamp = FrameStamp(frame.index, "".join(frame.texts(entities.EGO, "scene")), time)
+    world_from_ego = frame.array(entities.EGO, "pose", 16, 1).reshape(4, 4).copy()
+    if abs(world_from_ego[:3, :3] @ world_from_ego[:3, :3].T - np.eye(3)).max() > MOST_SKEW:
+        raise frame.wrong(entities.EGO, "pose", "a rotation and a place", "another matrix")
+    world_from_ego[:3, 3] += origin
+    return FrameBoxes(stamp, Pose.from_matrix(world_from_ego), boxes)
+
+
+def _column(frame: RecordedFrame, column: Column, count: int) -> Any:
+    """An optional column of the boxes; None where the recording does not have it."""
+    if not frame.has(entities.BOXES, column.recorded) and column.values != "score":
+        return None
+    if column.values == "text":
+        return np.array(frame.texts(entities.BOXES, column.recorded, count), dtype=np.str_)
+    values = frame.array(entities.BOXES, column.recorded, 1, count)[:, 0]
+    return values.astype({"flag": bool, "count": np.int64}.get(column.values, np.float64))
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """The summary of a recording.
+
+    Attributes:
+        path: the recording's file.
+        file_bytes: its size.
+        title: name of the sequence and of the model.
+        untrained: whether the model's weights were random.
+        timestamps_ns: of the frames, in order.
+        boxes: the number of shown boxes by class, largest first.
+        bytes_by_entity: size in memory by entity, largest first.
+    """
+
+    path: Path
+    file_bytes: int
+    title: str
+    untrained: bool
+    timestamps_ns: tuple[int, ...]
+    boxes: Mapping[str, int]
+    bytes_by_entity: Mapping[str, int]
+
+    def text(self) -> str:
+        """The summary as text for a terminal."""
+        lines = [f"{self.path}: {self.title}" + (" (UNTRAINED weights)" if self.untrained else "")]
+        lines += [f"  frames    {len(self.timestamps_ns)}{self._span()}", f"  size      {_size(self.file_bytes)}"]
+        lines += [f"  boxes     {sum(self.boxes.values())}"]
+        lines += [f"    {count:7d} {name}" for name, count in self.boxes.items()]
+        lines += [f"  entities  {len(self.bytes_by_entity)}, by size"]
+        largest = list(self.bytes_by_entity.items())[:SHOWN_ENTITIES]
+        lines += [f"    {_size(count):>9} {entity}" for entity, count in largest]
+        rest = list(self.bytes_by_entity.values())[SHOWN_ENTITIES:]
+        lines += [f"    {_size(sum(rest)):>9} in {len(rest)} others"] if rest else []
+        return "\n".join(lines)
+
+    def _span(self) -> str:
+        if not self.timestamps_ns:
+            return ""
+        first, last = min(self.timestamps_ns), max(self.timestamps_ns)
+        start = datetime.fromtimestamp(first / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")
+        return f", {(last - first) / 1e9:.2f} s from {start}"
+
+
+def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
+    """Summarises the recording at `path`. read_from: its repaired copy, if there is one."""
+    reader = RecordingReader(path if read_from is None else read_from)
+    sizes: Counter[str] = Counter()
+    for chunk in reader.chunks():
+        sizes[chunk.entity_path] += chunk.to_record_batch().nbytes
+    boxes: Counter[str] = Counter()
+    times: list[int] = []
+    title, untrained = "", False
+    for frame in reader.frames():
+        recorded = recorded_boxes(frame)
+        boxes.update(recorded.boxes.classes.tolist())
+        times.append(recorded.stamp.timestamp_ns)
+        title = "".join(frame.texts(entities.RUN, "title"))
+        untrained = any(frame.integers(entities.RUN, "untrained"))
+    return RecordingSummary(
+        path=path,
+        file_bytes=path.stat().st_size,
+        title=title or "a recording",
+        untrained=untrained,
+        timestamps_ns=tuple(times),
+        boxes=dict(boxes.most_common()),
+        bytes_by_entity=dict(sizes.most_common()),
+    )
+
+
+def _size(count: int) -> str:
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count = count / 1000  # type: ignore[assignment]
+    return f"{count:.1f} GB"

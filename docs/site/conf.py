@@ -24,6 +24,7 @@ SECTIONS = {
     "Run and look": [
         "docs/commands",
         "docs/sequence-format",
+        "docs/weights",
         "docs/other-inputs",
         "docs/recording",
         "docs/rendered-drives",
@@ -34,7 +35,7 @@ SECTIONS = {
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/extend", "docs/reference"],
-    "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG", "docs/history"],
+    "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG"],
 }
 
 project = "bevcli"

@@ -9,7 +9,7 @@ from small_fleet import write_drive
 from bevcli.errors import BevcliError, InputError
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.batch.drives import find_drives, read_list
+from bevcli.workshop.batch.job import find_drives, read_list
 from bevcli.workshop.batch.storage import open_storage
 
 

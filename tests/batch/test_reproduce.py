@@ -15,7 +15,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.temporal_model import build_model
 from bevcli.published import own_table
 from bevcli.workshop.batch.options import ray_is_installed
-from bevcli.workshop.batch.reproduce import compare_with_published
+from bevcli.workshop.batch.reproduce_command import compare_with_published, table_of
 
 ERRORS = {"trans_err": 0.7, "scale_err": 0.3, "orient_err": 0.4, "vel_err": 0.5, "attr_err": None}
 METRICS = {
@@ -31,7 +31,7 @@ METRICS = {
 
 def test_a_table_has_ours_the_published_and_the_difference():
     found = compare_with_published(METRICS, {"NDS": 0.517, "mAP": 0.4, "mATE": 0.673})
-    lines = [line.split() for line in found.table().splitlines()]
+    lines = [line.split() for line in table_of(found["scores"]).splitlines()]
     assert lines[:4] == [
         ["score", "ours", "published", "difference"],
         ["NDS", "%", "51.2", "51.7", "-0.5"],
@@ -39,14 +39,14 @@ def test_a_table_has_ours_the_published_and_the_difference():
         ["mATE", "m", "0.700", "0.673", "+0.027"],
     ]
     assert lines[-1] == ["mAAE", "–", "–", "–"]
-    assert found.notes == ()
+    assert found["notes"] == []
 
 
 def test_notes_tell_what_need_not_agree():
     found = compare_with_published({**METRICS, "frames": 81}, {"AMOTA": 0.39})
-    assert "6,019 frames of the validation split, these of 81" in found.notes[0]
-    assert found.notes[1].startswith("AMOTA: not measured here")
-    assert found.to_dict()["scores"]["AMOTA"] == {"name": "AMOTA", "ours": None, "published": 0.39, "difference": None}
+    assert "6,019 frames of the validation split, these of 81" in found["notes"][0]
+    assert found["notes"][1].startswith("AMOTA: not measured here")
+    assert found["scores"]["AMOTA"] == {"name": "AMOTA", "ours": None, "published": 0.39, "difference": None}
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
-from bevcli.workshop.batch.drives import find_drives
+from bevcli.workshop.batch.job import find_drives
 from bevcli.workshop.batch.run_batch import run_batch
 from bevcli.workshop.batch.worker import Worker
 from bevcli.workshop.formats.ros.format import BagOptions
@@ -122,7 +122,7 @@ def test_drives_run_again_if_input_or_option_differs_not_order(batch, tmp_path):
     moved = tmp_path / "moved"
     shutil.move(tmp_path / "drives/d002", moved / "d002")
     assert batch([*paths[:2], str(moved / "d002")], resume=True).skipped == 3
-    assert batch(paths[:2], resume=True, options={"embed": True}).skipped == 0
+    assert batch(paths[:2], resume=True, options={"evaluate": True}).skipped == 0
 
 
 def test_a_folder_with_a_batch_or_other_files_is_not_overwritten(batch, fleet, tmp_path):

@@ -18,14 +18,12 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.calibration.calibrate import judge
+from bevcli.workshop.calibration.calibrate import CalibrationResult, judge
 from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, delay_text
-from bevcli.workshop.calibration.matches import match_points
-from bevcli.workshop.calibration.measure import measure
+from bevcli.workshop.calibration.measure import match_points, measure
 from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.result import CalibrationResult
 from bevcli.workshop.calibration.views import Views, read_views
-from bevcli.workshop.robustness.sequences import CalibrationNoise, Draws
+from bevcli.workshop.robustness.conditions import CalibrationNoise, Draws
 
 LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured
 

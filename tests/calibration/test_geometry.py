@@ -6,12 +6,20 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
-from bevcli.workshop.calibration.levels import level_corrections, sees_road
+from bevcli.workshop.calibration.adjustment import (
+    HEIGHT,
+    OF_CAMERA,
+    EpipolarResiduals,
+    RoadResiduals,
+    Unknowns,
+    derivatives,
+    geometry_at,
+    solve,
+    spread,
+    values,
+)
 from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
-from bevcli.workshop.calibration.road import beside_way
-from bevcli.workshop.calibration.solve import solve, spread
-from bevcli.workshop.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
+from bevcli.workshop.calibration.road import beside_way, level_corrections, sees_road
 from bevcli.workshop.calibration.views import DELAYS_S, View, Views
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])

@@ -1,12 +1,13 @@
-"""`bevcli batch` and `bevcli find-like` as commands: exit codes, messages and the files that they name."""
+"""`bevcli batch` as a command: exit codes, messages and the files that they name."""
 
 import pytest
 from command_line import MINI_TOML, command
 from small_fleet import make_job, write_fleet
 
 from bevcli.errors import BevcliError
-from bevcli.workshop.batch import ray_workers
-from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
+from bevcli.workshop.batch import worker
+from bevcli.workshop.batch.options import Workers
+from bevcli.workshop.batch.worker import run_on_ray
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,7 @@ def place(tmp_path_factory):
 def test_the_commands_end_with_what_they_wrote(place):
     (place / "list.txt").write_text("drives/d001\ndrives/missing\n")
     arguments = ("batch", "drives/d000", "--list", "list.txt", "--out", "out", "--model", "mini.toml", "--untrained")
-    done = command(place, *arguments, "--workers", "1", "--retries", "0", "--embed")
+    done = command(place, *arguments, "--workers", "1", "--retries", "0")
     assert done.returncode == 3, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0] == "drives   2 of 3 done, 1 failed"
@@ -29,10 +30,6 @@ def test_the_commands_end_with_what_they_wrote(place):
     ]
     assert f"failed: missing: {place}/drives/missing: is missing" in done.stderr
     assert "3/3 drives" in done.stderr
-    found = command(place, "find-like", "d000", "--frame", "0", "--in", "out", "--html", "similar.html")
-    assert found.returncode == 0, found.stderr
-    assert found.stdout.splitlines()[1].split()[1].startswith("d001-")
-    assert (place / "similar.html").exists()
 
 
 def test_mistakes_are_one_line(place):
@@ -45,13 +42,13 @@ def test_mistakes_are_one_line(place):
 
 
 def test_a_cluster_needs_a_process_that_ran_no_local_batch(place, monkeypatch):
-    monkeypatch.setattr(ray_workers, "ray_is_installed", lambda: True)
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: True)
     monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # what a batch on this machine leaves
     with pytest.raises(BevcliError, match="use a new process for `address`"):
         next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(address="10.0.0.1:6379")))
 
 
 def test_several_workers_without_ray_name_what_to_install(place, monkeypatch):
-    monkeypatch.setattr(ray_workers, "ray_is_installed", lambda: False)
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: False)
     with pytest.raises(BevcliError, match=r"run pip install 'bevcli\[ray\]', or pass `count=1`"):
         next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(2)))

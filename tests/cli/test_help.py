@@ -1,5 +1,8 @@
 """`--help` of the program and of every command, as a terminal of 80 columns shows it."""
 
+import subprocess
+import sys
+
 import pytest
 from typer.testing import CliRunner
 
@@ -38,3 +41,19 @@ def test_options_stand_under_their_panels():
     text = help_of("run")
     assert text.index("\nInput:\n") < text.index("  --rate HZ|all")
     assert text.index("\nOptions:\n") < text.index("  -h, --help")
+
+
+def test_help_of_a_command_imports_no_other_wing():
+    """Beside the options of the input formats, and those that a wing adds to the command."""
+    code = (
+        "import contextlib, io, sys\n"
+        "from bevcli.cli.main import app\n"
+        "for name in ('viz', 'run', 'bench'):\n"
+        "    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):\n"
+        "        app([name, '--help'], standalone_mode=False)\n"
+        "    wings = {part[2] for part in (module.split('.') for module in sys.modules) if part[1:2] == ['workshop'] "
+        "and len(part) > 2}\n"
+        "    print(name, *sorted(wings - {'registered'}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["viz", "run calibration formats", "bench benchmark calibration formats"]

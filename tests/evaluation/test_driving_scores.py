@@ -14,15 +14,14 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.frame import FrameStamp, Ground, MapLines, Plan
+from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, apply, rigid
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.workshop.vad.line_scores import evaluate_lines
-from bevcli.workshop.vad.lines_file import LinesWriter
-from bevcli.workshop.vad.plan_file import PlanWriter
-from bevcli.workshop.vad.planning_scores import PlannedFrame, evaluate_plans
+from bevcli.workshop.vad.driving_metrics import PlannedFrame, evaluate_lines, evaluate_plans
+from bevcli.workshop.vad.map_lines import LinesWriter, MapLines
+from bevcli.workshop.vad.plan import Plan, PlanWriter
 
 FRAMES, TIMES = 10, 0.5 * np.arange(1, 7)
 OWN_MPS, CAR_MPS = 4.0, 2.0
@@ -117,7 +116,7 @@ def test_objects_of_frames_without_predictions_are_not_found(tmp_path: Path) -> 
     content = json.loads((found / "predictions.json").read_text())
     del content["frames"][0]
     (found / "predictions.json").write_text(json.dumps(content))
-    scores = evaluate(found, truth, count_missing=True, driving=["motion"]).driving.motion
+    scores = evaluate(found, truth, count_missing=True, motion=True).vad.motion
     assert scores is not None
     assert (scores["car"].truths, scores["car"].hits) == (4, 3)
 
@@ -126,7 +125,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
     found = write(tmp_path / "found", car, path(1.0), LINE, ("predictions.json", "map_lines.json"))
     truth = write(tmp_path / "truth", car, path(1.0), LINE, ("ground_truth.json", "other.json"))
     with pytest.raises(InputError, match=r"ground_truth_lines\.json: `map`: the file is missing"):
-        evaluate(found, truth, driving=["map"])
+        evaluate(found, truth, map=True)
 
 
 def test_a_line_may_be_reversed_and_cut_otherwise() -> None:

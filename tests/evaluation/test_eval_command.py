@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.evaluation.inputs import open_ground_truth, open_predictions, without_cycles_in_racks
-from bevcli.evaluation.pairing import pair_frames
+from bevcli.evaluation.inputs import open_ground_truth, open_predictions, pair_frames, without_cycles_in_racks
 from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose

@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
-from bevcli.workshop.formats.boxes.kitti import kitti_labels, write_kitti
+from bevcli.workshop.formats.kitti import kitti_labels, write_kitti
 
 # Camera axes in the ego frame, as columns: x right, y down, z forward.
 LOOKING_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -192,3 +192,9 @@ def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_unknown_format_names_the_known_ones() -> None:
+    sample = Path(__file__).parents[2] / "samples/street/ground_truth.json"
+    answer = CliRunner().invoke(app, ["export", str(sample), "--format", "dxf"])
+    assert "--format dxf: unknown format (expected csv, json, kitti, " in str(answer.exception)

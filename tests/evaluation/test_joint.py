@@ -8,12 +8,12 @@ from random_boxes import as_predictions, random_truth
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.scores_report import FrameScores
+from bevcli.evaluation.evaluate import FrameScores
 from bevcli.evaluation.segmentation import evaluate_segmentation
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.runs.state import load_state, save_state
-from bevcli.workshop.vad.joint_scores import DriveMatches, score_jointly
+from bevcli.workshop.batch.joint_scores import DriveMatches, score_jointly
 
 CONFIG = DetectionConfig().cut_at(25)
 

@@ -11,7 +11,7 @@ from random_boxes import as_predictions, random_truth
 
 from bevcli.errors import InputError
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.pairing import FramePairs, pair_frames
+from bevcli.evaluation.inputs import FramePairs, pair_frames
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev

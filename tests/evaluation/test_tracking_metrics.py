@@ -14,7 +14,7 @@ import pytest
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.workshop.tracking_scores.scoring import TrackingScores, evaluate_tracking
+from bevcli.workshop.scores.tracking import TrackingScores, evaluate_tracking
 
 GOLDEN = Path(__file__).parents[1] / "data" / "golden_tracking.json.gz"  # made with nuscenes-devkit 1.2.0
 Row = tuple[str, float, float]  # identity, x, y

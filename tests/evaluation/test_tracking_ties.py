@@ -8,7 +8,7 @@ import pytest
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.workshop.tracking_scores.scoring import evaluate_tracking
+from bevcli.workshop.scores.tracking import evaluate_tracking
 
 FRAMES, PERIOD_NS = 60, 500_000_000
 

@@ -9,12 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevcli.frame import MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.workshop.vad.line_scores import _Curve, evaluate_lines, similarity
-from bevcli.workshop.vad.motion_scores import MIN_SCORE, evaluate_motion, match
-from bevcli.workshop.vad.planning_scores import PlannedFrame, PlanScores, collisions, evaluate_plans, hits, occupancy
+from bevcli.workshop.vad.driving_metrics import (
+    MIN_SCORE,
+    PlannedFrame,
+    PlanScores,
+    _Curve,
+    collisions,
+    evaluate_lines,
+    evaluate_motion,
+    evaluate_plans,
+    hits,
+    match,
+    occupancy,
+    similarity,
+)
+from bevcli.workshop.vad.map_lines import MapLines
 
 VEHICLES = range(14, 24)
 HUMANS = range(2, 9)

@@ -21,11 +21,11 @@ from small_model import small_inputs, small_model, step_of_file
 
 from bevcli.config import as_table
 from bevcli.inference.load import Model
-from bevcli.recording.vehicle import load_vehicle
+from bevcli.recording.meshes import load_vehicle
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch.job import read_record
-from bevcli.workshop.batch.report import write_report
-from bevcli.workshop.batch.run_batch import BatchSummary, to_csv, to_parquet
+from bevcli.workshop.batch.report import to_csv, to_parquet, write_report
+from bevcli.workshop.batch.run_batch import BatchSummary
 from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx
 

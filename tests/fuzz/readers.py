@@ -35,7 +35,7 @@ def _drive(folder: Path) -> None:
 
 
 def _unlisted(folder: Path) -> None:
-    from bevcli.sequences.native.unlisted_frames import find_frames
+    from bevcli.sequences.native.folder import find_frames
 
     find_frames(folder / "drive", ("CAM_FRONT", "CAM_BACK"))
 
@@ -91,7 +91,7 @@ def _weights(name: str) -> Callable[[Path], None]:
 
 def _recording(folder: Path) -> None:
     from bevcli.viewer.recording_file import open_recording
-    from bevcli.viewer.summary import summarise
+    from bevcli.viewer.recording_reader import summarise
 
     with open_recording(folder / "recording.rrd") as file:
         summarise(folder / "recording.rrd", file).text()
@@ -124,7 +124,7 @@ def _checkpoint(folder: Path) -> None:
 
 
 def _vehicle(folder: Path) -> None:
-    from bevcli.recording.vehicle import load_vehicle
+    from bevcli.recording.meshes import load_vehicle
 
     load_vehicle(folder / "vehicle.glb")
 

@@ -15,12 +15,9 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import write_boxes
-from bevcli.viewer.export import read_recording
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.summary import summarise
-from bevcli.viewer.video import frame_rate
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader, read_recording, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, frame_rate, tiles
 
 READ = (entities.WORLD, entities.EGO, entities.BOXES, entities.RUN, entities.SPEED, "world/cameras", "bev")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bevcli.geometry.geographic import GeoOrigin
+from bevcli.geometry.transforms import GeoOrigin
 
 A, B = 6378137.0, 6356752.314245  # half axes of the ellipsoid, metres
 

@@ -250,10 +250,11 @@ class Labelled(MemorySequence):
 
 
 def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
-    def keep(found, *rest):
-        scored.extend(boxes.instances.tolist() for boxes in found)
+    def keep(_, compared):
+        scored.extend(frame.boxes.instances.tolist() for frame in compared.pairs.predictions)
+        return {}
 
     scored: list[list[str]] = []
-    monkeypatch.setattr(validation, "evaluate_tracking", keep)
+    monkeypatch.setattr(validation, "score_results", keep)
     validation.validate(Runner(model, CPU, StepOptions(tracker=TrackerConfig())), OneDrive([Labelled(whole[:3])]))
     assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]

@@ -10,7 +10,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.tracking import TrackerConfig, step
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.workshop.tracking_scores.scoring import evaluate_tracking
+from bevcli.workshop.scores.tracking import evaluate_tracking
 
 STREET = Path(__file__).parents[2] / "samples" / "street" / "ground_truth.json"
 STANDING = (0.0, 0.0)

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from bevcli.frame import MapLines
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.step import FrameTruth
@@ -23,6 +22,7 @@ from bevcli.workshop.vad.losses import (
     motion_losses,
     path_losses,
 )
+from bevcli.workshop.vad.map_lines import MapLines
 from bevcli.workshop.vad.motion_head import MotionOutputs
 
 GRID = BevGrid(4, 4, (-10, 10), (-20, 20), (-2, 2))

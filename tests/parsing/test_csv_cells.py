@@ -7,10 +7,10 @@ import pytest
 from memory_drive import MemorySequence, make_rig
 from recorded_drive import boxes_ahead
 
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_tables import cell_of, name_of
+from bevcli.parsing.documents import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.native_writer import NativeWriter

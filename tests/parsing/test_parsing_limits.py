@@ -6,8 +6,7 @@ import time
 import pytest
 
 from bevcli.errors import ConfigError, InputError
-from bevcli.parsing.csv_tables import read_csv
-from bevcli.parsing.documents import parse_json, parse_toml, read_json, read_yaml
+from bevcli.parsing.documents import parse_json, parse_toml, read_csv, read_json, read_yaml
 from bevcli.parsing.files import read_bytes
 
 

@@ -269,7 +269,7 @@ def test_attributes_in_the_file_never_reach_an_object_of_ours(tmp_path: Path) ->
 
 
 def test_a_key_that_takes_for_ever_to_hash_is_left_out() -> None:
-    from bevcli.parsing.pickles import PickleReader
+    from bevcli.parsing.pth import PickleReader
 
     # t = (t, t), sixty times: its hash needs 2**60 steps.
     nested = b"".join(b"q\x00h\x00\x86" for _ in range(60))

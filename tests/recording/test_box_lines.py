@@ -7,7 +7,7 @@ import numpy as np
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, Distortion
-from bevcli.recording.box_lines import NEAR_CLIP_M, clip_near, clip_to_image, lines_in_image
+from bevcli.recording.log_cameras import NEAR_CLIP_M, clip_near, clip_to_image, lines_in_image
 
 FINE = 256  # cv2.clipLine takes integers: subdivide the pixels
 CAMERA = Camera("front", 640, 360, np.array([[400.0, 0, 320], [0, 400, 180], [0, 0, 1]]), np.eye(4))

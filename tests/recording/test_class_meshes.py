@@ -11,7 +11,7 @@ from recorded_drive import TINY, NamedModel, boxes_ahead, predict
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import InputError
 from bevcli.geometry.object_classes import ClassSettings, are_nuscenes
-from bevcli.recording import class_meshes, entities
+from bevcli.recording import entities, meshes
 from bevcli.recording.colors import class_colors
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
@@ -99,7 +99,7 @@ def test_a_wrong_mesh_is_one_line_before_anything_is_written(
 ):
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    monkeypatch.setattr(class_meshes, "MOST_TRIANGLES", 1)
+    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 1)
     model = NamedModel(config=with_mesh(tmp_path / name))
     with pytest.raises(InputError, match=message) as caught, Recording(tmp_path / "r.rrd", MemorySequence(1), model):
         pass

@@ -11,14 +11,14 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
 
 from bevcli.config import load_config
-from bevcli.frame import MapLines, Plan
 from bevcli.geometry.transforms import apply
 from bevcli.recording import entities
-from bevcli.recording.colors import line_colors
-from bevcli.recording.ground_lines import FUTURES, HALF_VEHICLE_M, future_lines
+from bevcli.recording.log_bev import future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.vad.map_lines import MapLines, line_colors
+from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
 
 TIMES = np.array([0.5, 1.0])
 LINES = MapLines(
@@ -107,7 +107,7 @@ def test_futures_fade_with_time_and_with_the_score_of_the_mode() -> None:
 
 
 def test_a_frame_without_results_shows_none(frames: list[RecordedFrame]) -> None:
-    for kind in ("map_lines", "plan", FUTURES):
+    for kind in ("map_lines", "plan", entities.FUTURES):
         assert strips(frames[0], f"{entities.WORLD}/{kind}")
         assert not strips(frames[1], f"{entities.WORLD}/{kind}")
         assert not strips(frames[1], entities.overlay("CAM_FRONT", kind), 2)

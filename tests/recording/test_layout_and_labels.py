@@ -14,7 +14,7 @@ from bevcli.recording.blueprint import (
     camera_rows,
     rows_by_yaw,
 )
-from bevcli.recording.box_lines import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
+from bevcli.recording.log_cameras import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
 
 
 def test_nuscenes_cameras_are_in_two_rows():

@@ -21,10 +21,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.rrd_file import BLOCK, RrdFile
-from bevcli.recording.writer import Recording
-from bevcli.viewer.export import recorded_boxes
-from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.recording.writer import BLOCK, Recording, RrdFile
+from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 
 
 @pytest.fixture(scope="module")

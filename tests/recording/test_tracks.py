@@ -9,12 +9,10 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.recording import entities
-from bevcli.recording.box_lines import box_labels
-from bevcli.recording.log_boxes import false_and_duplicate
-from bevcli.recording.log_tracks import AHEAD_S, PAST_S
+from bevcli.recording.log_boxes import AHEAD_S, PAST_S, false_and_duplicate
+from bevcli.recording.log_cameras import box_labels
 from bevcli.recording.writer import Recording
-from bevcli.viewer.export import recorded_boxes
-from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 
 CAR, PEDESTRIAN = entities.track("car", "7"), entities.track("pedestrian", "8")
 

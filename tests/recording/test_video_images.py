@@ -7,13 +7,13 @@ from memory_drive import MemorySequence, WithoutImages
 from recorded_drive import record
 
 from bevcli.errors import BevcliError
-from bevcli.recording import entities, options, video_images
+from bevcli.recording import entities, log_cameras, options
+from bevcli.recording.log_cameras import Av1Encoder
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.video_images import Av1Decoder, Av1Encoder
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.video_frame import CameraImages
+from bevcli.viewer.video import Av1Decoder, CameraImages
 
-with_av = pytest.mark.skipif(not video_images.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
+with_av = pytest.mark.skipif(not options.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
 
 
 def scene(step: int, width: int = 320, height: int = 180) -> np.ndarray:
@@ -32,7 +32,7 @@ def test_each_image_is_complete_when_it_was_encoded(size):
     for step in range(12):
         image = scene(step, *size)
         data, is_keyframe = encoder.encode(image)
-        assert is_keyframe == (step % video_images.KEYFRAME_EVERY == 0)
+        assert is_keyframe == (step % log_cameras.KEYFRAME_EVERY == 0)
         back = decoder.decode(data)[: size[1], : size[0]]
         assert cv2.PSNR(back, image) > 33
     encoder.close()
@@ -67,6 +67,6 @@ def test_a_dropped_image_starts_a_new_stream(tmp_path):
 
 
 def test_without_pyav_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(video_images, "has_av", lambda: False)
+    monkeypatch.setattr(options, "has_av", lambda: False)
     with pytest.raises(BevcliError, match=r"`images=\"av1\"`: PyAV is not installed: pip install 'bevcli\[video\]'"):
         options.RecordingOptions(images="av1")

@@ -11,11 +11,11 @@ from recorded_drive import GRID, TINY, NamedModel, predict, record
 from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
-from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares
+from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, frame_rate_hz
 from bevcli.recording.colors import (
     BACKGROUND,
     GROUND_TRUTH_COLOR,
@@ -25,9 +25,14 @@ from bevcli.recording.colors import (
     class_colors,
     map_colors,
 )
-from bevcli.recording.log_static import legend_entries, ring_distances_m
+from bevcli.recording.log_static import (
+    FROM_RENDERED,
+    UNTRAINED,
+    Recorded,
+    legend_entries,
+    ring_distances_m,
+)
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.recorded import FROM_RENDERED, UNTRAINED, Recorded, frame_rate_hz
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 

@@ -19,7 +19,7 @@ from bevcli.geometry.transforms import rotation_from_quaternion
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import WriteOptions
-from bevcli.workshop.formats.foxglove.messages import Messages
+from bevcli.workshop.formats.mcap_writer import Messages
 from bevcli.workshop.formats.output import open_writer
 
 
@@ -153,7 +153,7 @@ def test_left_out_fields_are_zero_or_empty():
 
 def test_without_rosbags_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    for name in [name for name in sys.modules if name.startswith(("rosbags.", "bevcli.workshop.formats.foxglove."))]:
+    for name in [name for name in sys.modules if name.startswith("rosbags.")]:
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(BevcliError, match=r"pip install .*bevcli\[ros\]"):
         open_writer(tmp_path / "drive.mcap", Truthful(), WriteOptions(form="mcap"))

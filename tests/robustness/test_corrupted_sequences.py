@@ -12,19 +12,18 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.workshop.robustness.sequences import (
+from bevcli.workshop.robustness.conditions import (
     CalibrationNoise,
     CameraCrash,
     Draws,
     EgoMotionLost,
     FrameLost,
-    FrameStore,
     KeptFrames,
     TimeOffsets,
     at_lower_rate,
     motion_during,
-    split_scenes,
 )
+from bevcli.workshop.robustness.stress import split_scenes
 
 DRAWS = Draws(0, "test")
 
@@ -177,7 +176,7 @@ def test_kept_frames_are_read_once_while_the_memory_lasts():
     drive = WithTruth(3)
     frame_bytes = sum(image.pixels_bgr.nbytes for image in drive.load(0).images.values())
     drive.loads = 0
-    kept = KeptFrames(drive, FrameStore(2 * frame_bytes))
+    kept = KeptFrames(drive, 2 * frame_bytes)
     for _ in range(3):
         for place in range(3):
             kept.load(place)

@@ -13,7 +13,7 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp, Ground, MapLines, Plan
+from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference.commands import read_commands, with_command
 from bevcli.inference.load import Model
@@ -26,9 +26,9 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig
-from bevcli.workshop.vad.lines_file import LinesWriter, read_lines
+from bevcli.workshop.vad.map_lines import LinesWriter, MapLines, read_lines
 from bevcli.workshop.vad.motion_head import MotionConfig
-from bevcli.workshop.vad.plan_file import read_plans
+from bevcli.workshop.vad.plan import Plan, read_plans
 from bevcli.workshop.vad.vad import VAD
 
 FRAMES = 3

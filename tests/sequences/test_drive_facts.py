@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.frame import DriveFacts
-from bevcli.geometry.geographic import GeoOrigin
+from bevcli.geometry.transforms import GeoOrigin
 from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.native_writer import NativeWriter

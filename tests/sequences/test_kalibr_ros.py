@@ -8,6 +8,7 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.sequences.files.kalibr_ros import read_rig
+from bevcli.sequences.options import RigOptions
 
 KALIBR = """
 cam0:
@@ -136,7 +137,7 @@ def test_distortion_with_zero_coefficients_is_none(tmp_path):
 
 
 def test_without_files_there_is_no_rig():
-    assert read_rig(None, None) is None
+    assert RigOptions().rig() is None
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Ground truth from files of labelling tools: a CSV table as spreadsheets write it, and OpenLABEL."""
+"""Ground truth from files of labelling tools: a CSV table as spreadsheets write it, KITTI's and CVAT's files."""
 
 from __future__ import annotations
 
@@ -13,18 +13,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
-from bevcli.evaluation.options import ExportOptions
+from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.object_classes import object_classes
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
-from bevcli.workshop.formats.boxes import kitti_raw as tracklet_export
-from bevcli.workshop.formats.boxes.kitti import write_kitti
-from bevcli.workshop.formats.boxes.openlabel import openlabel
-from bevcli.workshop.formats.labels import label_format
-from bevcli.workshop.formats.labels.sequence import WithLabels, _labelled_places
+from bevcli.workshop.formats.kitti import write_kitti
+from bevcli.workshop.formats.labels import WithLabels, _labelled_places, read_labels
 from bevcli.workshop.formats.native_writer import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
@@ -64,14 +59,11 @@ def as_spreadsheet(text: str) -> bytes:
     return ("\ufeff" + "".join(";".join(row).replace(".", ",") + "\r\n" for row in cells)).encode()
 
 
-@pytest.mark.parametrize("form", ["csv", "spreadsheet", "openlabel"])
+@pytest.mark.parametrize("form", ["csv", "spreadsheet"])
 def test_what_bevcli_exports_is_read_again(form: str, tmp_path: Path) -> None:
-    drive, path = Drive(), tmp_path / f"labels.{'json' if form == 'openlabel' else 'csv'}"
+    drive, path = Drive(), tmp_path / "labels.csv"
     given = boxes_of_drive(drive)
-    if form == "openlabel":
-        path.write_text(json.dumps(openlabel(given)))
-    else:
-        write_csv(given, path)
+    write_csv(given, path)
     if form == "spreadsheet":
         path.write_bytes(as_spreadsheet(path.read_text()))
     labelled = WithLabels(drive, path)
@@ -147,38 +139,6 @@ def test_a_wrong_table_is_one_clear_line(text: str, message: str, tmp_path: Path
     (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         WithLabels(Drive(), tmp_path / "labels.csv")
-    assert "\n" not in str(caught.value)
-
-
-def openlabel_text(cuboid: dict, timestamp: object = None) -> str:
-    properties = {} if timestamp is None else {"timestamp": timestamp}
-    frame = {"frame_properties": properties, "objects": {"7": {"object_data": {"cuboid": [cuboid]}}}}
-    return json.dumps({"openlabel": {"objects": {"7": {"name": "a", "type": "PKW"}}, "frames": {"0": frame}}})
-
-
-def test_openlabel_angles_turn_about_the_vertical(tmp_path: Path) -> None:
-    path = tmp_path / "labels.json"
-    path.write_text(openlabel_text({"name": "a", "val": [1, 2, 3, 0, 0, 0.7, 4, 2, 1], "coordinate_system": "ego"}))
-    (frame,) = label_format.read_labels(path, Drive().rig, LabelOptions()).frames
-    np.testing.assert_allclose(frame.boxes.yaws, [0.7])
-    assert (frame.boxes.classes.tolist(), frame.boxes.instances.tolist()) == (["PKW"], ["7"])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"openlabel": []}', "is not OpenLABEL"),
-        ('{"openlabel": {', "is not OpenLABEL"),
-        ("[]", "is no file of labels .*an OpenLABEL file"),
-        (openlabel_text({"val": [1, 2]}), "object 7: expected a cuboid of 10 or 9 numbers"),
-        (openlabel_text({"val": [1] * 9, "coordinate_system": "lidar"}), "in one of world, odom, ego, .* found lidar"),
-        (openlabel_text({"val": [1] * 9}, "yesterday"), 'timestamp "yesterday" is not a time'),
-    ],
-)
-def test_wrong_openlabel_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "labels.json").write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
-        WithLabels(Drive(), tmp_path / "labels.json")
     assert "\n" not in str(caught.value)
 
 
@@ -265,18 +225,6 @@ def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path
         WithLabels(Drive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
 
 
-def test_tracklets_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
-    drive = Drive()
-    given = replace(boxes_of_drive(drive), classes=object_classes(("PKW", "Lorry"), {}))
-    tracklet_export.FORMAT.write(given, tmp_path, ExportOptions("kitti-raw"), tmp_path)
-    labelled = WithLabels(drive, tmp_path / drive.stamps[0].scene / "tracklet_labels.xml")
-    for place, frame in enumerate(given.frames):
-        found = labelled.load(place).ground_truth
-        same_boxes(replace(found, velocities=frame.boxes.velocities), frame.boxes)
-    assert np.allclose(labelled.load(1).ground_truth.velocities[0], (4, 0), atol=1e-3)  # they follow from the tracks
-    assert found.instances.tolist() == ["0", "1"]
-
-
 # As CVAT 2 exports a track of two frames with a gap of one between them: a PKW, 4 m long, 2 m wide and 1.5 m high.
 POSE = "<item><tx>{}</tx><ty>2</ty><tz>1</tz><rx>0</rx><ry>0</ry><rz>0.7</rz><truncation>{}</truncation></item>"
 CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
@@ -293,14 +241,14 @@ CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
 def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
     path = tmp_path / "tracklet_labels.xml"
     path.write_text(CVAT_TRACKLETS)
-    labels = label_format.read_labels(path, Drive().rig, LabelOptions())
+    labels = read_labels(path, Drive().rig, LabelOptions())
     assert [frame.index for frame in labels.frames] == [1, 3]
     box = labels.frames[1].boxes
     np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [12, 2, 1, 4, 2, 1.5, 0.7])
     assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["0"])
     assert any("CVAT's version" in note for note in labels.notes)
     path.write_text(CVAT_TRACKLETS.replace("<item_version>0", "<item_version>2").replace('"yes"', '"true"'))
-    as_kitti = label_format.read_labels(path, Drive().rig, LabelOptions())
+    as_kitti = read_labels(path, Drive().rig, LabelOptions())
     assert [frame.index for frame in as_kitti.frames] == [1, 2, 3]
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.centers[0]], [8, 2, 2])  # 1 m is the bottom
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.sizes_lwh[0]], [1.5, 4, 2])
@@ -319,7 +267,7 @@ def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list,
     height, width, length = hwl
     text = CVAT_TRACKLETS.replace("<h>2.0</h><w>4.0</w><l>1.5</l>", f"<h>{height}</h><w>{width}</w><l>{length}</l>")
     (tmp_path / "tracklet_labels.xml").write_text(text)
-    labels = label_format.read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
+    labels = read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
     assert labels.frames[0].boxes.sizes_lwh[0].tolist() == sizes
 
 
@@ -344,7 +292,7 @@ def test_wrong_tracklets_are_one_clear_line(old: str, new: str, message: str, tm
 
 def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.xml").write_text("")
-    with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or an OpenLABEL file"):
+    with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or CVAT tracklets"):
         WithLabels(Drive(), tmp_path / "labels.xml")
 
 
@@ -368,7 +316,6 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
     ("name", "text", "kept"),
     [
         ("labels.csv", f"{HEAD}\n0,PKW,1,2,0,4,2,0,0\n0,PKW,1,2,0,4,2,1,0", 1),
-        ("openlabel.json", openlabel_text({"val": [0] * 10}), 0),
         ("default.json", cvat_text(scale=[1, 1, 0]), 0),
         ("0000.txt", "0 1 Car 0 0 0 0 0 9 9 0 2 4 0 1 20 0\n0 2 Car 0 0 0 0 0 9 9 1 2 4 0 1 20 0", 1),
         ("labels.xml", CVAT_TRACKLETS.replace("<h>2.0</h>", "<h>0</h>"), 0),

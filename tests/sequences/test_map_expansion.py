@@ -7,6 +7,7 @@ bev y is x - 1.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,13 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.frame import Ground, MapLines, Plan
+from bevcli.frame import Ground
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.vad.lines_file import LinesWriter
-from bevcli.workshop.vad.plan_file import PlanWriter
+from bevcli.workshop.vad.map_lines import LinesWriter, MapLines
+from bevcli.workshop.vad.plan import Plan, PlanWriter
 
 TIMES = 0.5 * np.arange(1, 7)
 
@@ -79,8 +80,7 @@ def extents(lines: MapLines, name: str) -> set[tuple[float, ...]]:
 
 
 def test_lines_are_cut_and_in_the_bev_frame(root: Path) -> None:
-    lines = open_sequence(root).ground_truth_frame(0).ground_truth_lines
-    assert lines is not None
+    (lines,) = open_sequence(root).ground_truth_frame(0).ground_truth_results
     assert extents(lines, "divider") == {(0, 0, -30, 30)}
     assert extents(lines, "ped_crossing") == {(-4.5, 4.5, 9, 12)}  # its halves are one
     assert extents(lines, "boundary") == {(4.5, 4.5, -30, 30), (-4.5, -4.5, -30, 30), (-2.5, -1.5, 19, 21)}
@@ -102,8 +102,8 @@ def perfect_run(root: Path, folder: Path) -> Path:
             scored = boxes.__class__(**vars(boxes) | {"scores": np.ones(len(boxes)), "futures": futures})
             stated = {"ego_from_bev": pose_to_json(Pose.from_matrix(frame.rig.ego_from_bev))}
             writer.write(FrameBoxes(frame.stamp, frame.world_from_ego, scored, stated))
-            true = frame.ground_truth_lines
-            lines.write(ground, None if true is None else MapLines(true.points, true.classes, np.ones(len(true))))
+            scores = [replace(true, scores=np.ones(len(true))) for true in frame.ground_truth_results]
+            lines.write(ground, scores[0] if scores else None)
             plans.write(ground, plan)
     lines.close()
     plans.close()
@@ -128,7 +128,7 @@ def test_missing_or_wrong_maps_are_named(root: Path, tmp_path: Path) -> None:
     run, bare = perfect_run(root, tmp_path / "run"), tmp_path / "bare"
     write_tables(bare / "v1.0-mini", Size(scenes=1, samples=8, objects=2))
     with pytest.raises(InputError, match=r"scene-0001.* has no true lines .*the map expansion in .*/expansion"):
-        evaluate(run, bare, driving=["map"])
+        evaluate(run, bare, map=True)
     (bare / "v1.0-mini" / "log.json").write_text(json.dumps([{"token": token(9, 0), "location": "here"}]))
     (bare / "maps" / "expansion").mkdir(parents=True)
     (bare / "maps" / "expansion" / "here.json").write_text('{"node": [{"token": "a"}]}')

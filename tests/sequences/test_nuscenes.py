@@ -13,14 +13,12 @@ from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.evaluation.inputs import open_ground_truth
-from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
-from bevcli.sequences.files.boxes_file import BoxesFile, write_boxes
-from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
-from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
+from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
+from bevcli.sequences.nuscenes import tables
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import NUSCENES
+from bevcli.sequences.nuscenes.index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence, read_can_bus
+from bevcli.sequences.nuscenes.tables import build_index
 from bevcli.sequences.open import open_sequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)
@@ -113,8 +111,8 @@ def test_order_of_rows_does_not_matter(root, tmp_path):
 
 def test_batches_contain_all_rows_of_a_table(root, monkeypatch):
     path = root / "v1.0-trainval" / "sample_data.json"
-    monkeypatch.setattr(nuscenes_json, "BATCH_BYTES", 10_000)
-    batches = list(nuscenes_json.read_batches(path))
+    monkeypatch.setattr(tables, "BATCH_BYTES", 10_000)
+    batches = list(tables.read_batches(path))
     assert len(batches) > 10
     assert [row for batch in batches for row in batch.rows] == json.loads(path.read_text())
 
@@ -308,15 +306,15 @@ def test_missing_or_broken_table_is_named(root):
 def cached(root, monkeypatch, tmp_path):
     """The small tables, cached like large ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(nuscenes_cache, "SMALLEST_BYTES", 0)
+    monkeypatch.setattr(tables, "SMALLEST_BYTES", 0)
     return root
 
 
 def test_cached_index_equals_the_built_index(cached, monkeypatch):
-    first, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    first, note = tables.open_index(cached / "v1.0-trainval")
     assert str(cached / "cache" / "bevcli") in note
-    monkeypatch.delattr(nuscenes_cache, "build_index")  # the second time reads no table
-    second, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    monkeypatch.delattr(tables, "build_index")  # the second time reads no table
+    second, note = tables.open_index(cached / "v1.0-trainval")
     assert note == ""
     for part in ("scenes", "sensors", "samples", "images", "annotations"):
         for name, values in vars(getattr(first, part)).items():
@@ -324,25 +322,25 @@ def test_cached_index_equals_the_built_index(cached, monkeypatch):
 
 
 def test_changed_table_rebuilds_the_index(cached):
-    nuscenes_cache.open_index(cached / "v1.0-trainval")
+    tables.open_index(cached / "v1.0-trainval")
     edit_table(cached, "scene", lambda rows: [{**row, "name": "scene-09" + row["name"][-2:]} for row in rows])
-    index, _ = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    index, _ = tables.open_index(cached / "v1.0-trainval")
     assert index.scenes.names.tolist() == ["scene-0901", "scene-0902", "scene-0903"]
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\x93NUMPY broken"])
 def test_a_damaged_cache_is_built_anew(cached, content):
-    index, _ = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    index, _ = tables.open_index(cached / "v1.0-trainval")
     (file,) = (cached / "cache").rglob("samples.times_us.npy")
     file.unlink() if content is None else file.write_bytes(content)
-    again, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
+    again, note = tables.open_index(cached / "v1.0-trainval")
     assert "is cached in" in note
     np.testing.assert_array_equal(again.samples.times_us, index.samples.times_us)
 
 
 def test_nothing_is_written_into_the_dataset(cached):
     before = sorted(path.name for path in (cached / "v1.0-trainval").iterdir())
-    nuscenes_cache.open_index(cached / "v1.0-trainval")
+    tables.open_index(cached / "v1.0-trainval")
     assert sorted(path.name for path in (cached / "v1.0-trainval").iterdir()) == before
 
 

@@ -21,7 +21,7 @@ from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import DerivedSequence, Frame, Sequence
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, with_track_velocities
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse
@@ -30,7 +30,6 @@ from bevcli.inference.run import run
 from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.tracks import with_track_velocities
 
 FORMATS: dict[str, Format] = {name: resolve_name(f"{one.module}:FORMAT") for name, one in WRITTEN.items()}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}
@@ -388,8 +387,7 @@ def test_a_class_map_renames_a_class(street, tmp_path):
 @pytest.mark.parametrize("name", list(WRITTEN))
 def test_the_document_has_all_class_names(name):
     """Its table has the rows of the mapping, and others that have no class."""
-    module = resolve_name(f"{WRITTEN[name].module.removesuffix('.format')}.sequence")
-    mapping = module.CLASS_OF_NAME if name == "dgp" else module.CLASS_OF_CATEGORY
+    mapping = resolve_name(f"{WRITTEN[name].module}:CLASS_OF_CATEGORY")
     section = DOCUMENT.split(f"<!-- {name} -->")[1].split("<!--")[0]
     rows = {one: target for names, target in ROW.findall(section) for one in names.split("`, `")}
     assert {one: target for one, target in rows.items() if target != "–"}.items() >= mapping.items()

@@ -5,8 +5,7 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Sequence
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.selection import select_every, select_range, select_rate
+from bevcli.sequences.open import open_sequence, select_every, select_range, select_rate
 
 START_NS = 1_533_151_603_000_000_000
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from memory_drive import MemorySequence
 
-from bevcli.frame import MapLines
 from bevcli.registry import load
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import WriteOptions
 from bevcli.workshop.formats.output import GROUP, open_writer
+from bevcli.workshop.vad.map_lines import MapLines
 
 LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
 
 
 def with_lines(drive: MemorySequence, place: int):
-    return replace(drive.load(place), ground_truth_lines=MapLines((LINE,), np.array(["divider"])))
+    return replace(drive.load(place), ground_truth_results=(MapLines((LINE,), np.array(["divider"])),))
 
 
 def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
@@ -28,7 +28,7 @@ def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
                 writer.write(with_lines(drive, place) if read is None else read.load(place))
     read = open_sequence(tmp_path / "two")
     for place in range(2):
-        lines = read.load(place).ground_truth_lines
+        (lines,) = read.load(place).ground_truth_results
         assert list(lines.classes) == ["divider"]
         np.testing.assert_allclose(lines.points[0], LINE, atol=0.005)
 

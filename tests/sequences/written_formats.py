@@ -242,7 +242,7 @@ class WrittenFormat:
 
 
 WRITTEN = {
-    "dgp": WrittenFormat(write_dgp, "bevcli.workshop.formats.dgp.format", {}),
-    "argoverse2": WrittenFormat(write_argoverse2, "bevcli.workshop.formats.argoverse2.format", {"distorted": True}),
-    "t4": WrittenFormat(write_t4, "bevcli.workshop.formats.t4.format", {}),
+    "dgp": WrittenFormat(write_dgp, "bevcli.workshop.formats.dgp", {}),
+    "argoverse2": WrittenFormat(write_argoverse2, "bevcli.workshop.formats.argoverse2", {"distorted": True}),
+    "t4": WrittenFormat(write_t4, "bevcli.workshop.formats.t4", {}),
 }

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 

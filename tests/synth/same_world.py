@@ -4,7 +4,7 @@ from copy import copy
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.workshop.synth.drive import RenderedDrive
-from bevcli.workshop.synth.render.lens import lens_parts
+from bevcli.workshop.synth.rig import lens_parts
 
 
 def with_rig(drive: RenderedDrive, rig: CameraRig) -> RenderedDrive:

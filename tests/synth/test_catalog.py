@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.workshop.synth.assets.catalog import Assets, draw_body
-from bevcli.workshop.synth.assets.paint import linear
+from bevcli.workshop.synth.catalog import Assets, draw_body
+from bevcli.workshop.synth.mesh import linear
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 # Smallest and largest plausible length, width and height of each class, metres.

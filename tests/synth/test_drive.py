@@ -9,10 +9,10 @@ from same_world import with_rig
 
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse, wrap_angle
-from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import ANNOTATED_M, RenderedDrive, RenderedFrame
 from bevcli.workshop.synth.rig import nuscenes_like_rig
-from bevcli.workshop.synth.world.traffic import ActorState
+from bevcli.workshop.synth.traffic import ActorState
 
 
 def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):

@@ -9,17 +9,15 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES
 from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.synth.assets.catalog import Assets
-from bevcli.workshop.synth.drive import RenderedDrive
-from bevcli.workshop.synth.export import export_drive, render as render_sequence
+from bevcli.workshop.synth.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive, export_drive, render as render_sequence
+from bevcli.workshop.synth.looks import WEATHER_NAMES
 from bevcli.workshop.synth.options import Weather, parse_resolution
 from bevcli.workshop.synth.rig import nuscenes_like_rig
-from bevcli.workshop.synth.world.weather import WEATHER_NAMES
-from bevcli.workshop.vad.lines_file import TRUE_LINES, read_lines
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, read_lines
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +55,7 @@ def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive,
     for found, expected in zip(lines.frames[1].lines.points, rendered.lines.points, strict=True):
         at = apply(world_from_bev, np.pad(expected, ((0, 0), (0, 1))))
         np.testing.assert_allclose(found[:, :2], at[:, :2], atol=0.05)  # the bev frame is 1.84 m above the ground
-    read = open_sequence(folder).load(1).ground_truth_lines
-    assert read is not None
+    (read,) = open_sequence(folder).load(1).ground_truth_results
     for found, expected in zip(read.points, rendered.lines.points, strict=True):
         np.testing.assert_allclose(found, expected, atol=2e-3)  # files have millimetres
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from bevcli.workshop.robustness.sequences import Draws
+from bevcli.workshop.robustness.conditions import Draws
 from bevcli.workshop.synth.corruptions import (
     FOG,
     LOW_LIGHT,

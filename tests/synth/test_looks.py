@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from bevcli.workshop.synth.assets.catalog import Assets
+from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive
+from bevcli.workshop.synth.looks import bent, recoloured
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
-from bevcli.workshop.synth.world.looks import bent, recoloured
 
 
 def drive(varied: bool, seed: int = 5) -> RenderedDrive:

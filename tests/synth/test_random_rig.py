@@ -8,9 +8,8 @@ import pytest
 from bevcli.frame import Sequence
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.synth.assets.catalog import Assets
-from bevcli.workshop.synth.drive import RenderedDrive
-from bevcli.workshop.synth.export import export_drive
+from bevcli.workshop.synth.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive, export_drive
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
 
 SIZE = (512, 288)

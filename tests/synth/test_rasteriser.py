@@ -8,8 +8,8 @@ import pytest
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
-from bevcli.workshop.synth.assets.mesh import Mesh, TriangleSoup
-from bevcli.workshop.synth.render.rasteriser import rasterise
+from bevcli.workshop.synth.mesh import Mesh, TriangleSoup
+from bevcli.workshop.synth.renderer import rasterise
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 CAMERA = nuscenes_like_rig(160, 90)["CAM_FRONT_LEFT"]

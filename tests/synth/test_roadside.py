@@ -2,9 +2,9 @@
 
 import pytest
 
-from bevcli.workshop.synth.assets.catalog import Assets
-from bevcli.workshop.synth.world.city import STOP_LINE_M, CityPlan
-from bevcli.workshop.synth.world.roadside import Roadside, StandingActor
+from bevcli.workshop.synth.catalog import Assets
+from bevcli.workshop.synth.city import STOP_LINE_M, CityPlan
+from bevcli.workshop.synth.roadside import Roadside, StandingActor
 
 WORKS = ("barrier-", "cone-", "machine-", "worker-")
 

@@ -17,7 +17,7 @@ from bevcli.errors import WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
-from bevcli.workshop.training.backbone_weights import start_backbone
+from bevcli.workshop.training.warm_start import start_backbone
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 

@@ -14,7 +14,7 @@ from bevcli.frame import Sequence
 from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.sequences.selection import select_range
+from bevcli.sequences.open import select_range
 from bevcli.workshop.synth.drives import FolderDrives
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.validation import validate

@@ -16,14 +16,12 @@ from small_fleet import write_fleet
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
 from bevcli.sequences.native.folder import FolderSequence
-from bevcli.workshop.synth.drives import FolderDrives
+from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.synth.splits import read_split, scored_drives
-from bevcli.workshop.training.changes import with_changes
-from bevcli.workshop.training.drive_checks import check_scored_drives, check_training_drives
-from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
+from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.validation import check_scored_drives, check_training_drives
 
 CPU = torch.device("cpu")
 SETTINGS = {"clips.frames": "2", "clips.batch": "1", "held_out": "1", "steps": "1"}
@@ -170,20 +168,6 @@ def test_a_star_stands_for_folders_in_order(fleet: Path) -> None:
     assert [path.name for path in read_split(file).train] == ["d000", "d001", "d002", "d003"]
 
 
-def test_a_seed_draws_a_split_whatever_the_order(fleet: Path) -> None:
-    def drawn(text: str, seed: int) -> list[str]:
-        file = fleet / "drawn.toml"
-        file.write_text(f"drives = {text}\nvalidate_share = 0.4\nseed = {seed}\n")
-        split = read_split(file)
-        assert len({*split.train, *split.validate}) == 4
-        return sorted(path.name for path in split.validate)
-
-    splits = [drawn('["d00?"]', seed) for seed in range(8)]
-    assert {len(split) for split in splits} == {2}
-    assert len({tuple(split) for split in splits}) > 1
-    assert [drawn('["d003", "d001", "d002", "d000"]', seed) for seed in range(8)] == splits
-
-
 def test_batch_norms_kept_from_random_weights_are_said(prepare: Callable[..., TrainingJob]) -> None:
     notes = prepare("d000", "d001", changes={"freeze_batch_norm": "true"}).notes
     assert any("starts from random weights, but its file keeps the statistics of batch norms" in note for note in notes)
@@ -192,13 +176,7 @@ def test_batch_norms_kept_from_random_weights_are_said(prepare: Callable[..., Tr
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('train = ["d000"]\n', "expected the keys train and validate, or drives, validate_share, seed, found train"),
-        (
-            'drives = ["d00?"]\nvalidate_share = 1\nseed = 0',
-            "validate_share: expected a number between 0 and 1, found 1",
-        ),
-        ('drives = ["d00?"]\nvalidate_share = 0.5\nseed = "a"', "seed: expected an integer, found 'a'"),
-        ('drives = ["d000"]\nvalidate_share = 0.5\nseed = 0', "leaves no drive to score on"),
+        ('train = ["d000"]\n', "expected the keys train and validate, found train"),
         ('train = ["d000"]\nvalidate = []\n', "validate: leaves no drive"),
         ('train = ["d000"]\nvalidate = ["d9*"]\n', r"validate: d9\*: there is no such folder"),
         ('train = ["d000"]\nvalidate = ["./d000"]\n', "d000 stands there twice"),

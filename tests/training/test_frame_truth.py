@@ -12,18 +12,19 @@ from safetensors.torch import load_file
 
 from bevcli.config import load_config
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, MapLines, Sequence
+from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.frame_losses import FrameLosses, LossConfigs
-from bevcli.workshop.training.frame_truth import frame_truth
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
 from bevcli.workshop.training.samples import Clip, ClipConfig, load_batch
 from bevcli.workshop.training.trainer import Trainer, forward_clip
 from bevcli.workshop.vad.config import VADConfig
+from bevcli.workshop.vad.frame_truth import frame_truth
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig
+from bevcli.workshop.vad.map_lines import MapLines
 from bevcli.workshop.vad.motion_head import MotionConfig
 from bevcli.workshop.vad.vad import VAD
 
@@ -57,7 +58,7 @@ class MovingDrive(Sequence):
         )  # fmt: skip
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.zeros(3))
         at = dict.fromkeys(RIG.names, pose)
-        return Frame(self.stamps[place], RIG, {}, pose, at, still, ground_truth=boxes, ground_truth_lines=LINES)
+        return Frame(self.stamps[place], RIG, {}, pose, at, still, ground_truth=boxes, ground_truth_results=(LINES,))
 
 
 def test_futures_and_the_driven_path_are_in_the_bev_frame() -> None:
@@ -86,7 +87,7 @@ def test_missing_lines_and_identities_are_named() -> None:
     drive = MovingDrive()
     frame = drive.load(0)
     with pytest.raises(InputError, match=r"frame 0 of the drive has no true lines .* ground_truth_lines\.json"):
-        frame_truth(replace(frame, ground_truth_lines=None), drive, 0, VAD_CONFIG)
+        frame_truth(replace(frame, ground_truth_results=()), drive, 0, VAD_CONFIG)
     nameless = replace(frame, ground_truth=replace(frame.ground_truth, instances=None))
     with pytest.raises(InputError, match='true boxes have no "instance"'):
         frame_truth(nameless, drive, 0, VAD_CONFIG)
@@ -99,7 +100,7 @@ class LinedDrive(PaintedDrive):
         frame = super().load(index)
         assert frame.ground_truth is not None
         names = np.array([str(place) for place in range(len(frame.ground_truth))])
-        return replace(frame, ground_truth=replace(frame.ground_truth, instances=names), ground_truth_lines=LINES)
+        return replace(frame, ground_truth=replace(frame.ground_truth, instances=names), ground_truth_results=(LINES,))
 
 
 class LinedDrives:

@@ -17,8 +17,7 @@ from bevcli.inference.preprocess import write_network_image
 from bevcli.model.config import ImageConfig
 from bevcli.workshop.training.augmentation import AugmentationConfig, noisy
 from bevcli.workshop.training.loading import BatchMaker, loaded_batches
-from bevcli.workshop.training.pixels import images_from_bytes, write_bytes
-from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.samples import ClipConfig, images_from_bytes, write_bytes
 
 NOTHING, NOISE = AugmentationConfig(0, 0), AugmentationConfig(0.5, 0.5, exposure=1.0, noise=6.0, calibration_share=0.5)
 LITE = ImageConfig((64, 48), mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), color_order="rgb")
@@ -66,14 +65,6 @@ def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:
             assert torch.equal(alone.image_from_bev[0], together.image_from_bev[place])
         for own, of_batch in zip(clip.targets, batch.targets, strict=True):
             assert torch.equal(own.detection[0].labels, of_batch.detection[place].labels)
-
-
-def test_unchanged_clips_are_prepared_once_for_the_teacher() -> None:
-    unchanged, changed = maker(NOTHING).clip(0, 0, 0), maker().clip(0, 0, 0)
-    assert unchanged.plain is not None
-    assert changed.plain is not None
-    assert unchanged.plain.inputs is unchanged.inputs
-    assert not torch.equal(changed.plain.inputs[0].images, changed.inputs[0].images)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.workshop.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss
-from bevcli.workshop.training.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.detection_loss import (
+    DetectionLossConfig,
+    DetectionTargets,
+    detection_loss,
+    focal_cost,
+    focal_loss,
+    hungarian_matching,
+)
 from bevcli.workshop.training.segmentation_loss import dice_costs, dice_loss
 
 

@@ -219,13 +219,6 @@ def test_boxes_outside_the_grid_are_detected_too() -> None:
     assert len(targets.detection[0].labels) < len(targets.perspective[0].labels) == 5
 
 
-def test_the_table_of_earlier_versions_is_rejected_by_new_name(tmp_path: Path) -> None:
-    (tmp_path / "old.toml").write_text("[training.picture_loss]\nweight = 1.0\n")
-    expected = r'unknown key "training.picture_loss"; \[training.perspective_loss\] replaces it'
-    with pytest.raises(ConfigError, match=expected):
-        load_table(tmp_path / "old.toml", TRAINING, TrainingConfig)
-
-
 def test_a_negative_weight_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text("[training.perspective_loss]\ndepth_weight = -1.0\n")
     with pytest.raises(

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from bevcli.model.config import ImageConfig
-from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.randomisation import RandomisationConfig, randomised
+from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig, randomised
 
 LITE = ImageConfig((48, 32), (127.0,) * 3, (128.0,) * 3, "rgb")
 IMAGENET = ImageConfig((48, 32), (123.675, 116.28, 103.53), (58.395, 57.12, 57.375), "rgb")
@@ -87,15 +86,15 @@ def test_a_convolution_mixes_pixels_up_to_three_away() -> None:
 
 
 def test_no_saturation_leaves_the_mean_of_the_channels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bevcli.workshop.training.randomisation.SATURATION_RANGE", (0.0, 0.0))
+    monkeypatch.setattr("bevcli.workshop.training.augmentation.SATURATION_RANGE", (0.0, 0.0))
     pixels = made_images()
     found = changed(pixels, RandomisationConfig(saturation=1.0), IMAGENET)
     torch.testing.assert_close(found, pixels.mean(1, keepdim=True).expand_as(pixels), atol=0.01, rtol=1e-4)
 
 
 def test_contrast_and_brightness_are_those_of_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bevcli.workshop.training.randomisation.CONTRAST_RANGE", (1.5, 1.5))
-    monkeypatch.setattr("bevcli.workshop.training.randomisation.BRIGHTNESS_RANGE", (10.0, 10.0))
+    monkeypatch.setattr("bevcli.workshop.training.augmentation.CONTRAST_RANGE", (1.5, 1.5))
+    monkeypatch.setattr("bevcli.workshop.training.augmentation.BRIGHTNESS_RANGE", (10.0, 10.0))
     pixels = made_images()
     found = changed(pixels, RandomisationConfig(contrast=1.0), IMAGENET)
     torch.testing.assert_close(found, 1.5 * (pixels - 127) + 10 + 127, atol=0.01, rtol=1e-4)

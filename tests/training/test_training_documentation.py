@@ -59,7 +59,7 @@ def with_floats(value: object) -> object:
     return float(value) if type(value) in (int, float) else value
 
 
-@pytest.mark.parametrize("page", ["training.md", "model-card.md", "history.md", "speed.md"])
+@pytest.mark.parametrize("page", ["training.md", "model-card.md", "speed.md"])
 def test_links_lead_to_files_and_headings(page: str) -> None:
     for target in re.findall(r"\]\((?!http)([^)]+)\)", (DOCS / page).read_text()):
         file, _, anchor = target.partition("#")

@@ -11,14 +11,12 @@ from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.formats.csv_table import write_csv
+from bevcli.evaluation.box_format import write_csv
 from bevcli.recording import entities
 from bevcli.viewer import recording_file
-from bevcli.viewer.export import read_recording, recorded_boxes
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.summary import summarise
-from bevcli.viewer.video_frame import CameraImages, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, tiles
 
 
 @pytest.fixture(scope="module")

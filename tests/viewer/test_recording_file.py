@@ -10,7 +10,7 @@ from recorded_drive import NamedModel, predict, record
 from rerun.chunk import RrdReader
 
 from bevcli.errors import InputError
-from bevcli.parsing.own_process import run_python
+from bevcli.parsing.files import run_python
 from bevcli.recording import entities, writer
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording

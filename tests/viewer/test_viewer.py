@@ -14,13 +14,11 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 
 from bevcli.errors import InputError, OutputError
-from bevcli.recording.options import RecordingOptions
-from bevcli.recording.video_images import has_av
+from bevcli.recording.options import RecordingOptions, has_av
 from bevcli.recording.writer import Recording
-from bevcli.viewer import screenshot as screenshot_file, web
-from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+from bevcli.viewer import native, web
+from bevcli.viewer.native import LOOPBACK, NO_DRIVER, free_port, start_viewer, stop, take_screenshot
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
 from bevcli.viewer.web import LiveView
 
 VIEWS = {
@@ -86,8 +84,8 @@ class AnswersUntilItDraws:
 
 
 def test_without_vulkan_an_early_answer_changes_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(screenshot_file, "ViewerClient", AnswersUntilItDraws)
-    monkeypatch.setattr(screenshot_file, "start_viewer", lambda *_: subprocess.Popen([sys.executable, "-c", ""]))
+    monkeypatch.setattr("rerun.experimental.ViewerClient", AnswersUntilItDraws)
+    monkeypatch.setattr(native, "start_viewer", lambda *_: subprocess.Popen([sys.executable, "-c", ""]))
     with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
         take_screenshot(tmp_path / "r.rrd", tmp_path / "image.png")
 

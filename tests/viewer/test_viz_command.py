@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.formats.csv_table import COLUMNS
+from bevcli.evaluation.box_format import COLUMNS
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer import video
-from bevcli.viewer.summary import summarise
+from bevcli.viewer.recording_reader import summarise
 from bevcli.viewer.video import write_video
 
 

@@ -1,6 +1,6 @@
 """Readers and writers of single files that several formats and commands share.
 
-boxes_file: ground_truth.json and predictions.json; box_json: one frame's boxes in it.
+boxes_file: ground_truth.json and predictions.json.
 incremental_json: a file that only grows, and a JSON file that is written entry by entry.
 map_folder: BEV maps, one PNG per frame.
 calibration_file: calibration.json.

@@ -1,27 +1,210 @@
 """ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame."""
 
-from collections.abc import Iterable, Mapping
+import math
+import operator
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args
 
 import msgspec
+import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.parsing.documents import without_garbage_collection
-from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
+FUTURE_DECIMALS = 3  # millimetres
+_OWN_NAMES = ClassNames()
+_Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
+_Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
+_Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
+_Numbers = Annotated[list[float], Meta(description="a list of numbers")]
+# Types of the optional members, by `Column.values`. The range of shares is checked by column.
+_TYPES: dict[str, Any] = {
+    "score": Annotated[float, Meta(ge=0, le=1, description="0 to 1")] | UnsetType,
+    "share": Annotated[float, Meta(description="0 to 1")] | UnsetType | None,
+    "text": Annotated[str, Meta(description="a string")] | UnsetType | None,
+    "flag": Annotated[bool, Meta(description="true or false")] | UnsetType,
+    "count": Annotated[int, Meta(ge=0, description="an integer, 0 or more")] | UnsetType,
+}
 FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
+
+
+class _FixedMembers(Struct, forbid_unknown_fields=True):
+    """A box in JSON without its optional columns. futures: M modes of T steps, each x and y; null if unknown."""
+
+    name: Annotated[str, Meta(min_length=1, description="a name")] = msgspec.field(name="class")
+    center: _Vector
+    size_lwh: _Vector
+    yaw: Annotated[float, Meta(description="a number")]
+    velocity: Annotated[tuple[float | None, float | None], Meta(description="2 numbers")] | None = None
+    futures: _Futures | None = None
+    future_times_s: _Numbers = []
+    future_scores: _Numbers | None = None
+
+
+_Box: Any = msgspec.defstruct(
+    "_Box",
+    [(column.key, _TYPES[column.values], UNSET) for column in OPTIONAL_COLUMNS.values()],
+    bases=(_FixedMembers,),
+    forbid_unknown_fields=True,
+)
+
+
+def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
+    """N boxes from a list of N JSON objects. A missing or null velocity becomes NaN.
+
+    where: start of an error message, such as "boxes.json: frame 3". class_names: maps the classes; names that it does
+    not know are kept.
+    Raises InputError that names the first invalid box by its index in the list.
+    """
+    if not isinstance(objects, list):
+        raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
+    if not objects:
+        return Boxes3D.empty()
+    try:
+        rows = msgspec.convert(objects, list[_Box])
+    except msgspec.ValidationError:
+        index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
+        raise InputError(f"{where}: box {index}: {mistake}") from None
+    boxes = Boxes3D(
+        centers=np.array([row.center for row in rows]),
+        sizes_lwh=np.array([row.size_lwh for row in rows]),
+        yaws=np.array([row.yaw for row in rows]),
+        velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
+        classes=np.array([class_names[row.name] for row in rows]),
+        **{name: _column(rows, column) for name, column in OPTIONAL_COLUMNS.items()},
+        **_futures(rows, where),
+    )
+    without = [index for index, row in enumerate(rows) if row.score is UNSET]
+    if 0 < len(without) < len(rows):
+        raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
+    for name, column in OPTIONAL_COLUMNS.items():
+        shares = getattr(boxes, name)
+        if column.values == "share" and shares is not None:
+            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, column.key, "0 to 1")
+    for key, values in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
+        _require(np.isfinite(values), values, where, key, "finite numbers")
+    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, where, "size_lwh", "numbers above 0")
+    return boxes
+
+
+def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
+    """N JSON objects. Unknown values (NaN visibility, "" names, -1 points) are left out; NaN velocities become null.
+
+    "duplicate" is written only where it is true.
+    """
+    velocities = [[None if math.isnan(v) else v for v in row] for row in boxes.velocities.tolist()]
+    columns: dict[str, list[Any]] = {
+        "class": boxes.classes.tolist(),
+        "center": boxes.centers.tolist(),
+        "size_lwh": boxes.sizes_lwh.tolist(),
+        "yaw": boxes.yaws.tolist(),
+        "velocity": velocities,
+    }
+    objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    for name, column in OPTIONAL_COLUMNS.items():
+        values = getattr(boxes, name)
+        if values is not None:
+            for box, value, is_known in zip(objects, values.tolist(), _is_known(values, column).tolist(), strict=True):
+                if is_known:
+                    box[column.key] = value
+    _add_futures(objects, boxes)
+    return objects
+
+
+def _mistake(box: Any) -> str:
+    """The first mistake in the object of a box, "" if it is right."""
+    if not isinstance(box, dict):
+        return f"expected an object, found {box!r:.40}"
+    fields = {member.encode_name: member for member in msgspec.structs.fields(_Box)}
+    for key in (key for key, member in fields.items() if member.required and key not in box):
+        return f'"{key}" is missing (found: {", ".join(box)})'
+    for key, value in box.items():
+        if key not in fields:
+            return f'unknown key "{key}" (known: {", ".join(sorted(fields))})'
+        try:
+            msgspec.convert(value, fields[key].type)
+        except msgspec.ValidationError:
+            return f"{key}: expected {_description(fields[key].type)}, found {value!r:.60}"
+    return ""
+
+
+def _description(kind: Any) -> str:
+    """The description in a type, or in one of the types of a union."""
+    notes = [note for part in (kind, *get_args(kind)) for note in getattr(part, "__metadata__", ())]
+    return str(notes[0].description)
+
+
+def _column(rows: Sequence[Any], column: Column) -> NDArray[Any] | None:
+    """An optional column; None where no box has it."""
+    values = [getattr(row, column.key) for row in rows]
+    if values.count(UNSET) == len(values):
+        return None
+    return np.array([column.unknown if value is UNSET or value is None else value for value in values])
+
+
+def _is_known(values: NDArray[Any], column: Column) -> NDArray[np.bool_]:
+    """(N,) for which boxes an optional column is written. Scores always are, so that NaN is an error."""
+    if column.values == "score":
+        return np.ones(len(values), dtype=bool)
+    if column.values == "count":
+        return values >= 0  # two unknown numbers may add up to -2
+    return ~np.isnan(values) if column.values == "share" else values != column.unknown
+
+
+def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
+    if not good.all():
+        index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+        raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {column[index].tolist()}")
+
+
+def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
+    """Add futures to N JSON objects: M modes of T steps, each x and y, null if unknown; and the times of the steps."""
+    if boxes.futures is None:
+        return
+    for index, box in enumerate(objects):
+        future = boxes.futures[index]  # (M, T, 3)
+        if not np.isfinite(future[..., 1:]).any():
+            continue
+        box["future_times_s"] = future[0, :, 0].tolist()
+        modes = future[..., 1:].round(FUTURE_DECIMALS).tolist()
+        box["futures"] = [[None if math.isnan(point[0]) else point for point in mode] for mode in modes]
+        if boxes.future_scores is not None:
+            box["future_scores"] = boxes.future_scores[index].tolist()
+
+
+def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
+    """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
+    having = {index: row for index, row in enumerate(rows) if row.futures}
+    if not having:
+        return {}
+    first = next(iter(having.values()))
+    modes, steps = len(first.futures or ()), len(first.future_times_s)
+    futures, scores = np.full((len(rows), modes, steps, 3), np.nan), np.full((len(rows), modes), np.nan)
+    for index, row in having.items():
+        counts = [len(mode) for mode in row.futures or ()]
+        if counts != [steps] * modes or len(row.future_times_s) != steps or len(row.future_scores or counts) != modes:
+            raise InputError(
+                f"{where}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
+                f"{steps}, as in the other boxes of the frame, with a score for each mode and a time for each step)"
+            )
+        futures[index, ..., 0] = row.future_times_s
+        futures[index, ..., 1:] = [[point or (np.nan, np.nan) for point in mode] for mode in row.futures or ()]
+        scores[index] = row.future_scores or np.nan
+    return {"futures": futures, **({"future_scores": scores} if any(row.future_scores for row in rows) else {})}
 
 
 @dataclass(frozen=True)
@@ -85,7 +268,7 @@ def read_boxes(
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
         reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
         names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
-        frames = tuple(_frame(path, place, row, reference, names) for place, row in enumerate(rows))
+        frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
@@ -156,8 +339,8 @@ def write_boxes(boxes: BoxesFile, path: Path) -> int:
     return sum(len(frame.boxes) for frame in boxes.frames)
 
 
-def _frame(path: Path, place: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
-    stamp = stamp_from_json(row, f"{path}: entry {place} of frames")
+def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
+    stamp = stamp_from_json(row, f"{path}: entry {index} of frames")
     where = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
         raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')

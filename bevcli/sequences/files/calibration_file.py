@@ -12,8 +12,7 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
-from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import (

@@ -17,8 +17,8 @@ YAML_SUFFIXES = (".yaml", ".yml")
 CHAIN = "camera_from_previous"  # key of Kalibr's T_cn_cnm1 in Fields, until all poses are known
 
 
-def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | None:
-    """The rig of an intrinsics and an extrinsics file; None if neither is given.
+def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig:
+    """The rig of an intrinsics and an extrinsics file.
 
     intrinsics: a Kalibr camchain, a ROS camera_info, or a folder of these.
     extrinsics: JSON with each camera's pose and, optionally, the bev frame:
@@ -26,11 +26,9 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
         A camera that is missing there gets its pose from its neighbour and T_cn_cnm1 of the camchain.
     Raises InputError if one file is given without the other, or one is missing or invalid.
     """
-    if intrinsics is None and extrinsics is None:
-        return None
     if intrinsics is None or extrinsics is None:
         raise InputError("`intrinsics` and `extrinsics` must be given together: pass both, or write a calibration.json")
-    cameras = _read_intrinsics(intrinsics)
+    cameras = _intrinsics_in(intrinsics)
     document = read_json(extrinsics)
     if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
         expected = '{"cameras": {"cam0": {"ego_from_camera": ...}}}'
@@ -42,8 +40,7 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     return CameraRig(rig_cameras, require(parse_transform, document, "ego_from_bev", where=extrinsics))
 
 
-def _read_intrinsics(path: Path) -> dict[str, Fields]:
-    """The fields of every camera in a file or in the files of a folder, by name."""
+def _intrinsics_in(path: Path) -> dict[str, Fields]:
     files = [path]
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in YAML_SUFFIXES]

@@ -2,7 +2,6 @@
 
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.formats.output import OutputFormat
 
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
@@ -15,5 +14,3 @@ FORMAT = Format(
     options=RigOptions,
     precedence=-10,
 )
-
-OUTPUT = OutputFormat("a sequence folder", "bevcli.workshop.formats.native_writer:write_native", keeps_maps=True)

@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.csv_tables import CsvRow, read_csv
+from bevcli.parsing.documents import CsvRow, read_csv
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.writing import whole_file
 

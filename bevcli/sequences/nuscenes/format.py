@@ -5,7 +5,6 @@ from pathlib import Path
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
-from bevcli.workshop.formats.output import OutputFormat
 
 
 @options("Input")
@@ -47,5 +46,3 @@ FORMAT = Format(
     annotated=True,
     precedence=20,
 )
-
-OUTPUT = OutputFormat("a nuScenes root", "bevcli.workshop.formats.nuscenes_writer:NuScenesWriter")

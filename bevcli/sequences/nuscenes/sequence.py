@@ -13,16 +13,25 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
-from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.images import ImageReader, ImageSource
-from bevcli.sequences.native.folder import rig_notes
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.format import true_results
+from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples, Sensors
-from bevcli.sequences.nuscenes.json_tables import read_rows
-from bevcli.sequences.nuscenes.map_expansion import MapExpansion
+from bevcli.sequences.nuscenes.index import (
+    NUSCENES,
+    Dialect,
+    Images,
+    Ints,
+    NuScenesIndex,
+    Samples,
+    Sensors,
+    chosen_scenes,
+    keyframes,
+    sweep_frames,
+    tables_of,
+)
+from bevcli.sequences.nuscenes.tables import open_index, read_rows
 from bevcli.sequences.options import SequenceOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
@@ -80,6 +89,7 @@ class TableSequence(Sequence):
         self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
     ) -> None:
         common.refuse_static(root)
+        self.name = root.resolve().name
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
@@ -88,7 +98,7 @@ class TableSequence(Sequence):
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
-        self.notes = (*((note,) if note else ()), *rig_notes(self.rig, str(tables)), *self._table_notes())
+        self.notes = (*((note,) if note else ()), *bev_frame_notes(self.rig, str(tables)), *self._table_notes())
 
     def _table_notes(self) -> Iterator[str]:
         """What the tables lack."""
@@ -185,16 +195,16 @@ class NuScenesSequence(TableSequence):
         tables = tables_of(root, own.version)
         super().__init__(root, tables, common, NUSCENES, own)
         self.name = common.scene or own.split or tables.name
-        self._maps = MapExpansion(root, tables) if common.ground_truth else None
+        self._true_results = true_results("nuscenes", root, tables=tables) if common.ground_truth else ()
         note = self._can_bus_note()
         self.notes = (*self.notes, note) if note else self.notes
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
         frame = super()._frame(entry, with_images=with_images)
-        if self._maps is None or entry.sample is None:
+        if entry.sample is None:
             return frame
-        bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
-        return replace(frame, ground_truth_lines=self._maps.lines(frame.stamp.scene, bev_from_world))
+        results = (result for of_frame in self._true_results if (result := of_frame(frame)) is not None)
+        return replace(frame, ground_truth_results=tuple(results))
 
     def _can_bus_note(self) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in self.scenes]

@@ -16,8 +16,7 @@ from bevcli.workshop.batch.options import BatchOptions, Workers
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model
-    from bevcli.workshop.batch.drives import Drive
-    from bevcli.workshop.batch.job import Job
+    from bevcli.workshop.batch.job import Drive, Job
     from bevcli.workshop.batch.run_batch import BatchSummary
 
 PANEL = "Run"
@@ -52,8 +51,7 @@ def batch(
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
     from bevcli.sequences.nuscenes.format import NuScenesOptions
-    from bevcli.workshop.batch.drives import find_drives, read_list
-    from bevcli.workshop.batch.job import Job, all_own_options, with_absolute_paths
+    from bevcli.workshop.batch.job import Job, all_own_options, find_drives, read_list, with_absolute_paths
     from bevcli.workshop.batch.storage import is_url
 
     texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]
@@ -63,7 +61,6 @@ def batch(
         options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
         with_absolute_paths(model),
         run=replace(run_options, recording=recording),
-        embed=options.embed,
         evaluate=options.evaluate,
         retries=workers.retries,
     )

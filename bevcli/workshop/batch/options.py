@@ -1,4 +1,4 @@
-"""The options of a batch, of its workers on Ray, and of a search for similar frames."""
+"""The options of a batch, and of its workers on Ray."""
 
 import importlib.util
 from pathlib import Path
@@ -73,9 +73,6 @@ class BatchOptions:
         help="Score drives that have ground truth, each and all together (metrics.json).",
         flag="--eval",
     )
-    embed: bool = option(
-        default=False, help="Write a vector per frame, the pooled BEV features, for `bevcli find-like`."
-    )
 
 
 @options("Input")
@@ -92,22 +89,4 @@ class ReproduceOptions:
     )
     resume: bool = option(
         default=False, help="Go on in the output folder: scenes that are done are not run again.", panel="Output"
-    )
-
-
-@options()
-class FindLikeOptions:
-    """A frame of a batch, and how many similar ones are listed."""
-
-    frame: int = option(help="The index of the frame.", metavar="K")
-    batch: str = option(
-        reads="path", help="Folder or URL of a batch of `bevcli batch --embed`.", flag="--in", metavar="BATCH_DIR"
-    )
-    count: int = option(default=12, help="Number of frames.", minimum=1)
-    per_drive: int = option(default=3, help="At most this many frames of each drive.", minimum=1)
-    same_drive: bool = option(
-        default=False, help="List frames of RUN's own drive, too: its neighbours are the most similar."
-    )
-    html: Path | None = option(
-        default=None, help="The page with thumbnails. Default: find-like.html in the batch.", metavar="FILE"
     )

@@ -1,61 +1,140 @@
-"""report.html: one page about a batch that needs no other file, for light and dark browsers."""
+"""The results of a batch: its tables, the scores of all drives together, and report.html.
 
+report.html is one page that needs no other file, for light and dark browsers.
+"""
+
+import csv
+import io
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from bevcli._version import __version__
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.evaluate import OWN_CLASSES
+from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
+from bevcli.parsing.documents import cell_of
 from bevcli.printing import counted, duration
-from bevcli.workshop.batch.job import RESULTS, SCORE_BINS, Record
+from bevcli.runs.state import load_state
+from bevcli.workshop.batch.job import READING_THREADS, RESULTS, Record
+from bevcli.workshop.batch.joint_scores import DriveMatches, score_jointly
+from bevcli.workshop.batch.storage import Storage
+from bevcli.workshop.batch.worker import MATCHES
 
+PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
+_COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
 WORST = 10  # drives in the table of the worst ones
 MOST_ERRORS = 50  # rows in the table of errors
-WIDTH, HEIGHT = 420, 180  # of a chart
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 24, 10, 36
 STYLE = """
 :root { color-scheme: light dark; --page: #fcfcfb; --text: #1d1d1b; --soft: #6b6a66; --line: #dddcd6;
-  --card: #ffffff; --bar: #2f6db5; --bad: #b3261e; }
+  --card: #ffffff; --link: #2f6db5; --bad: #b3261e; }
 @media (prefers-color-scheme: dark) { :root { --page: #171716; --text: #e8e7e3; --soft: #a09f99; --line: #3a3936;
-  --card: #20201e; --bar: #6ea8e8; --bad: #f2877f; } }
+  --card: #20201e; --link: #6ea8e8; --bad: #f2877f; } }
 body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 24px; max-width: 1080px;
   background: var(--page); color: var(--text); }
 h1 { font-size: 24px; margin: 0 0 4px; } h2 { font-size: 17px; margin: 32px 0 8px; }
-p { margin: 4px 0; } .soft, .none { color: var(--soft); } .bad { color: var(--bad); }
-a { color: var(--bar); } code { font-size: 13px; }
+p { margin: 4px 0; } .soft { color: var(--soft); } .bad { color: var(--bad); }
+a { color: var(--link); } code { font-size: 13px; }
 .cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(116px, 1fr)); gap: 12px; margin-top: 16px; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px 14px; }
 .card b { display: block; font-size: 22px; font-weight: 600; }
-.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 16px; }
-figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px; }
-figcaption { font-weight: 600; margin-bottom: 4px; }
 table.narrow { width: auto; } table.narrow td, table.narrow th { padding-right: 32px; }
-svg rect { fill: var(--bar); } svg line { stroke: var(--soft); } svg text { fill: var(--soft); font-size: 11px; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-size: 14px; }
 th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-td:first-child { white-space: nowrap; } img { max-width: 100%; border-radius: 4px; display: block; }
+td:first-child { white-space: nowrap; }
 """
-# Key of the scores -> title and axis of its histogram.
-_SCORE_CHARTS = {
-    "mean_ap": ("mAP", "mAP of a drive, classes with ground truth"),
-    "trans_err": ("Translation errors", "translation error of a drive, metres"),
-    "orient_err": ("Orientation errors", "orientation error of a drive, radians"),
-    "vel_err": ("Velocity errors", "velocity error of a drive, m/s"),
-}
 
 
-def page(title: str, body: str) -> str:
-    """An HTML page with the style of the reports. body: HTML."""
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
-    )
+def write_results(out: Storage, records: Sequence[Record], model: Model) -> tuple[str, ...]:
+    """Write the tables, the joint scores and the report of a batch; return their paths or URLs."""
+    metrics = joint_metrics(out, records, model.config)
+    classes = model.config.classes
+    files = {PARQUET: to_parquet(records, classes), CSV: to_csv(records, classes)}
+    if metrics is not None:
+        files[METRICS] = (json.dumps(metrics, indent=1) + "\n").encode()
+    files[REPORT] = write_report(records, metrics, model).encode()
+    for name, content in files.items():
+        out.write(name, content)
+    return tuple(f"{out.where}/{name}" for name in files)
+
+
+def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
+    """The columns of the tables and their types. classes: of the model, a column each."""
+    return {
+        **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
+        **dict.fromkeys(_COUNTS, pa.int64()),
+        **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
+        "output_bytes": pa.int64(),
+        **{f"boxes_{name}": pa.int64() for name in classes},
+        **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
+        "ground_truth_boxes": pa.int64(),
+        **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
+    }
+
+
+def row(record: Record, names: Iterable[str]) -> dict[str, Any]:
+    """The columns of a drive; None for what is not known, such as metrics without ground truth."""
+    boxes = record.get("boxes_by_class")
+    flat = {**(record.get("scores") or {}), **record}
+    counts = {} if boxes is None else {name: boxes.get(name.removeprefix("boxes_"), 0) for name in names}
+    return {name: counts.get(name) if name.startswith("boxes_") else flat.get(name) for name in names}
+
+
+def to_parquet(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.parquet: one row per drive, in the order of the records. classes: of the model."""
+    schema = columns(classes)
+    table = pa.Table.from_pylist([row(record, schema) for record in records], schema=pa.schema(list(schema.items())))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.csv: the same columns; an empty field for what is not known."""
+    names = columns(classes)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for record in records:
+        cells = row(record, names).items()
+        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in cells})
+    return text.getvalue().encode()
+
+
+def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
+    """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
+
+    Boxes of all drives are scored together: the result is not a mean of the drives' scores. Nothing was scored beyond
+    the model's BEV grid. Raises InputError where the matches of a drive cannot be read.
+    """
+    scored = [record for record in records if record.get("scores")]
+    if not scored:
+        return None
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+    range_m = model.bev_grid.nearest_side_m
+    config = DetectionConfig.of(model.object_classes).cut_at(range_m)
+    notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
+    if not are_nuscenes(model.object_classes):
+        notes.append(OWN_CLASSES)
+    return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
+
+
+def _read_matches(out: Storage, record: Record) -> DriveMatches:
+    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+        return load_state(path, DriveMatches)
 
 
 def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:
@@ -63,16 +142,20 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
     done = [record for record in records if not record.get("error")]
     failed = [record for record in records if record.get("error")]
     untrained = '<p class="bad">UNTRAINED: random weights, the boxes are meaningless</p>' if model.untrained else ""
+    title = f"Batch of {counted(len(records), 'drives')}"
     body = [
-        f"<h1>Batch of {counted(len(records), 'drives')}</h1>",
+        f"<h1>{title}</h1>",
         f'<p class="soft">model {escape(model.name)}, bevcli {__version__}</p>{untrained}',
         _cards(done, failed, metrics),
-        _distributions(done),
         _classes(done, model.config.classes),
         _worst(done),
         _errors(failed),
     ]
-    return page(f"Batch of {counted(len(records), 'drives')}", "\n".join(body))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(body) + "\n</body></html>\n"
+    )
 
 
 def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, Any] | None) -> str:
@@ -86,23 +169,6 @@ def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, 
         cards += [(f"NDS, {metrics['drives']:,} drives together", _number(present["nd_score"]))]
     shown = [f'<div class="card"><b>{value}</b><span class="soft">{escape(name)}</span></div>' for name, value in cards]
     return f'<div class="cards">{"".join(shown)}</div>'
-
-
-def _distributions(done: Sequence[Record]) -> str:
-    if not done:
-        return ""
-    scores = np.sum([r["score_histogram"] for r in done], axis=0)
-    figures = [
-        ("Speed", histogram([r["frames_per_second"] for r in done], "frames per second of a drive")),
-        ("Scores", bars(scores.tolist(), np.linspace(0, 1, SCORE_BINS + 1), "score of a box")),
-    ]
-    scored = [r["scores"] for r in done if r.get("scores")]
-    if scored:
-        for key, (title, label) in _SCORE_CHARTS.items():
-            known = [scores[key] for scores in scored if scores.get(key) is not None]
-            figures.append((title, histogram(known, label)))
-    charts = "".join(f"<figure><figcaption>{escape(n)}</figcaption>{svg}</figure>" for n, svg in figures)
-    return f'<h2>Distributions over drives</h2><div class="charts">{charts}</div>'
 
 
 def _classes(done: Sequence[Record], classes: Sequence[str]) -> str:
@@ -163,7 +229,7 @@ def _errors(failed: Sequence[Record]) -> str:
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], kind: str = "wide") -> str:
     """A table. rows: cells as HTML. numbers: columns with numbers. kind: "narrow" is only as wide as its cells."""
     lines = [("th", [escape(text) for text in head]), *(("td", row) for row in rows)]
-    classes = ["number" if place in numbers else "text" for place in range(len(head))]
+    classes = ["number" if column in numbers else "text" for column in range(len(head))]
     body = "".join(
         "<tr>" + "".join(f'<{tag} class="{c}">{text}</{tag}>' for c, text in zip(classes, row, strict=True)) + "</tr>"
         for tag, row in lines
@@ -173,50 +239,3 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
-
-
-def histogram(values: ArrayLike, label: str, bins: int = 24) -> str:
-    """A histogram of numbers. label: of the horizontal axis, with its unit."""
-    numbers = np.asarray(values, dtype=np.float64)
-    numbers = numbers[np.isfinite(numbers)]
-    if not len(numbers):
-        return '<p class="none">no values</p>'
-    low, high = float(numbers.min()), float(numbers.max())
-    if low == high:
-        low, high = (max(low - 0.5, 0) if low >= 0 else low - 0.5), high + 0.5
-    counts, edges = np.histogram(numbers, bins, (low, high))
-    return bars(counts.tolist(), edges, label)
-
-
-def bars(counts: Sequence[float], edges: ArrayLike, label: str) -> str:
-    """N bars with N + 1 edges on the horizontal axis."""
-    ends = np.asarray(edges, dtype=np.float64)
-    top = max(max(counts, default=0), 1)
-    span = float(ends[-1] - ends[0])
-    inner_width, inner_height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
-    base = HEIGHT - _BOTTOM
-
-    def x_of(value: float) -> float:
-        return _LEFT + (value - float(ends[0])) / span * inner_width
-
-    parts = []
-    for count, low, high in zip(counts, ends[:-1], ends[1:], strict=True):
-        height = count / top * inner_height
-        left, right = x_of(low), x_of(high)
-        title = f"<title>{_short(low)} to {_short(high)}: {_short(count)}</title>"
-        parts.append(
-            f'<rect x="{left + 0.5:.1f}" y="{base - height:.1f}" width="{max(right - left - 1, 1):.1f}" '
-            f'height="{height:.1f}">{title}</rect>'
-        )
-    for value in np.linspace(ends[0], ends[-1], 5):
-        parts.append(f'<text x="{x_of(float(value)):.1f}" y="{base + 14}" text-anchor="middle">{_short(value)}</text>')
-    parts.append(f'<text x="{_LEFT - 6}" y="{_TOP + 8}" text-anchor="end">{_short(top)}</text>')
-    parts.append(f'<text x="{_LEFT - 6}" y="{base}" text-anchor="end">0</text>')
-    parts.append(f'<line x1="{_LEFT}" y1="{base}" x2="{WIDTH - _RIGHT}" y2="{base}"/>')
-    middle = _LEFT + inner_width / 2
-    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(label)}</text>')
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">{"".join(parts)}</svg>'
-
-
-def _short(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 100 or float(value).is_integer() else f"{value:.3g}"

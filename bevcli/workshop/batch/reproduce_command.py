@@ -2,9 +2,10 @@
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
     from bevcli.published import NamedWeights
 
 PANEL = "Score"
+VALIDATION_FRAMES = 6019  # of the nuScenes validation split
+# By the name of a score: its key in `FrameScores.to_dict`, and its unit.
+SCORES = {
+    "NDS": ("nd_score", "%"),
+    "mAP": ("mean_ap", "%"),
+    "mATE": ("trans_err", "m"),
+    "mASE": ("scale_err", ""),
+    "mAOE": ("orient_err", "rad"),
+    "mAVE": ("vel_err", "m/s"),
+    "mAAE": ("attr_err", ""),
+}
 
 
 def reproduce(
@@ -36,14 +48,11 @@ def reproduce(
     """Score a published model on a nuScenes split, next to its published scores.
 
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
-    question, or with --fetch. Notes tell what makes the numbers differ, and known mistakes that they show. Exit code
-    3: some scenes failed.
+    question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
     from bevcli.published import named_weights
-    from bevcli.workshop.batch.drives import find_drives
-    from bevcli.workshop.batch.job import Job, all_own_options, with_absolute_paths
-    from bevcli.workshop.batch.reproduce import compare_with_published
-    from bevcli.workshop.batch.run_batch import METRICS
+    from bevcli.workshop.batch.job import Job, all_own_options, find_drives, with_absolute_paths
+    from bevcli.workshop.batch.report import METRICS
 
     named = named_weights(name, model.weights_dir)
     split = NuScenesOptions(options.version, options.split)
@@ -73,9 +82,9 @@ def reproduce(
         )
         raise InputError(f"{options.data}: no scene could be scored: {why}")
     metrics = json.loads((out / METRICS).read_text())
-    comparison = compare_with_published(metrics, named.source.published, temporal=run_options.temporal)
-    say(json.dumps(comparison.to_dict(), indent=1) if as_json else comparison.table())
-    for note in comparison.notes:
+    comparison = compare_with_published(metrics, named.source.published)
+    say(json.dumps(comparison, indent=1) if as_json else table_of(comparison["scores"]))
+    for note in comparison["notes"]:
         say(f"note: {note}", err=True)
     if summary.failed:
         say(f"{summary.failed} scenes failed and are not in the scores; `--resume` runs them again", err=True)
@@ -97,3 +106,50 @@ def _get(named: "NamedWeights", model: ModelOptions) -> None:
     if not model.fetch and not typer.confirm(f"{what}. Download them?", err=True):
         raise WeightsError(f"{named.name}: without its weights nothing can be scored: pass `weights=FILE`")
     fetch_with_bar(named)
+
+
+def compare_with_published(metrics: Mapping[str, Any], published: Mapping[str, float]) -> dict[str, Any]:
+    """Scores of a split next to the published ones, for JSON.
+
+    Args:
+        metrics: of `joint_metrics`; all ten classes count, as in the published scores.
+        published: by the names of SCORES; further names cannot be measured here.
+
+    Returns "frames", the number of frames that were scored; "scores", by name: "name", "ours", "published" and
+    "difference", each None if not measured or not published; and "notes", why the numbers may differ.
+    """
+    ours = {**metrics["tp_errors"], **{key: metrics[key] for key in ("nd_score", "mean_ap")}}
+    others = [name for name in published if name not in SCORES]
+    scores = {name: _pair(name, ours[key], published.get(name)) for name, (key, _) in SCORES.items()}
+    scores |= {name: _pair(name, None, published[name]) for name in others}
+    notes = []
+    if metrics["frames"] != VALIDATION_FRAMES:
+        notes.append(
+            f"the published scores are those of the {VALIDATION_FRAMES:,} frames of the validation split, these of "
+            f"{metrics['frames']:,}: they need not agree"
+        )
+    if others:
+        notes.append(f"{', '.join(others)}: not measured here; `bevcli eval --tracking` scores tracks")
+    return {"frames": metrics["frames"], "scores": scores, "notes": notes}
+
+
+def _pair(name: str, ours: float | None, published: float | None) -> dict[str, Any]:
+    difference = None if ours is None or published is None else ours - published
+    return {"name": name, "ours": ours, "published": published, "difference": difference}
+
+
+def table_of(scores: Mapping[str, Mapping[str, Any]]) -> str:
+    """The scores of `compare_with_published` as text for a terminal."""
+    rows = [f"{'score':9} {'ours':>7} {'published':>10} {'difference':>11}"]
+    for name, score in scores.items():
+        unit = SCORES[name][1] if name in SCORES else "%"
+        ours, published, difference = (
+            _number(score[key], unit, sign) for key, sign in (("ours", ""), ("published", ""), ("difference", "+"))
+        )
+        rows.append(f"{f'{name} {unit}'.strip():9} {ours:>7} {published:>10} {difference:>11}")
+    return "\n".join(rows)
+
+
+def _number(value: float | None, unit: str, sign: str) -> str:
+    scale, digits = (100, 1) if unit == "%" else (1, 3)
+    return "–" if value is None else f"{scale * value:{sign}.{digits}f}"

@@ -1,41 +1,33 @@
 """`run_batch`: skip drives that are done, hand the others to workers, and write the tables and the report."""
 
 import contextlib
-import csv
-import io
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
+from dataclasses import dataclass
 
 from bevcli.errors import OutputError
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.evaluate import OWN_CLASSES
-from bevcli.frame import MAP_CLASSES
-from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
-from bevcli.model.config import ModelConfig
-from bevcli.parsing.csv_tables import cell_of
-from bevcli.recording.class_meshes import read_class_meshes
+from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
-from bevcli.runs.state import load_state
-from bevcli.workshop.batch.drives import Drive
-from bevcli.workshop.batch.job import ATTEMPTS, FAILED, READING_THREADS, RECORD, RESULTS, Job, Record, read_record
-from bevcli.workshop.batch.ray_workers import Workers, run_on_ray
-from bevcli.workshop.batch.report import write_report
+from bevcli.workshop.batch.job import (
+    ATTEMPTS,
+    FAILED,
+    READING_THREADS,
+    RECORD,
+    RESULTS,
+    Drive,
+    Job,
+    Record,
+    read_record,
+)
+from bevcli.workshop.batch.options import Workers
+from bevcli.workshop.batch.report import write_results
 from bevcli.workshop.batch.storage import LocalFolder, Storage, open_storage
-from bevcli.workshop.batch.worker import MATCHES, StoppedError, Worker
-from bevcli.workshop.vad.joint_scores import DriveMatches, score_jointly
+from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray
 
-PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 DESCRIPTION = "batch.json"  # says that a folder is a batch
-
-_COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
 
 
 @dataclass(frozen=True)
@@ -137,7 +129,7 @@ def run_batch(
             for name in out.names(ATTEMPTS):  # an attempt that the user ended does not count
                 out.remove(f"{ATTEMPTS}/{name}")
         ordered = [records[name] for name in (drive.result(job_hash) for drive in drives) if name in records]
-        files = _write_tables(out, ordered, model)
+        files = write_results(out, ordered, model)
     return BatchSummary(tuple(ordered), len(drives), len(known), stopped, files)
 
 
@@ -185,82 +177,3 @@ def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_f
     with ThreadPoolExecutor(READING_THREADS) as pool:
         found = zip(results, pool.map(find, results), strict=True)
         return {result: record for result, record in found if record is not None}
-
-
-def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tuple[str, ...]:
-    metrics = joint_metrics(out, records, model.config)
-    classes = model.config.classes
-    files = {PARQUET: to_parquet(records, classes), CSV: to_csv(records, classes)}
-    if metrics is not None:
-        files[METRICS] = (json.dumps(metrics, indent=1) + "\n").encode()
-    files[REPORT] = write_report(records, metrics, model).encode()
-    for name, content in files.items():
-        out.write(name, content)
-    return tuple(f"{out.where}/{name}" for name in files)
-
-
-def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
-    """The columns of the tables and their types. classes: of the model, a column each."""
-    return {
-        **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
-        **dict.fromkeys(_COUNTS, pa.int64()),
-        **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
-        "output_bytes": pa.int64(),
-        **{f"boxes_{name}": pa.int64() for name in classes},
-        **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
-        "ground_truth_boxes": pa.int64(),
-        **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
-    }
-
-
-def row(record: Record, names: Iterable[str]) -> dict[str, Any]:
-    """The columns of a drive; None for what is not known, such as metrics without ground truth."""
-    boxes = record.get("boxes_by_class")
-    flat = {**(record.get("scores") or {}), **record}
-    counts = {} if boxes is None else {name: boxes.get(name.removeprefix("boxes_"), 0) for name in names}
-    return {name: counts.get(name) if name.startswith("boxes_") else flat.get(name) for name in names}
-
-
-def to_parquet(records: Sequence[Record], classes: Iterable[str]) -> bytes:
-    """batch.parquet: one row per drive, in the order of the records. classes: of the model."""
-    schema = columns(classes)
-    table = pa.Table.from_pylist([row(record, schema) for record in records], schema=pa.schema(list(schema.items())))
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    return buffer.getvalue()
-
-
-def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
-    """batch.csv: the same columns; an empty field for what is not known."""
-    names = columns(classes)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    for record in records:
-        cells = row(record, names).items()
-        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in cells})
-    return text.getvalue().encode()
-
-
-def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
-    """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
-
-    Boxes of all drives are scored together: the result is not a mean of the drives' scores. Nothing was scored beyond
-    the model's BEV grid. Raises InputError where the matches of a drive cannot be read.
-    """
-    scored = [record for record in records if record.get("scores")]
-    if not scored:
-        return None
-    with ThreadPoolExecutor(READING_THREADS) as pool:
-        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
-    range_m = model.bev_grid.nearest_side_m
-    config = DetectionConfig.of(model.object_classes).cut_at(range_m)
-    notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
-    if not are_nuscenes(model.object_classes):
-        notes.append(OWN_CLASSES)
-    return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
-
-
-def _read_matches(out: Storage, record: Record) -> DriveMatches:
-    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
-        return load_state(path, DriveMatches)

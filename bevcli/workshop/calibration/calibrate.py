@@ -3,17 +3,22 @@
 `motion_findings`: the same in short, as findings for `bevcli project-debug`.
 """
 
+import json
 from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import Sequence
-from bevcli.geometry.cameras import Camera
+from bevcli.frame import DerivedSequence, DriveFacts, Frame, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
+from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.workshop.calibration.adjustment import HEIGHT, OF_CAMERA, OF_RIG, Solution, Unknowns, moved, values
 from bevcli.workshop.calibration.estimates import (
     CameraEstimate,
     RigEstimate,
@@ -21,15 +26,13 @@ from bevcli.workshop.calibration.estimates import (
     change_text,
     delay_text,
     either_text,
+    rig_text,
+    table,
 )
-from bevcli.workshop.calibration.matches import match_points
-from bevcli.workshop.calibration.measure import PARTS, Measurement, measure
+from bevcli.workshop.calibration.measure import PARTS, Measurement, match_points, measure
 from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.residuals import values
-from bevcli.workshop.calibration.result import CalibrationResult, corrected_rig
-from bevcli.workshop.calibration.solve import Solution
-from bevcli.workshop.calibration.unknowns import HEIGHT, OF_CAMERA, OF_RIG, Unknowns
 from bevcli.workshop.calibration.views import FEWEST_PAIRS, READING_STEPS, WIDTH, read_views
+from bevcli.writing import write_whole
 
 FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
@@ -40,6 +43,68 @@ LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make
 FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
 SHORT_PAIRS = 8  # of frames, for findings
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The result of `calibrate`.
+
+    Attributes:
+        name: of the drive.
+        stated: the rig of the drive.
+        rig: the corrected rig; cameras that are fine or not measurable are as stated.
+        cameras: the estimates, in the rig's order.
+        whole: what is said about the whole rig.
+        pairs: number of frame pairs that were used.
+        facts: of the drive, for calibration.json.
+    """
+
+    name: str
+    stated: CameraRig
+    rig: CameraRig
+    cameras: tuple[CameraEstimate, ...]
+    whole: RigEstimate
+    pairs: int
+    facts: DriveFacts
+
+    def __getitem__(self, camera: str) -> CameraEstimate:
+        return next(each for each in self.cameras if each.camera == camera)
+
+    def text(self) -> str:
+        """One row a camera, and lines about the whole rig, for a terminal."""
+        pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
+        return "\n".join([table(self.cameras), "", pairs, rig_text(self.whole, self.cameras)])
+
+    def to_json(self) -> str:
+        """The content of report.json."""
+        content = {
+            "drive": self.name,
+            "pairs": self.pairs,
+            "cameras": {each.camera: each.to_dict() for each in self.cameras},
+            "rig": asdict(self.whole),
+        }
+        return json.dumps(content, indent=1, ensure_ascii=False)
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Write calibration.json (the corrected rig) and report.json into a folder. Returns their paths.
+
+        The folder is made where it is missing; existing files are overwritten. Raises OutputError.
+        """
+        rig, report = Path(folder) / "calibration.json", Path(folder) / "report.json"
+        write_whole(report, f"{self.to_json()}\n".encode(), parents=True)
+        write_calibration(rig, self.rig, self.facts)
+        return [rig, report]
+
+
+class CorrectedDrive(DerivedSequence):
+    """The calibrated drive, with the corrected rig in every frame."""
+
+    def __init__(self, sequence: Sequence, result: CalibrationResult) -> None:
+        super().__init__(sequence)
+        self.rig = result.rig
+
+    def load(self, index: int) -> Frame:
+        return replace(self.sequence.load(index), rig=self.rig)
 
 
 def calibrate(
@@ -83,14 +148,20 @@ def calibrate(
 def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
     """The result of a measurement: what is observed, with a verdict for each camera."""
     changes, covariances, whole = observed(measurement)
-    found, views = enumerate(zip(changes, covariances, strict=True)), measurement.views
-    cameras = tuple(_estimate(index, measurement, *each) for index, each in found)
-    rig = corrected_rig(views.stated, cameras)
-    return CalibrationResult(drive.name, views.stated, rig, cameras, whole, len(views.pairs), drive.facts, measurement)
+    stated, unknowns, pairs = measurement.views.stated, measurement.unknowns, len(measurement.views.pairs)
+    cameras = tuple(_estimate(index, measurement, changes[index], covariances[index]) for index in range(len(changes)))
+    rig = replace(
+        stated,
+        cameras=tuple(
+            replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
+            for camera, pose, estimate in zip(stated.cameras, moved(unknowns.stated, changes), cameras, strict=True)
+        ),
+    )
+    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts)
 
 
 def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:
-    """The estimate of a camera. change, covariance: of `observed`, (7,) and (7, 7)."""
+    """change, covariance: of `observed`, (7,) and (7, 7)."""
     views, groups = measurement.views, measurement.matches.group
     deviations = np.sqrt(np.diag(covariance))
     mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
@@ -108,8 +179,8 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
         reason=reason,
         rotation_deg=_yaw_pitch_roll(-np.degrees(change[:3])),
         rotation_deviation_deg=_yaw_pitch_roll(np.degrees(deviations[:3]) * [1, -1, 1]),
-        position_m=_triple(-change[3:6]),
-        position_deviation_m=_triple(deviations[3:6]),
+        position_m=tuple((-change[3:6]).tolist()),
+        position_deviation_m=tuple(deviations[3:6].tolist()),
         delay_ms=1000 * float(change[6]),
         delay_deviation_ms=1000 * float(deviations[6]),
         matches=count,
@@ -139,20 +210,14 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
-    """The median residual of a camera's matched points, in pixels of the reduced image."""
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
-    found = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
-    return float(np.median(found)) if found.size else 0.0
+    residuals_px = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
+    return float(np.median(residuals_px)) if residuals_px.size else 0.0
 
 
 def _yaw_pitch_roll(turn: Array) -> tuple[float, float, float]:
     """Small turns (3,) about right, down and forward axes of a camera as yaw (to the left), pitch (up) and roll."""
     return -float(turn[1]), float(turn[0]), float(turn[2])
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
@@ -217,16 +282,17 @@ def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
 
 def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
     """A finding for each camera that is corrected, and for each whose capture times are off."""
-    found = []
-    for each in cameras:
-        if each.verdict is Verdict.CORRECTED:
+    findings = []
+    for estimate in cameras:
+        name = estimate.camera
+        if estimate.verdict is Verdict.CORRECTED:
             message, advice = "does not fit how the vehicle moves", "measure it with `bevcli calibrate`"
-            found.append(Finding("calibration-off", "warning", each.camera, message, change_text(each), "", advice))
-        if delay_text(each):
-            late = f"{each.delay_ms:+.0f} ms ± {each.delay_deviation_ms:.0f} ms"
+            findings.append(Finding("calibration-off", "warning", name, message, change_text(estimate), "", advice))
+        if delay_text(estimate):
+            late = f"{estimate.delay_ms:+.0f} ms ± {estimate.delay_deviation_ms:.0f} ms"
             message, advice = "its images were taken at another time than stated", "correct its timestamps"
-            found.append(Finding("capture-times-off", "warning", each.camera, message, late, "0 ms", advice))
-        if either_text(each):
+            findings.append(Finding("capture-times-off", "warning", name, message, late, "0 ms", advice))
+        if either_text(estimate):
             advice = "choose a part of the drive that turns and drives straight on"
-            found.append(Finding("capture-times-off", "warning", each.camera, either_text(each), "", "", advice))
-    return tuple(found)
+            findings.append(Finding("capture-times-off", "warning", name, either_text(estimate), "", "", advice))
+    return tuple(findings)

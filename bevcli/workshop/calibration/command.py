@@ -37,9 +37,8 @@ def calibrate(
     """Measure the calibration of a drive from its own images and ego-motion.
 
     Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
-    fine, corrected, or not measurable. Writes calibration.json with the corrected rig, report.json with all numbers,
-    calibration.png and recording.rrd, which show the cameras before and after. Nothing in SEQUENCE is changed.
-    `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
+    fine, corrected, or not measurable. Writes calibration.json with the corrected rig and report.json with all numbers.
+    Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
     """
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
@@ -61,14 +60,13 @@ def _corrected(options: CalibrateFirstOptions, drive: Sequence) -> Sequence:
     if not options.calibrate:
         return drive
     from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration.calibrate import STEPS, calibrate as measure
-    from bevcli.workshop.calibration.estimates import change_text
-    from bevcli.workshop.calibration.result import CorrectedDrive
+    from bevcli.workshop.calibration.calibrate import STEPS, CorrectedDrive, calibrate as measure
+    from bevcli.workshop.calibration.estimates import Verdict, change_text
 
     with Progress(STEPS, "steps of the calibration") as progress:
         result = measure(drive, after_step=progress.advance)
     for each in result.cameras:
-        reason = change_text(each) if each in result.corrected else each.reason
+        reason = change_text(each) if each.verdict is Verdict.CORRECTED else each.reason
         say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
     return CorrectedDrive(drive, result)
 

@@ -1,105 +1,163 @@
-"""The measurement: rounds of rotations from points, heights from the road, and both together."""
+"""The measurement: rotations from matched points, heights from the road, and rounds of both together.
+
+Points are matched by SIFT features; what moves by itself is left out.
+"""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
-from bevcli.rig.overlay import visible_runs
-from bevcli.workshop.calibration.levels import level_corrections, sees_road
-from bevcli.workshop.calibration.matches import PointMatches
+from bevcli.workshop.calibration.adjustment import (
+    HEIGHT,
+    OF_CAMERA,
+    OF_PAIR,
+    EpipolarResiduals,
+    RoadResiduals,
+    Solution,
+    Term,
+    Unknowns,
+    solve,
+    spread,
+    values,
+)
 from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.residuals import RoadResiduals, values
-from bevcli.workshop.calibration.road import road_residuals, search_heights
-from bevcli.workshop.calibration.solve import Solution, Term, solve, spread
-from bevcli.workshop.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, Unknowns, geometry_at
-from bevcli.workshop.calibration.views import Views
+from bevcli.workshop.calibration.road import level_corrections, road_residuals, search_heights, sees_road
+from bevcli.workshop.calibration.views import THREADS, View, Views
+
+FEATURES = 2000  # an image
+RATIO = 0.75  # of the distances to the best and the second best match
+INLIER_PX = 1.5
+FEWEST = 15  # matches of a pair of images; fewer are not used
+CELLS = (10, 6)  # of an image, across and down;
+MOST_IN_CELL = 6  # matches in one of them, so that no object counts for all
+FLATTEST = 0.25  # cosine of the largest angle off the optical axis of a matched ray
+_Features = tuple[Array, NDArray[np.float32]]  # pixels (F, 2) and descriptors (F, 128)
+
+
+@dataclass(frozen=True)
+class PointMatches(EpipolarResiduals):
+    """M matches of all pairs."""
+
+    same: NDArray[np.bool_]  # (M,) whether both images are of the same camera
+    pixels_a: Array  # (M, 2) in the reduced image of the first frame
+    pixels_b: Array  # (M, 2) in that of the second frame
+
+
+def match_points(views: Views) -> PointMatches:
+    """The matches of all groups of views."""
+    groups = views.groups()
+    with ThreadPoolExecutor(THREADS) as threads:
+        features = dict(zip(views.of, threads.map(_features, views.of.values()), strict=True))
+
+        def matched(group: tuple[int, int, int]) -> tuple[Array, Array]:
+            (a, b), (_, first, second) = views.pairs[group[0]], group
+            cameras = views.rig.cameras[first], views.rig.cameras[second]
+            return _matched(features[a, first], features[b, second], *cameras)
+
+        pixels = list(threads.map(matched, groups))
+    counts = [len(a) for a, _ in pixels]
+    pixels_a, pixels_b = (np.concatenate(side) for side in zip(*pixels, strict=True))
+    _, first, second = (np.repeat(column, counts) for column in np.array(groups).T)
+    rays_a, rays_b = np.zeros((len(first), 3)), np.zeros((len(first), 3))
+    for index, camera in enumerate(views.rig.cameras):
+        rays_a[first == index] = camera.rays(pixels_a[first == index])
+        rays_b[second == index] = camera.rays(pixels_b[second == index])
+    group = np.repeat(np.arange(len(counts)), counts)
+    focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[first]
+    return PointMatches(group, rays_a, rays_b, focal, first == second, pixels_a, pixels_b)
+
+
+def _features(view: View) -> _Features:
+    detector = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
+    points, descriptors = detector.detectAndCompute(view.pixels, None)
+    if descriptors is None:
+        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
+    return np.array([point.pt for point in points], dtype=np.float64), np.asarray(descriptors, dtype=np.float32)
+
+
+def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple[Array, Array]:
+    """Pixels (m, 2) and (m, 2) of the matches; those within one camera fit one rigid motion."""
+    nothing = np.zeros((0, 2)), np.zeros((0, 2))
+    if min(len(a[0]), len(b[0])) < FEWEST:
+        return nothing
+    nearest, quality, other = _nearest(a[1], b[1])
+    kept = quality < RATIO**2 * other
+    if kept.sum() < FEWEST:
+        return nothing
+    pixels_a, pixels_b, quality = a[0][kept], b[0][nearest[kept]], quality[kept]
+    rays_a, rays_b = first.rays(pixels_a), second.rays(pixels_b)
+    with np.errstate(invalid="ignore"):
+        good = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
+    if first is second:
+        good[good] = _rigid(rays_a[good], rays_b[good], first)
+    chosen = np.flatnonzero(good)
+    # SIFT gives a point with several orientations several times.
+    chosen = chosen[np.sort(np.unique(pixels_a[chosen].astype(int), axis=0, return_index=True)[1])]
+    chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
+    return pixels_a[chosen], pixels_b[chosen]
+
+
+def _nearest(
+    a: NDArray[np.float32], b: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """The nearest of the descriptors b (F, 128) for each of a (A, 128); squared distances to it and to the next one.
+
+    A matrix product is three times as fast as OpenCV's matcher, and as exact: SIFT's descriptors are whole numbers.
+    """
+    distances = (b**2).sum(-1) - 2 * (a @ b.T)
+    rows, nearest = np.arange(len(a)), distances.argmin(-1)
+    best = distances[rows, nearest]
+    distances[rows, nearest] = np.inf
+    lengths = (a**2).sum(-1)
+    return nearest, lengths + best, lengths + distances.min(-1)
+
+
+def _rigid(rays_a: Array, rays_b: Array, camera: Camera) -> NDArray[np.bool_]:
+    """(m,) the matches that one rigid motion explains: all others move by themselves, or are wrong."""
+    nothing = np.zeros(len(rays_a), dtype=bool)
+    if len(rays_a) < FEWEST:
+        return nothing
+    flat_a, flat_b = (rays[:, :2] / rays[:, 2:] for rays in (rays_a, rays_b))
+    threshold = INLIER_PX / camera.intrinsics[0, 0]
+    _, inliers = cv2.findEssentialMat(flat_a, flat_b, np.eye(3), cv2.RANSAC, 0.999, threshold)
+    if inliers is None or inliers.sum() < FEWEST:
+        return nothing
+    return np.asarray(inliers.ravel() > 0)
+
+
+def _spread(pixels: Array, distance: Array, camera: Camera) -> NDArray[np.int64]:
+    cell = (pixels / [camera.width, camera.height] * CELLS).astype(int).clip(0, np.array(CELLS) - 1) @ [1, CELLS[0]]
+    order = np.lexsort((distance, cell))
+    first = np.searchsorted(cell[order], cell[order])
+    return np.sort(order[np.arange(len(order)) - first < MOST_IN_CELL])
+
 
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
 POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
 CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
-LEARNINGS = 4  # rounds in which the error of the vehicle's rotation is learned
+TURN_ROUNDS = 4  # in which the error of the vehicle's rotation is estimated
 SMALLEST_TURN = np.radians(0.005)  # of it
 KERB_M = 0.09  # less than from the road to a pavement
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
-MOST_SHOWN = 60  # matches of a camera
-DEPTHS_M = np.geomspace(0.7, 300, 400)  # along the ray of a point
-PIECE_PX = 30.0  # length of the shown piece of an epipolar line to each side
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the drive says about the unknowns, and what shows it: of each camera the pair of images with most matches.
-
-    Attributes:
-        views: the frame pairs.
-        matches: of all pairs.
-        unknowns: their layout.
-        solution: their best values, with the information and pull of each group.
-        points: the matches that were used.
-        road: residuals of points of the road.
-    """
+    """What the drive says about the unknowns."""
 
     views: Views
-    matches: PointMatches
+    matches: PointMatches  # of all pairs
     unknowns: Unknowns
     solution: Solution
-    points: PointMatches
+    points: PointMatches  # the matches that were used
     road: RoadResiduals
-
-    def image(self, index: int) -> NDArray[np.uint8] | None:
-        """(h, w) grey, the second image of the shown pair of a camera; None where it has no matches."""
-        group = self._shown.get(index)
-        return None if group is None else self.views.sides(self.views.groups()[group])[1].pixels
-
-    def camera(self, index: int, *, measured: bool) -> Camera:
-        """A camera of the reduced images with its stated or its measured pose."""
-        camera = self.views.rig.cameras[index]
-        return replace(camera, ego_from_camera=self.unknowns.ego_from_camera(self._x(measured))[index])
-
-    def shown_matches(self, index: int, *, measured: bool) -> list[tuple[Array, list[Array]]]:
-        """Some matches of the shown pair of a camera.
-
-        Of each the pixel (2,) in the image, and its piece of the epipolar line by either calibration, as lines (P, 2).
-        """
-        group, camera = self._shown.get(index), self.camera(index, measured=measured)
-        if group is None:
-            return []
-        mine = np.flatnonzero(self.matches.group == group)
-        chosen = mine[:: 1 + len(mine) // MOST_SHOWN]
-        motion = geometry_at(self.unknowns, self._x(measured)).camera_b_from_camera_a[group]
-        pairs = zip(self.matches.pixels_b[chosen], self.matches.rays_a[chosen], strict=True)
-        return [(point, _epipolar_piece(camera, motion, ray, point)) for point, ray in pairs]
-
-    def _x(self, measured: bool) -> Array:
-        return self.solution.x * (1.0 if measured else 0.0)
-
-    @cached_property
-    def _shown(self) -> dict[int, int]:
-        """Camera -> the group of its shown pair."""
-        counts = np.bincount(self.matches.group[self.matches.same], minlength=len(self.unknowns.groups))
-        best: dict[int, int] = {}
-        for group in np.argsort(counts):
-            if counts[group]:
-                best[int(self.unknowns.groups[group, 1])] = int(group)
-        return best
-
-
-def _epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, point: Array) -> list[Array]:
-    """The part of a ray's image that is nearest to a point, as lines (P, 2) in pixels."""
-    points = DEPTHS_M[:, None] * ray @ camera_b_from_camera_a[:3, :3].T + camera_b_from_camera_a[:3, 3]
-    pixels = camera.project(points)[0]
-    distance = np.linalg.norm(pixels - point, axis=-1)
-    if not np.isfinite(distance).any():
-        return []
-    nearest = pixels[np.nanargmin(distance)]
-    near = np.linalg.norm(pixels - nearest, axis=-1) < PIECE_PX
-    return visible_runs(np.where(near[:, None], pixels, np.nan))
 
 
 def measure(
@@ -128,16 +186,16 @@ def measure(
             x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
         progress()
     road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
-    for _ in range(LEARNINGS):
+    for _ in range(TURN_ROUNDS):
         solution = solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
-        x, unknowns = solution.x, with_learned_turns(unknowns, solution)
+        x, unknowns = solution.x, with_estimated_turns(unknowns, solution)
     return Measurement(views, matches, unknowns, solution, within, road)
 
 
 def _terms(unknowns: Unknowns, points: PointMatches, road: RoadResiduals, x: Array, road_scale: float) -> list[Term]:
     """Both kinds of residuals, with the spread that they have at x (P,)."""
     scales = ((points, POINT_SCALE_PX), (road, road_scale))
-    return [(each, np.maximum(least, spread(unknowns, each, x))) for each, least in scales]
+    return [(residuals, np.maximum(least, spread(unknowns, residuals, x))) for residuals, least in scales]
 
 
 def consistent(unknowns: Unknowns, points: PointMatches, x: Array) -> PointMatches:
@@ -147,12 +205,12 @@ def consistent(unknowns: Unknowns, points: PointMatches, x: Array) -> PointMatch
     """
     fits = np.abs(values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
     count = len(unknowns.groups)
-    fitting, found = (np.bincount(each, minlength=count) for each in (points.group[fits], points.group))
-    shares = fitting / np.maximum(found, 1)
+    fitting, matched = (np.bincount(group, minlength=count) for group in (points.group[fits], points.group))
+    shares = fitting / np.maximum(matched, 1)
     return points.where(fits & (shares[points.group] >= CONSISTENT_SHARE))
 
 
-def with_learned_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
+def with_estimated_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
     """The unknowns with the deviation of the vehicle's stated rotation that its pairs show, at most the present one.
 
     It is estimated an axis, as the scatter of the solution over what the pairs determine (MacKay's rule).
@@ -163,6 +221,6 @@ def with_learned_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
     covariance = np.linalg.inv(solution.information + np.diag(1 / deviations**2))
     determined = (1 - np.diag(covariance)[turns] / deviations[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
     squares = (solution.x[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
-    learned = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
-    deviations[turns] = np.minimum(deviations[turns], np.tile(learned, unknowns.pairs))
+    estimated = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
+    deviations[turns] = np.minimum(deviations[turns], np.tile(estimated, unknowns.pairs))
     return replace(unknowns, deviations=deviations)

@@ -27,13 +27,6 @@ class CalibrateOptions:
         default=0.003, help="Error of the scale of the ego-motion: standard deviation, as a share.",
         minimum=0.0001, maximum=0.2,
     )  # fmt: skip
-    tilt_deg: float = option(
-        default=0.2, help="Tilt of the ego frame over the road: standard deviation, degrees.", minimum=0.001, maximum=5
-    )
-    delay_ms: float = option(
-        default=100.0, help="How far off the capture times of a camera may be: standard deviation, milliseconds.",
-        minimum=0.01, maximum=300,
-    )  # fmt: skip
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
 
 

@@ -29,34 +29,21 @@ DELAYS_S = np.linspace(-0.3, 0.3, 25)  # of a camera's capture times, where the 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's image at one time.
+    """One camera's image at one time."""
 
-    Attributes:
-        pixels: (h, w) uint8, grey, at most WIDTH wide.
-        texture: (h, w) uint8, their fine structure with about the same contrast everywhere, without light and shade.
-        poses: (25, 4, 4) world_from_ego at the time when it was taken and each of DELAYS_S later.
-    """
-
-    pixels: NDArray[np.uint8]
-    texture: NDArray[np.uint8]
-    poses: Array
+    pixels: NDArray[np.uint8]  # (h, w) grey, at most WIDTH wide
+    texture: NDArray[np.uint8]  # (h, w) fine structure with even contrast, without light and shade
+    poses: Array  # (25, 4, 4) world_from_ego when it was taken, and each of DELAYS_S later
 
 
 @dataclass(frozen=True)
 class Views:
-    """What a drive shows.
+    """What a drive shows."""
 
-    Attributes:
-        stated: the rig of the frames.
-        rig: the same with cameras for the reduced images.
-        pairs: places of the frames of each pair.
-        of: (place, camera index) -> view; missing images are left out.
-    """
-
-    stated: CameraRig
-    rig: CameraRig
-    pairs: tuple[tuple[int, int], ...]
-    of: dict[tuple[int, int], View]
+    stated: CameraRig  # the rig of the frames
+    rig: CameraRig  # the same with cameras for the reduced images
+    pairs: tuple[tuple[int, int], ...]  # places of the frames of each pair
+    of: dict[tuple[int, int], View]  # (place, camera index) -> view; missing images are left out
 
     def groups(self) -> list[tuple[int, int, int]]:
         """(pair, camera of its first frame, camera of its second one): each camera with itself and its neighbours."""
@@ -93,16 +80,16 @@ def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = 
             f"m (expected {FEWEST_PAIRS} or more): choose more frames, or a part of the drive in which it moves"
         )
     views: dict[tuple[int, int], View] = {}
-    places = sorted({place for pair in pairs for place in pair})
-    for done, place in enumerate(places, 1):
-        frame = drive.load(place)
+    frames = sorted({frame_index for pair in pairs for frame_index in pair})
+    for done, frame_index in enumerate(frames, 1):
+        frame = drive.load(frame_index)
         if done == 1:
             stated, rig = frame.rig, replace(frame.rig, cameras=tuple(map(_reduced, frame.rig.cameras)))
         for index, camera in enumerate(rig.cameras):
             view = _view(frame, camera, drive.ego_motion)
             if view is not None:
-                views[place, index] = view
-        for _ in range(READING_STEPS * done // len(places) - READING_STEPS * (done - 1) // len(places)):
+                views[frame_index, index] = view
+        for _ in range(READING_STEPS * done // len(frames) - READING_STEPS * (done - 1) // len(frames)):
             progress()
     if not views:
         raise InputError(f"{drive.name}: no image shows anything (expected images with contrast, not black ones)")
@@ -126,25 +113,25 @@ def _positions(drive: Sequence) -> tuple[list[int], Array]:
     """Places of frames, and their positions with headings (F, 3): x, y in metres, yaw in radians."""
     count = len(drive.stamps)
     if drive.ego_motion is not None:
-        places = list(range(count))
+        frames = list(range(count))
         poses = [drive.ego_motion.pose_at(stamp.timestamp_ns) for stamp in drive.stamps]
     else:
         blocks = np.array_split(np.arange(count), max(1, MOST_FRAMES // 6))
-        places = list(range(count)) if count <= MOST_FRAMES else [int(p) for block in blocks for p in block[:6]]
-        poses = [drive.load(place).world_from_ego for place in places]
-    return places, np.array([(*pose.translation[:2], pose.yaw) for pose in poses])
+        frames = list(range(count)) if count <= MOST_FRAMES else [int(p) for block in blocks for p in block[:6]]
+        poses = [drive.load(number).world_from_ego for number in frames]
+    return frames, np.array([(*pose.translation[:2], pose.yaw) for pose in poses])
 
 
-def _choose_pairs(found: tuple[list[int], Array], most: int) -> list[tuple[int, int]]:
+def _choose_pairs(positions: tuple[list[int], Array], most: int) -> list[tuple[int, int]]:
     """Pairs of successive frames between which the vehicle moves; of many, those that turn most and an even choice."""
-    places, at = found
+    frames, at = positions
     pairs, turns, anchor = list[tuple[int, int]](), list[float](), 0
-    for k in range(1, len(places)):
+    for k in range(1, len(frames)):
         moved = float(np.hypot(*(at[k, :2] - at[anchor, :2])))
         if moved < NEAREST_M:
             continue
         if moved <= FARTHEST_M:
-            pairs.append((places[anchor], places[k]))
+            pairs.append((frames[anchor], frames[k]))
             turns.append(abs(float(np.angle(np.exp(1j * (at[k, 2] - at[anchor, 2]))))))
         anchor = k
     if len(pairs) <= most:

@@ -32,8 +32,7 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.selection import select_range
+from bevcli.sequences.open import open_sequence, select_range
 from bevcli.user_folders import user_cache
 from bevcli.workshop.engines.export_onnx import export_onnx, quantize
 from bevcli.workshop.engines.exported import ExportedModel

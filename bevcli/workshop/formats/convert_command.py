@@ -31,7 +31,7 @@ def convert(
     from bevcli.registry import load
     from bevcli.sequences.images import no_image_error
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.formats.labels.sequence import WithLabels
+    from bevcli.workshop.formats.labels import WithLabels
     from bevcli.workshop.formats.output import GROUP, open_writer
 
     if Path(os.path.realpath(input)).is_relative_to(os.path.realpath(out)):

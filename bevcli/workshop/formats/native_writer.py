@@ -4,32 +4,28 @@ import csv
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.frame import DriveFacts, Frame, FrameResult, Ground, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_tables import cell_of
+from bevcli.parsing.documents import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.map_folder import write_map
+from bevcli.sequences.format import true_result_files
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.options import SequenceOptions, WriteOptions
-from bevcli.workshop.formats.output import FolderWriter
-from bevcli.workshop.vad.lines_file import TRUE_LINES, LinesWriter
+from bevcli.workshop.formats.output import FolderWriter, OutputFormat
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
-PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
-
-
-def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "NativeWriter":
-    """The writer of a sequence as a native folder; see `OutputFormat`."""
-    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
+PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
 
 
 class NativeWriter(FolderWriter):
@@ -50,7 +46,7 @@ class NativeWriter(FolderWriter):
     def __init__(
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
-        super().__init__(folder, PARTS, force=force)
+        super().__init__(folder, (*PARTS, *true_result_files("native")), force=force)
         self._facts = facts or DriveFacts()
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
@@ -58,7 +54,7 @@ class NativeWriter(FolderWriter):
         self._motion: dict[int, tuple[Pose, Kinematics]] = {}
         self._scenes: dict[str, tuple[int, int]] = {}  # first and last time of each scene, ns
         self._boxes: BoxesWriter | None = None
-        self._lines: LinesWriter | None = None
+        self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
         try:
             table = self.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
         except OSError as error:
@@ -77,8 +73,8 @@ class NativeWriter(FolderWriter):
             self._write_boxes(frame, frame.ground_truth, pose)
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
-        if frame.ground_truth_lines is not None:
-            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), frame.ground_truth_lines)
+        for result in frame.ground_truth_results:
+            self._write_result(Ground(frame.stamp, frame.rig.ego_from_bev, pose), result)
 
     def _finish(self) -> None:
         if self._rig is None:
@@ -135,11 +131,12 @@ class NativeWriter(FolderWriter):
         extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
         self._boxes.write(FrameBoxes(frame.stamp, pose, boxes, extras))
 
-    def _write_lines(self, ground: Ground, lines: MapLines) -> None:
-        if self._lines is None:
-            writer = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
-            self._lines = self.enter_context(writer)
-        self._lines.write(ground, lines)
+    def _write_result(self, ground: Ground, result: FrameResult) -> None:
+        kind = type(result)
+        if kind not in self._results:
+            writer = kind.writer(self.folder / kind.true_file, self._reference, {"classes": list(kind.true_names)})
+            self._results[kind] = self.enter_context(writer)
+        self._results[kind].write(ground, result)
 
 
 def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
@@ -151,3 +148,10 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
         np.stack([pose.quaternion for pose in poses]),
         *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
     )
+
+
+def _writer(folder: Path, sequence: Sequence, options: WriteOptions) -> NativeWriter:
+    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
+
+
+OUTPUT = OutputFormat("a sequence folder", _writer, keeps_maps=True)

@@ -18,10 +18,10 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes.format import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
-from bevcli.sequences.nuscenes.json_tables import Row
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence
+from bevcli.sequences.nuscenes.tables import Row
 from bevcli.sequences.options import WriteOptions
-from bevcli.workshop.formats.output import FolderWriter
+from bevcli.workshop.formats.output import FolderWriter, OutputFormat
 from bevcli.writing import write_whole
 
 VERSION = "v1.0-custom"
@@ -238,3 +238,6 @@ def _visibility(fraction: float | None) -> str:
 
 def _pose_of(pose: Pose) -> Row:
     return {"rotation": pose.quaternion.tolist(), "translation": pose.translation.tolist()}
+
+
+OUTPUT = OutputFormat("a nuScenes root", NuScenesWriter)

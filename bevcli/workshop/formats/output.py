@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final, Protocol
 
 from bevcli.errors import InputError, OutputError
@@ -90,20 +89,20 @@ class OutputFormat:
 
     Attributes:
         name: with an article, for messages: "a nuScenes root".
-        opener: makes the writer of a path for a sequence, or the name of what does, "module:attribute", which is
-            imported when it is needed. Raises OutputError, and InputError for a drive that the format cannot hold.
+        opener: makes the writer of a path for a sequence. Raises OutputError, and InputError for a drive that the
+            format cannot hold.
         takes_boxes: the option `boxes` is for this format.
         keeps_maps: maps and lines of the ground truth are written; otherwise they are left out.
     """
 
     name: str
-    opener: str | Callable[[Path, Sequence, WriteOptions], DriveWriter]
+    opener: Callable[[Path, Sequence, WriteOptions], DriveWriter]
     takes_boxes: bool = False
     keeps_maps: bool = False
 
     def left_out(self, frame: Frame) -> set[str]:
         """What the format cannot hold of a frame, in words."""
-        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_lines}
+        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_results or None}
         return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 
@@ -116,5 +115,4 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     chosen: OutputFormat = load_form(GROUP, options.form)
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
-    opener = resolve_name(chosen.opener) if isinstance(chosen.opener, str) else chosen.opener
-    return opener(path, sequence, options)
+    return chosen.opener(path, sequence, options)

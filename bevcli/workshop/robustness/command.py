@@ -18,8 +18,7 @@ PANEL = "Score"
 
 def stress(
     sequence: Annotated[
-        list[Path] | None,
-        argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        list[Path] | None, argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS.")
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
@@ -39,11 +38,9 @@ def stress(
     from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
-    from bevcli.sequences.open import open_sequence
-    from bevcli.sequences.selection import select_range
+    from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.report import stress_table
-    from bevcli.workshop.robustness.results import read_results
+    from bevcli.workshop.robustness.results import read_results, stress_table
     from bevcli.workshop.robustness.stress import stress
     from bevcli.workshop.synth.drives import open_drives
 

@@ -1,16 +1,235 @@
-"""The corruptions with their severities: what `bevcli stress` runs."""
+"""The corruptions of `bevcli stress` with their severities, and the sequences that apply them to another one."""
 
-from collections.abc import Callable, Mapping, Sequence as Items
-from dataclasses import dataclass
+import hashlib
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence as Items
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import partial
+from typing import Any
+
+import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
-from bevcli.workshop.robustness import sequences
+from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
+from bevcli.geometry.ego_motion import Kinematics, motion_during
+from bevcli.geometry.transforms import Pose, inverse
+from bevcli.sequences.open import select
 from bevcli.workshop.robustness.options import LostImage, SeverityChoice
-from bevcli.workshop.robustness.sequences import Draws
 from bevcli.workshop.synth import corruptions
+from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
+
+KEPT_BYTES = 1 << 30  # decoded images that are kept in memory, of all scenes together
+LOST_PARTS = 6  # level L loses an image or a pose with probability L/6
+MOST_CRASHES = 5  # draws of cameras at the hardest level
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The random numbers of one corruption, from the seed of the whole test and the name of the corruption.
+
+    The severity is no part of the key: a harder severity draws the same numbers as an easier one, so that, for example,
+    it loses the same images and more.
+    """
+
+    seed: int
+    corruption: str
+
+    def generator(self, *keys: str | int) -> np.random.Generator:
+        """A generator for what the keys name, such as scene, frame index and camera."""
+        digest = hashlib.sha256("\0".join(map(str, (self.corruption, *keys))).encode()).digest()
+        return np.random.default_rng([self.seed, *np.frombuffer(digest, dtype="<u4").tolist()])
+
+
+class ChangedSequence(DerivedSequence):
+    """A sequence whose frames are changed when they are loaded. A subclass overrides `change`.
+
+    level: of the change; its meaning depends on the subclass. lost_images: what the model gets for a lost image.
+    """
+
+    def __init__(self, sequence: Sequence, level: Level, draws: Draws, lost_images: LostImage = "black") -> None:
+        super().__init__(sequence)
+        self._level, self._draws, self._lost_images = level, draws, lost_images
+
+    def load(self, index: int) -> Frame:
+        return self.change(index, self.sequence.load(index))
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        """The frame at an index with its change."""
+        raise NotImplementedError
+
+    def random(self, stamp: FrameStamp, *keys: str | int) -> np.random.Generator:
+        """A generator for the scene of a frame and further keys; it does not depend on where the drive is stored."""
+        return self._draws.generator(f"{self.name}/{stamp.scene}", *keys)
+
+
+class CorruptedImages(ChangedSequence):
+    """A sequence with every image corrupted by `corrupt`. Each frame and camera has its own random numbers."""
+
+    def __init__(self, *arguments: Any, corrupt: ImageCorruption) -> None:
+        super().__init__(*arguments)
+        self._corrupt = corrupt
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        def corrupted(name: str) -> CameraImage:
+            random = self.random(frame.stamp, frame.stamp.index, name)
+            return _with_pixels(frame.images[name], self._corrupt(frame.images[name].pixels_bgr, self._level, random))
+
+        with ThreadPoolExecutor(min(max(len(frame.images), 1), os.cpu_count() or 1)) as threads:
+            images = dict(zip(frame.images, threads.map(corrupted, frame.images), strict=True))
+        return replace(frame, images=images)
+
+
+def _with_pixels(image: CameraImage, pixels_bgr: Pixels) -> CameraImage:
+    return replace(image, pixels_bgr=pixels_bgr, encoded=None, media_type=None)
+
+
+class KeptFrames(DerivedSequence):
+    """Keeps decoded frames, without the bytes of files, while the memory lasts, because every condition needs them.
+
+    most_bytes: of decoded images that are kept; frames beyond it are read again each time.
+    """
+
+    def __init__(self, sequence: Sequence, most_bytes: int) -> None:
+        super().__init__(sequence)
+        self._left_bytes = most_bytes
+        self._frames: dict[int, Frame] = {}
+
+    def load(self, index: int) -> Frame:
+        if index in self._frames:
+            return self._frames[index]
+        frame = self.sequence.load(index)
+        images = {name: _with_pixels(image, image.pixels_bgr) for name, image in frame.images.items()}
+        frame = replace(frame, images=images)
+        size = sum(image.pixels_bgr.nbytes for image in images.values())
+        if size <= self._left_bytes:
+            self._left_bytes -= size
+            self._frames[index] = frame
+        return frame
+
+
+def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:
+    """The frames of one scene at 1/step of its rate, as `step` sequences that start one frame after another.
+
+    Together they have every frame once, so that the score covers the same ground truth as at the full rate.
+    """
+    count = len(sequence.stamps)
+    return tuple(select(sequence, range(start, count, step)) for start in range(min(step, count)))
+
+
+class LostImages(ChangedSequence):
+    """A sequence that loses images: they are missing or black. A subclass overrides `lost`."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        """The cameras whose images are lost."""
+        raise NotImplementedError
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        all_lost = self.lost(frame)
+        lost = [name for name in frame.images if name in all_lost]
+        if self._lost_images == "missing":
+            kept = {name: image for name, image in frame.images.items() if name not in lost}
+            dropped = {**frame.dropped, **dict.fromkeys(lost, "lost by bevcli stress")}
+            return replace(frame, images=kept, dropped=dropped)
+        black = {name: _with_pixels(frame.images[name], np.zeros_like(frame.images[name].pixels_bgr)) for name in lost}
+        return replace(frame, images={**frame.images, **black})
+
+
+class CameraCrash(LostImages):
+    """Level L draws L cameras of the rig, with replacement; they deliver nothing for the whole scene."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        names = frame.rig.names
+        drawn = self.random(frame.stamp).integers(0, len(names), MOST_CRASHES)
+        return {names[index] for index in drawn[: self._level]}
+
+
+class FrameLost(LostImages):
+    """Level L loses each image with a probability of L/6, independently of the others."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        stamp, limit = frame.stamp, self._level / LOST_PARTS
+        return {name for name in frame.rig.names if self.random(stamp, stamp.index, name).random() < limit}
+
+
+class CalibrationNoise(ChangedSequence):
+    """A sequence whose cameras state wrong poses, the same ones for a whole scene; levels of `camera_pose_noise`."""
+
+    # A rig, its scene and the noisy rig, which the frames of a scene with one rig share.
+    _noisy: tuple[CameraRig, str, CameraRig] | None = None
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        stamp = frame.stamp
+        if self._noisy is None or self._noisy[0] is not frame.rig or self._noisy[1] != stamp.scene:
+            cameras = tuple(self._with_noise(camera, stamp) for camera in frame.rig.cameras)
+            self._noisy = (frame.rig, stamp.scene, replace(frame.rig, cameras=cameras))
+        return replace(frame, rig=self._noisy[2])
+
+    def _with_noise(self, camera: Camera, stamp: FrameStamp) -> Camera:
+        noise = camera_pose_noise(self._level, self.random(stamp, camera.name))
+        return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
+
+
+class TimeOffsets(ChangedSequence):
+    """A sequence whose cameras state wrong capture times: each camera is off by its own constant, for a whole scene.
+
+    Level L draws each offset uniformly from -L to L milliseconds. The pose of the vehicle at the camera's time is then
+    that of the wrong time: the vehicle is moved on with the frame's velocity and angular rate. Images stay.
+    """
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        draws = {name: self.random(frame.stamp, name).uniform(-1, 1) for name in frame.rig.names}
+        offsets_s = {name: self._level / 1000 * draw for name, draw in draws.items()}
+        poses = {
+            name: Pose.from_matrix(pose.matrix @ motion_during(offsets_s[name], frame.kinematics))
+            for name, pose in frame.world_from_ego_at.items()
+        }
+        images = {
+            name: replace(image, timestamp_ns=image.timestamp_ns + round(offsets_s[name] * 1e9))
+            for name, image in frame.images.items()
+        }
+        return replace(frame, world_from_ego_at=poses, images=images)
+
+
+class EgoMotionLost(ChangedSequence):
+    """A sequence in which poses do not arrive: the last pose and kinematics that arrived are used instead.
+
+    Level L loses the pose of a frame with a probability of L/6; the first frame of a scene keeps its pose. The ground
+    truth is moved with the pose, so that it stays where it is relative to the vehicle.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._arrived: dict[int, tuple[Pose, Kinematics]] = {}
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        last = self._last_arrived(index)
+        if last not in self._arrived:
+            earlier = frame if last == index else self.sequence.load(last)
+            self._arrived[last] = earlier.world_from_ego, earlier.kinematics
+        if last == index:
+            return frame
+        pose, kinematics = self._arrived[last]
+        stated_from_world = pose.matrix @ inverse(frame.world_from_ego.matrix)
+        truth = frame.ground_truth
+        return replace(
+            frame,
+            world_from_ego=pose,
+            world_from_ego_at=dict.fromkeys(frame.world_from_ego_at, pose),
+            kinematics=kinematics,
+            ground_truth=None if truth is None else truth.transformed(stated_from_world),
+        )
+
+    def _last_arrived(self, index: int) -> int:
+        stamps = self.stamps
+        while index > 0 and stamps[index - 1].scene == stamps[index].scene:
+            if self.random(stamps[index], stamps[index].index).random() >= self._level / LOST_PARTS:
+                break
+            index -= 1
+        return index
+
 
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.
 Apply = Callable[[Sequence, int, Draws, LostImage], Sequence | tuple[Sequence, ...]]
@@ -24,106 +243,63 @@ class Group(Enum):
     OTHER = auto()  # averaged with nothing
 
 
-class Shown(Enum):
-    """The part of a frame that shows a corruption on the contact sheet."""
-
-    IMAGE = auto()  # of the camera that looks ahead
-    BOXES = auto()  # the same with ground truth boxes: the image stays, they show where the model looks
-    CAMERAS = auto()  # all cameras
-    NOTHING = auto()  # it changes no image
-
-
 @dataclass(frozen=True)
 class Corruption:
-    """A kind of corruption with its severities.
+    """A kind of corruption with its severities."""
 
-    Attributes:
-        name: on the command line and in stress.json.
-        title: in plots, with the unit of the levels.
-        levels: severity, such as "easy", or a number -> level.
-        apply: makes of a scene what is run.
-        shown: on the contact sheet.
-        group: the corruptions that it is averaged with.
-    """
-
-    name: str
-    title: str
-    levels: Mapping[str, int]
-    apply: Apply
-    shown: Shown = Shown.IMAGE
-    group: Group = Group.ROBOBEV
+    name: str  # on the command line and in stress.json
+    levels: Mapping[str, int]  # severity, such as "easy", or a number -> level
+    apply: Apply  # makes of a scene what is run
+    group: Group = Group.ROBOBEV  # of those that it is averaged with
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One corruption at one severity.
+    """One corruption at one severity."""
 
-    Attributes:
-        corruption: CLEAN for clean drives.
-        severity: a key of `Corruption.levels`.
-    """
-
-    corruption: Corruption
-    severity: str
+    corruption: Corruption  # CLEAN for clean drives
+    severity: str  # a key of `Corruption.levels`
 
     @property
     def name(self) -> str:
-        """Name of the corruption, or "clean"."""
         return self.corruption.name
 
     def sequences(self, scene: Sequence, seed: int, kind: LostImage) -> tuple[Sequence, ...]:
         """The sequences that are run in place of a scene."""
-        made = self.corruption.apply(scene, self.corruption.levels[self.severity], Draws(seed, self.name), kind)
-        return made if isinstance(made, tuple) else (made,)
-
-
-def _images(corrupt: corruptions.ImageCorruption) -> Apply:
-    return partial(sequences.CorruptedImages, corrupt=corrupt)
+        changed = self.corruption.apply(scene, self.corruption.levels[self.severity], Draws(seed, self.name), kind)
+        return changed if isinstance(changed, tuple) else (changed,)
 
 
 def _severities(easy: int, mid: int, hard: int) -> dict[str, int]:
     return {"easy": easy, "mid": mid, "hard": hard}
 
 
-def _unseen(name: str, corrupt: corruptions.ImageCorruption) -> Corruption:
-    return Corruption(name, name.replace("_", " "), _severities(2, 4, 5), _images(corrupt), group=Group.UNSEEN)
+def _of_images(corrupt: ImageCorruption, *levels: int, group: Group = Group.ROBOBEV) -> Corruption:
+    """A corruption of each image alone, named as its function."""
+    return Corruption(corrupt.__name__, _severities(*levels), partial(CorruptedImages, corrupt=corrupt), group)
 
 
-CLEAN = Corruption("clean", "no corruption", {"": 0}, lambda scene, *_: scene, Shown.NOTHING, Group.OTHER)
-# Levels of the first eight as published: RoboBEV, docs/CREATE.md.
+CLEAN = Corruption("clean", {"": 0}, lambda scene, *_: scene, Group.OTHER)
 CORRUPTIONS = (
-    Corruption("camera_crash", "camera crash", _severities(2, 4, 5), sequences.CameraCrash, Shown.CAMERAS),
-    Corruption("frame_lost", "frame lost", _severities(2, 4, 5), sequences.FrameLost, Shown.CAMERAS),
-    Corruption(
-        "color_quantisation", "colour quantisation", _severities(1, 2, 3), _images(corruptions.color_quantisation)
-    ),
-    Corruption("motion_blur", "motion blur", _severities(2, 4, 5), _images(corruptions.motion_blur)),
-    Corruption("brightness", "brightness", _severities(2, 4, 5), _images(corruptions.brightness)),
-    Corruption("low_light", "low light", _severities(2, 3, 4), _images(corruptions.low_light)),
-    Corruption("fog", "fog", _severities(2, 4, 5), _images(corruptions.fog)),
-    Corruption("snow", "snow", _severities(1, 2, 3), _images(corruptions.snow)),
-    _unseen("defocus_blur", corruptions.defocus_blur),
-    _unseen("low_contrast", corruptions.low_contrast),
-    _unseen("impulse_noise", corruptions.impulse_noise),
-    _unseen("jpeg", corruptions.jpeg),
-    _unseen("saturation", corruptions.saturation),
-    Corruption(
-        "calibration_noise", "calibration noise", {"1": 1, "2": 2, "3": 3, "4": 4},
-        sequences.CalibrationNoise, Shown.BOXES, group=Group.OTHER,
-    ),
-    Corruption(
-        "time_offset", "capture times off by up to 50, 100, 200 ms", _severities(50, 100, 200),
-        sequences.TimeOffsets, Shown.BOXES, group=Group.OTHER,
-    ),
-    Corruption(
-        "ego_motion_lost", "ego-motion lost in 2/6, 4/6, 5/6 of the frames", _severities(2, 4, 5),
-        sequences.EgoMotionLost, Shown.NOTHING, group=Group.OTHER,
-    ),
-    Corruption(
-        "frame_rate", "1/2, 1/3, 1/4 of the frame rate", _severities(2, 3, 4),
-        lambda scene, step, *_: sequences.at_lower_rate(scene, step), Shown.NOTHING, group=Group.OTHER,
-    ),
-)  # fmt: skip
+    # Levels of the first eight as published: RoboBEV, docs/CREATE.md.
+    Corruption("camera_crash", _severities(2, 4, 5), CameraCrash),
+    Corruption("frame_lost", _severities(2, 4, 5), FrameLost),
+    _of_images(corruptions.color_quantisation, 1, 2, 3),
+    _of_images(corruptions.motion_blur, 2, 4, 5),
+    _of_images(corruptions.brightness, 2, 4, 5),
+    _of_images(corruptions.low_light, 2, 3, 4),
+    _of_images(corruptions.fog, 2, 4, 5),
+    _of_images(corruptions.snow, 1, 2, 3),
+    _of_images(corruptions.defocus_blur, 2, 4, 5, group=Group.UNSEEN),
+    _of_images(corruptions.low_contrast, 2, 4, 5, group=Group.UNSEEN),
+    _of_images(corruptions.impulse_noise, 2, 4, 5, group=Group.UNSEEN),
+    _of_images(corruptions.jpeg, 2, 4, 5, group=Group.UNSEEN),
+    _of_images(corruptions.saturation, 2, 4, 5, group=Group.UNSEEN),
+    Corruption("calibration_noise", {"1": 1, "2": 2, "3": 3, "4": 4}, CalibrationNoise, Group.OTHER),
+    Corruption("time_offset", _severities(50, 100, 200), TimeOffsets, Group.OTHER),
+    Corruption("ego_motion_lost", _severities(2, 4, 5), EgoMotionLost, Group.OTHER),
+    Corruption("frame_rate", _severities(2, 3, 4), lambda scene, step, *_: at_lower_rate(scene, step), Group.OTHER),
+)
 NAMES = tuple(corruption.name for corruption in CORRUPTIONS)
 _GROUP_OF_LEVEL = {"1": "easy", "2": "mid", "3": "mid", "4": "hard"}  # of corruptions with numbered levels
 

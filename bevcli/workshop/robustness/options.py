@@ -16,8 +16,7 @@ class StressOptions:
 
     seed: int = option(default=0, help="Seed of all random numbers of the corruptions.", minimum=0)
     lost_images: LostImage = option(
-        default="black",
-        help="What the model gets for a lost image: a black image, as in RoboBEV, or none.",
+        default="black", help="What the model gets for a lost image: a black image, as in RoboBEV, or none."
     )
     calibrate: bool = option(
         default=False,
@@ -26,12 +25,7 @@ class StressOptions:
     temporal: bool = option(
         default=True, help="Use the frames before (and after).", panel="Model", flag="--temporal/--no-temporal"
     )
-    max_range_m: float | None = option(
-        default=None,
-        help=MAX_RANGE_HELP,
-        flag="--max-range",
-        metavar="METRES",
-    )
+    max_range_m: float | None = option(default=None, help=MAX_RANGE_HELP, flag="--max-range", metavar="METRES")
     against: Path | None = option(
         reads="path",
         default=None,
@@ -59,11 +53,7 @@ class StressOutputOptions:
         metavar="NAME",
         repeatable=True,
     )
-    out: Path | None = option(
-        default=None,
-        help="Folder for stress.json, stress.png and corruptions.png. Default: runs/stress-MODEL.",
-        metavar="DIR",
-    )
+    out: Path | None = option(default=None, help="Folder for stress.json. Default: runs/stress-MODEL.", metavar="DIR")
     force: bool = option(default=False, help="Replace the files of an earlier test in the output folder.")
     resume: bool = option(
         default=False,

@@ -1,4 +1,4 @@
-"""The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
+"""The result of a stress test: scores by condition, resilience rates, corruption errors, stress.json, and the table."""
 
 import math
 from collections.abc import Mapping
@@ -10,8 +10,9 @@ import msgspec
 
 from bevcli.errors import InputError
 from bevcli.evaluation.detection import known_mean
-from bevcli.evaluation.scores_report import finite
+from bevcli.evaluation.evaluate import finite
 from bevcli.parsing.documents import read_json
+from bevcli.printing import aligned
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group
 
 FORMAT = "bevcli-stress/1"
@@ -19,23 +20,14 @@ FORMAT = "bevcli-stress/1"
 
 @dataclass(frozen=True)
 class ConditionScores:
-    """The scores under one condition, over the classes that have ground truth: an entry of "conditions" in stress.json.
+    """An entry of "conditions" in stress.json: scores over the classes that have ground truth."""
 
-    Attributes:
-        corruption: its name, or "clean".
-        severity: "easy", "mid", "hard" or a level; "" for clean.
-        nd_score: NDS, 0 to 1.
-        mean_ap: mAP, 0 to 1.
-        tp_errors: true-positive errors by the devkit's names; NaN, or None of a file, where undefined.
-        mean_dist_aps: class -> AP.
-    """
-
-    corruption: str
-    severity: str
-    nd_score: float
-    mean_ap: float
-    tp_errors: Mapping[str, float | None]
-    mean_dist_aps: Mapping[str, float]
+    corruption: str  # name, or "clean"
+    severity: str  # "easy", "mid", "hard" or a level; "" for clean
+    nd_score: float  # NDS, 0 to 1
+    mean_ap: float  # mAP, 0 to 1
+    tp_errors: Mapping[str, float | None]  # by the devkit's names; NaN (None of a file) if undefined
+    mean_dist_aps: Mapping[str, float]  # class -> AP
 
 
 @dataclass(frozen=True)
@@ -67,10 +59,10 @@ class StressResults:
 
     def resilience(self, name: str) -> float:
         """Resilience rate of a corruption: its mean NDS over its severities, over the NDS of clean drives."""
-        found = self.of(name).values()
-        if self.clean is None or not found or not self.clean.nd_score:
+        severities = self.of(name).values()
+        if self.clean is None or not severities or not self.clean.nd_score:
             return math.nan
-        return sum(scores.nd_score for scores in found) / len(found) / self.clean.nd_score
+        return sum(scores.nd_score for scores in severities) / len(severities) / self.clean.nd_score
 
     def corruption_error(self, name: str, against: Self) -> float:
         """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""
@@ -123,3 +115,54 @@ def read_results(path: Path) -> StressResults:
     except (KeyError, msgspec.ValidationError) as error:
         raise InputError(f'{path}: "conditions" is wrong ({type(error).__name__}: {error})') from None
     return StressResults(content, scores, content.get("complete") is True)
+
+
+def stress_table(results: StressResults, against: StressResults | None = None) -> str:
+    """NDS and mAP by corruption and severity as text; with `against`, also the corruption errors."""
+    parts = []
+    if results.clean is not None:
+        parts.append(f"clean drives: NDS {results.clean.nd_score:.3f}, mAP {results.clean.mean_ap:.3f}")
+    tested = results.tested()
+    groups = {
+        tuple(corruption.levels): [c for c in tested if c.levels.keys() == corruption.levels.keys()]
+        for corruption in tested
+    }
+    parts += [_block(results, severities, group, against) for severities, group in groups.items()]
+    published, unseen = (sum(each.group is group for each in tested) for group in (Group.ROBOBEV, Group.UNSEEN))
+    if published:
+        parts.append(_means(results, published, against))
+    if unseen:
+        mean = _percent(results.mean_resilience(Group.UNSEEN))
+        parts.append(f"mean resilience {mean} % over {unseen} of 5 corruptions that no training of bevcli uses")
+    return "\n\n".join(parts)
+
+
+def _block(
+    results: StressResults, severities: tuple[str, ...], group: list[Corruption], against: StressResults | None
+) -> str:
+    scale = "level " if severities[0].isdecimal() else ""
+    head = [cell for severity in severities for cell in (f"{scale}{severity}: NDS", "mAP")]
+    rows = [("corruption", *head, "mean NDS", "RR %", *(("CE %",) if against else ()))]
+    for corruption in group:
+        scores = results.of(corruption.name)
+        cells = []
+        for part in map(scores.get, severities):
+            cells += [f"{part.nd_score:.3f}", f"{part.mean_ap:.3f}"] if part else ["-", "-"]
+        mean = sum(part.nd_score for part in scores.values()) / len(scores)
+        rates = [f"{mean:.3f}", _percent(results.resilience(corruption.name))]
+        rates += [_percent(results.corruption_error(corruption.name, against))] if against else []
+        rows.append((corruption.name, *cells, *rates))
+    return aligned(rows)
+
+
+def _means(results: StressResults, published: int, against: StressResults | None) -> str:
+    what = f"over {published} of RoboBEV's 8 corruptions"
+    lines = [f"mRR {_percent(results.mean_resilience())} % {what}"]
+    if against is not None:
+        other = against.header.get("model", "?")
+        lines.append(f"mCE {_percent(results.mean_corruption_error(against))} % against {other} {what}")
+    return "\n".join(lines)
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.1f}"

@@ -11,21 +11,20 @@ from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.frame import Sequence
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
-from bevcli.workshop.calibration.calibrate import calibrate
-from bevcli.workshop.calibration.result import CorrectedDrive
-from bevcli.workshop.robustness.conditions import Condition, choose_conditions
+from bevcli.sequences.open import scenes_of, select
+from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
+from bevcli.workshop.robustness.conditions import KEPT_BYTES, Condition, KeptFrames, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.robustness.results import ConditionScores, StressResults, read_results
-from bevcli.workshop.robustness.sequences import FrameStore, KeptFrames, split_scenes
-from bevcli.workshop.training.validation import boxes_ego
 from bevcli.writing import write_whole
 
-RESULTS, SHEET, PLOT = "stress.json", "corruptions.png", "stress.png"
+RESULTS = "stress.json"
 # Predicted boxes and ground truth of each scored frame of a scene, in the ego frame.
 SceneBoxes = tuple[tuple[Boxes3D, Boxes3D], ...]
 _INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
@@ -33,15 +32,10 @@ _INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
 
 @dataclass(frozen=True)
 class StressState:
-    """A test after a number of finished conditions, for `resume`.
+    """A test after a number of finished conditions, for `resume`."""
 
-    Attributes:
-        facts: what the results depend on, see `run_facts`.
-        scores: of the finished conditions.
-    """
-
-    facts: dict[str, str]
-    scores: tuple[ConditionScores, ...] = ()
+    facts: dict[str, str]  # what the results depend on, see `run_facts`
+    scores: tuple[ConditionScores, ...] = ()  # of the finished conditions
 
 
 class _Stopped(Exception):
@@ -70,8 +64,7 @@ def stress(
         model: of `load_model`.
         drives: of `open_sequence`, with ground truth.
         conditions: of `choose_conditions`. Results of an earlier, resumed test are kept.
-        out: the folder for stress.json and, when the test is complete, stress.png and corruptions.png; made where it is
-            missing.
+        out: the folder for stress.json; made where it is missing.
         options: see `StressOptions`.
         force: remove the files that an earlier test wrote into `out`.
         resume: go on with an interrupted test; it may get further conditions.
@@ -87,8 +80,8 @@ def stress(
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     model = model.in_engine(drives[0].rig, drives[0])
-    store = FrameStore()
-    scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
+    parts = [part for drive in drives for part in split_scenes(drive)]
+    scenes = [KeptFrames(part, KEPT_BYTES // len(parts)) for part in parts]
     against = None if options.against is None else read_results(options.against)
     facts = _facts(model, drives, replace(options, against=None))
     with RunFolder(out, force=force, resume=resume) as folder:
@@ -97,29 +90,27 @@ def stress(
             folder.remove_written()
             state = StressState(facts)
             save_state(folder.state_path, state)
-        test = _Test(model, scenes, options, folder, after_frame, should_stop)
-        finished = {(each.corruption, each.severity) for each in state.scores}
+        run = _StressRun(model, scenes, options, folder, after_frame, should_stop)
+        finished = {(scores.corruption, scores.severity) for scores in state.scores}
         left = [condition for condition in conditions if (condition.name, condition.severity) not in finished]
-        done = test.kept_frames(left) + (len(conditions) - len(left)) * sum(len(scene.stamps) for scene in scenes)
+        done = run.kept_frames(left) + (len(conditions) - len(left)) * sum(len(scene.stamps) for scene in scenes)
         if done:
             resumed(done)
-        results = StressResults(test.header(), state.scores, is_complete=False)
+        results = StressResults(run.header(), state.scores, is_complete=False)
         with contextlib.suppress(_Stopped):
             for condition in left:
-                scores = (*results.scores, test.run(condition))
-                results = replace(results, scores=tuple(sorted(scores, key=_place_of)))
+                scores = (*results.scores, run.scores(condition))
+                results = replace(results, scores=tuple(sorted(scores, key=_order)))
                 save_state(folder.state_path, StressState(facts, results.scores))
                 _write_results(folder, results, against)
-                test.remove_boxes(condition)
+                run.remove_boxes(condition)
             results = replace(results, is_complete=True)
         _write_results(folder, results, against)
-        if results.is_complete:
-            _write_figures(folder, results, against, scenes[0], options)
     return results
 
 
 @dataclass
-class _Test:
+class _StressRun:
     """One model, its scenes, and the folder in which finished scenes of the current condition are kept."""
 
     model: Model
@@ -153,29 +144,28 @@ class _Test:
         scenes = [scene for n, scene in enumerate(self.scenes) if left and self._boxes_path(left[0], n).exists()]
         return sum(len(scene.stamps) for scene in scenes)
 
-    def run(self, condition: Condition) -> ConditionScores:
-        """The scores under a condition. Raises _Stopped."""
-        frames = [frame for place in range(len(self.scenes)) for frame in self._scene_boxes(condition, place)]
+    def scores(self, condition: Condition) -> ConditionScores:
+        """Raises _Stopped."""
+        frames = [frame for index in range(len(self.scenes)) for frame in self._scene_boxes(condition, index)]
         predictions, truths = zip(*frames, strict=True)
         table = evaluate_detections(predictions, truths, self.metrics).overall.of_classes_with_ground_truth()
         aps = {name: scores.mean_ap for name, scores in table.classes.items()}
         return ConditionScores(condition.name, condition.severity, table.nd_score, table.mean_ap, table.errors, aps)
 
     def remove_boxes(self, condition: Condition) -> None:
-        """Removes the stored boxes of a finished condition."""
-        for place in range(len(self.scenes)):
-            self._boxes_path(condition, place).unlink(missing_ok=True)
+        for index in range(len(self.scenes)):
+            self._boxes_path(condition, index).unlink(missing_ok=True)
 
-    def _boxes_path(self, condition: Condition, place: int) -> Path:
-        name = "-".join(("boxes", condition.name, condition.severity or "0", str(place)))
+    def _boxes_path(self, condition: Condition, index: int) -> Path:
+        name = "-".join(("boxes", condition.name, condition.severity or "0", str(index)))
         return self.folder.state_path.with_name(f"{name}.safetensors")
 
-    def _scene_boxes(self, condition: Condition, place: int) -> SceneBoxes:
+    def _scene_boxes(self, condition: Condition, index: int) -> SceneBoxes:
         """The boxes of a scene: read if they are there already, else computed and stored."""
-        path = self._boxes_path(condition, place)
+        path = self._boxes_path(condition, index)
         if path.exists():
             return load_state(path, SceneBoxes)
-        scene = self.scenes[place]
+        scene = self.scenes[index]
         boxes: SceneBoxes = ()
         for part in condition.sequences(scene, self.options.seed, self.options.lost_images):
             boxes += tuple(self._run_sequence(_calibrated(part) if self.options.calibrate else part))
@@ -186,14 +176,15 @@ class _Test:
         return boxes
 
     def _run_sequence(self, sequence: Sequence) -> Iterator[tuple[Boxes3D, Boxes3D]]:
-        """The predicted boxes and the ground truth of each frame that has any."""
         model = self.model
         if self.runner is None:
             self.runner = model.runner(track=False, temporal=self.options.temporal)
         steps = self.runner.run(sequence, range(len(sequence.stamps)), self.runner.preprocessor())
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
-                yield boxes_ego(frame, frame.ground_truth, prediction, self.metrics.classes)
+                predicted = prediction.boxes_ego  # the model has no attributes: they follow from the speed
+                predicted = replace(predicted, attributes=attributes_by_speed(predicted, self.metrics.classes))
+                yield predicted, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))
             self.after_frame()
             if self.should_stop():
                 raise _Stopped
@@ -207,18 +198,25 @@ def _calibrated(sequence: Sequence) -> Sequence:
         return sequence
 
 
-def _place_of(scores: ConditionScores) -> int:
+def split_scenes(drive: Sequence) -> list[Sequence]:
+    """One sequence per scene. Raises InputError if the drive has no frames."""
+    if not drive.stamps:
+        raise InputError(f"{drive.name}: has no frames")
+    return [select(drive, indices) for indices in scenes_of(drive.stamps)]
+
+
+def _order(scores: ConditionScores) -> int:
     """Clean first, then as in CORRUPTIONS."""
-    order = [(each.name, each.severity) for each in choose_conditions()]
-    return order.index((scores.corruption, scores.severity))
+    conditions = [(condition.name, condition.severity) for condition in choose_conditions()]
+    return conditions.index((scores.corruption, scores.severity))
 
 
 def _facts(model: Model, drives: Items[Sequence], options: StressOptions) -> dict[str, str]:
     """The facts that the results depend on, apart from the conditions."""
-    each = [run_facts(model, drive, options) for drive in drives]
-    facts = dict(each[0])
-    if len(each) > 1:
-        facts |= {name: digest(tuple(one[name] for one in each))[:12] for name in _INPUT_FACTS}
+    of_drives = [run_facts(model, drive, options) for drive in drives]
+    facts = dict(of_drives[0])
+    if len(of_drives) > 1:
+        facts |= {name: digest(tuple(of_drive[name] for of_drive in of_drives))[:12] for name in _INPUT_FACTS}
     return facts | {"drives": ", ".join(drive.name for drive in drives)}
 
 
@@ -226,18 +224,3 @@ def _write_results(folder: RunFolder, results: StressResults, against: StressRes
     path = folder.path / RESULTS
     folder.add(path)
     write_whole(path, (json.dumps(results.to_dict(against), indent=1) + "\n").encode())
-
-
-def _write_figures(
-    folder: RunFolder, results: StressResults, against: StressResults | None, scene: Sequence, options: StressOptions
-) -> None:
-    """Writes the plot, and a contact sheet of a scene."""
-    from bevcli.evaluation.plots import save_figures  # only plots need matplotlib
-    from bevcli.workshop.robustness.report import draw_stress, write_contact_sheet
-
-    folder.add(folder.path / SHEET)
-    conditions = [each for each in choose_conditions() if each.severity in results.of(each.name)]
-    write_contact_sheet(folder.path / SHEET, scene, conditions, options)
-    if results.tested():
-        folder.add(folder.path / PLOT)
-        save_figures({PLOT: draw_stress(results, against)}, folder.path)

@@ -10,15 +10,12 @@ from bevcli.workshop.synth.options import RenderOptions
 PANEL = "Start"
 
 
-def render(
-    out: Annotated[Path, argument("The sequence folder to write.", reads=None)],
-    options: RenderOptions,
-) -> None:
+def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
     from bevcli.cli.progress import Progress
     from bevcli.jit import is_compiled
-    from bevcli.workshop.synth.export import render as render_sequence
-    from bevcli.workshop.synth.render.shading_kernels import shade_pixels
+    from bevcli.workshop.synth.drive import render as render_sequence
+    from bevcli.workshop.synth.shading_kernels import shade_pixels
 
     if not is_compiled(shade_pixels):
         say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)

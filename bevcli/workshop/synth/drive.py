@@ -1,38 +1,46 @@
-"""A rendered drive: its frames, ground truth and ego-motion, made in memory when they are asked for."""
+"""A rendered drive: its frames, ground truth and ego-motion, in memory or as a sequence folder.
 
-from collections.abc import Mapping
+`render` makes a drive and writes it, `export_drive` writes a given one.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import BevMap, FrameStamp, MapLines
+from bevcli.frame import BevMap, CameraImage, DriveFacts, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
-from bevcli.workshop.synth.assets.catalog import Assets, Body
-from bevcli.workshop.synth.assets.mesh import TriangleSoup
-from bevcli.workshop.synth.render.ground import GroundTexture, draw_map, paint_ground, true_lines
-from bevcli.workshop.synth.render.lens import lens_parts
-from bevcli.workshop.synth.render.rasteriser import ShadowMap
-from bevcli.workshop.synth.render.renderer import (
+from bevcli.options import gather
+from bevcli.sequences.native.tables import write_ego_motion
+from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.synth.catalog import Assets, Body
+from bevcli.workshop.synth.city import CityPlan
+from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
+from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
+from bevcli.workshop.synth.mesh import TriangleSoup
+from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
+from bevcli.workshop.synth.renderer import (
     NO_PATTERN,
     RenderedView,
+    ShadowMap,
     WorldSnapshot,
     render_through_lens,
     render_view,
 )
-from bevcli.workshop.synth.rig import DrawnRig, nuscenes_like_rig
-from bevcli.workshop.synth.world.city import CityPlan
-from bevcli.workshop.synth.world.ground_plan import GroundPlan
-from bevcli.workshop.synth.world.looks import Looks
-from bevcli.workshop.synth.world.scenery import Scenery
-from bevcli.workshop.synth.world.simulation import Actor, Simulation
-from bevcli.workshop.synth.world.traffic import ActorState
-from bevcli.workshop.synth.world.weather import WEATHER_NAMES, make_weather
+from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
+from bevcli.workshop.synth.scenery import Scenery
+from bevcli.workshop.synth.simulation import Actor, Simulation
+from bevcli.workshop.synth.traffic import ActorState
+from bevcli.workshop.vad.map_lines import MapLines
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
@@ -51,27 +59,16 @@ def texel_sizes(width: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame of a rendered drive.
-
-    Attributes:
-        stamp: index, scene and timestamp.
-        views: camera name to image.
-        world_from_ego: pose of the ego vehicle.
-        world_from_ego_at: camera name to pose of the ego vehicle at the camera's time.
-        camera_timestamps_ns: camera name to the time of its image.
-        boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
-        bev_map: ground truth map.
-        lines: true lines of the map, bev frame.
-    """
+    """One frame of a rendered drive with its ground truth."""
 
     stamp: FrameStamp
-    views: Mapping[str, RenderedView]
+    views: Mapping[str, RenderedView]  # by camera
     world_from_ego: Pose
-    world_from_ego_at: Mapping[str, Pose]
-    camera_timestamps_ns: Mapping[str, int]
-    boxes: Boxes3D
+    world_from_ego_at: Mapping[str, Pose]  # by camera, at the time of its image
+    camera_timestamps_ns: Mapping[str, int]  # by camera
+    boxes: Boxes3D  # world frame, with attributes, instances, visibilities, pixels
     bev_map: BevMap
-    lines: MapLines
+    lines: MapLines  # bev frame
 
     @property
     def images(self) -> dict[str, NDArray[np.uint8]]:
@@ -158,7 +155,6 @@ class RenderedDrive:
         return [state for _, state in self._actors(index)]
 
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
-        """The annotated objects around the vehicle at a frame, with their states."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
         seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))
         return [(a, state) for a, state in seen if state and np.hypot(*(state.position[:2] - origin)) < ACTORS_M]
@@ -219,7 +215,6 @@ class RenderedDrive:
             return dict(zip(names, pool.map(render_one, names), strict=True))
 
     def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
-        """The scenery around a world point, the texture of the ground, and the shadow map of the scenery."""
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         scenery = self._scenery.around(center, SCENERY_M)
@@ -230,11 +225,9 @@ class RenderedDrive:
         return scenery, texture, shadows
 
     def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
-        """The mesh of a body in the world."""
         return self._template(body, pose).placed((x, y, z), yaw)
 
     def _make_template(self, body: Body, pose: int) -> TriangleSoup:
-        """The mesh of a body in its size and colours."""
         mesh, paint = body.variant.poses[pose % len(body.variant.poses)], body.paint
         if self._looks is not None:
             mesh, paint = self._looks.body(mesh, body.instance), self._looks.paint(paint, body.instance)
@@ -264,3 +257,103 @@ class RenderedDrive:
         )  # fmt: skip
         origin = (pose.matrix @ self.rig.ego_from_bev)[:2, 3]
         return boxes[np.hypot(*(boxes.centers[:, :2] - origin).T) < ANNOTATED_M]
+
+
+EGO_MOTION_HZ = 50.0
+SUPERSAMPLED_WIDTH = 1000  # images up to this width are supersampled by default
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class RenderSummary:
+    """Summary of the sequence that `render` has written.
+
+    Attributes:
+        folder: the sequence folder.
+        seed: seed of the drive.
+        frames: number of frames.
+        cameras: names of the cameras.
+        weather: name of the weather.
+    """
+
+    folder: Path
+    seed: int
+    frames: int
+    cameras: tuple[str, ...]
+    weather: str
+
+
+def render(
+    out: str | Path,
+    options: RenderOptions | None = None,
+    *,
+    progress: Callable[[Frame], None] | None = None,
+    **changes: Any,
+) -> RenderSummary:
+    """Render a drive through a procedural city and write it as a sequence with ground truth boxes and maps.
+
+    The same options give the same files. The models of this project were trained on seeds below 1,000,000 only. The
+    first call on a computer compiles the renderer, which takes about 15 s.
+
+    Args:
+        out: the sequence folder to write.
+        options: the options; by default those of `RenderOptions`.
+        progress: called with each frame after it is written.
+        changes: options by name, such as `seed=7` and `resolution=(800, 450)`.
+
+    Raises:
+        InputError: an option is out of range, the calibration file is wrong, or a camera's field of view is too wide.
+        OutputError: `out` contains a sequence and `force` is false, or it cannot be written.
+    """
+    chosen = gather(RenderOptions, options, changes)
+    rig = rig_for_rendering(chosen.rig, chosen.resolution)
+    samples = chosen.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
+    drive = RenderedDrive(
+        chosen.seed, chosen.frames, chosen.rate_hz, rig, chosen.weather, supersampling=samples, threads=THREADS
+    )
+    export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
+    return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
+
+
+def export_drive(
+    drive: RenderedDrive,
+    folder: Path,
+    *,
+    force: bool = False,
+    quality: int = JPEG_QUALITY,
+    progress: Callable[[Frame], None] | None = None,
+) -> None:
+    """Render all frames of a drive and write them, with ego-motion at EGO_MOTION_HZ, ground truth boxes and maps.
+
+    folder: the sequence folder. force: whether to replace a sequence in it. quality: JPEG quality, 1 to 100.
+    progress: called with each frame after it is written.
+    Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
+    """
+    with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
+        for frame in _encoded(drive, quality):
+            writer.write(frame)
+            if progress is not None:
+                progress(frame)
+    # The writer has written a pose for each frame. Replace them by denser ones, so that cameras may have time offsets.
+    write_ego_motion(folder / "ego_motion.csv", drive.ego_motion(EGO_MOTION_HZ))
+
+
+def _encoded(drive: RenderedDrive, quality: int) -> Iterator[Frame]:
+    motion = drive.ego_motion(EGO_MOTION_HZ)
+    for rendered in map(drive.frame, range(drive.frames)):
+        images = {}
+        for name, pixels in rendered.images.items():
+            encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+            images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
+        yield Frame(
+            rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
+            motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
+            ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
+        )  # fmt: skip
+
+
+def _rounded(boxes: Boxes3D) -> Boxes3D:
+    """The boxes rounded to 0.1 mm and 10 microradians, which keeps the files small."""
+    decimals = {"centers": 4, "sizes_lwh": 4, "yaws": 5, "velocities": 4, "visibilities": 4}
+    values: dict[str, Any] = {name: getattr(boxes, name) for name in decimals}
+    return replace(boxes, **{name: np.round(v, decimals[name]) for name, v in values.items() if v is not None})

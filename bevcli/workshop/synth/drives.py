@@ -1,11 +1,17 @@
-"""Drives with ground truth, for training, validation and stress tests: sequence folders, or rendered from seeds."""
+"""Drives with ground truth, for training, validation and stress tests: sequence folders, or rendered from seeds.
 
+A split says which drives are trained on and which are scored: a file states them, or the last drives are held out.
+"""
+
+import glob
 import hashlib
+import json
 import os
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Mapping, Sequence as Items
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,28 +20,28 @@ from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.synth.assets.catalog import Assets
-from bevcli.workshop.synth.drive import RenderedDrive
-from bevcli.workshop.synth.export import export_drive
+from bevcli.workshop.synth.catalog import Assets
+from bevcli.workshop.synth.drive import RenderedDrive, export_drive
+from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
+from bevcli.writing import write_whole
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
 FRAMES_PER_DRIVE = 20
-InputShape = tuple[int, int, int]  # cameras, height, width
+InputShape = tuple[int, int, int]  # number of cameras; height and width, pixels
 
 
 class Drives(Protocol):
-    """A list of drives. Several threads may open them at the same time.
-
-    Attributes:
-        input_shapes: of each drive, the number of cameras, and height and width of the network's input in pixels; None
-            where any of them may share a batch.
-    """
+    """A list of drives. Several threads may open them at the same time."""
 
     @property
-    def input_shapes(self) -> tuple[InputShape, ...] | None: ...
+    def input_shapes(self) -> tuple[InputShape, ...] | None:
+        """Of each drive the shape of the network's input; None where any of them may share a batch."""
+        ...
 
     def __len__(self) -> int: ...
 
@@ -98,9 +104,9 @@ class RenderedDrives(FolderDrives):
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
-            found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
-            self._rigs = [DrawnRig(found)] * len(seeds)
-            name += "" if rig is None else f"-rig-{_digest(found)}"
+            fitting = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
+            self._rigs = [DrawnRig(fitting)] * len(seeds)
+            name += "" if rig is None else f"-rig-{_digest(fitting)}"
         super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
         self._seeds, self._config = tuple(seeds), config
         self._rendering = threading.Lock()
@@ -168,8 +174,6 @@ def _digest(rig: CameraRig) -> str:
 
 
 class _Subset:
-    """Some of the drives."""
-
     def __init__(self, drives: Drives, indices: range) -> None:
         self._drives, self._indices = drives, indices
         shapes = drives.input_shapes
@@ -237,3 +241,91 @@ def split_drives(drives: Drives, held_out: int) -> tuple[Drives, Drives]:
 def count_frames(drives: Drives) -> int:
     """The number of frames of all drives. Opens each of them."""
     return sum(len(drives.open(index).stamps) for index in range(len(drives)))
+
+
+KEYS = ("train", "validate")
+
+
+@dataclass(frozen=True)
+class Split:
+    """The sequence folders of a split file: to train on, and to score on."""
+
+    train: tuple[Path, ...]
+    validate: tuple[Path, ...]
+
+
+def read_split(path: Path) -> Split:
+    """The drives in a TOML file with the keys train and validate.
+
+        train = ["drives/2024-*"]
+        validate = ["drives/2025-01", "drives/2025-02"]
+
+    Folders are relative to the file; *, ? and [abc] stand for the folders that match, in the order of their names.
+    Raises InputError for another key, a list that leaves no drive, or a drive that is missing or stands there twice.
+    """
+    table = parse_toml(read_text(path, TOML_BYTES), path)
+    if set(table) != set(KEYS):
+        raise InputError(f"{path}: expected the keys {' and '.join(KEYS)}, found {', '.join(table) or 'none'}")
+    split = Split(*(_folders(path, key, table[key]) for key in KEYS))
+    times = Counter(folder.resolve() for folder in (*split.train, *split.validate))
+    twice = [str(folder) for folder, count in times.items() if count > 1]
+    if twice:
+        raise InputError(f"{path}: {twice[0]} stands there twice: a drive is trained on or scored on, once")
+    return split
+
+
+def split_of(data: DriveOptions, held_out: int) -> Split | None:
+    """The folders to train on and to score on; None for rendered drives. Raises InputError as `read_split`."""
+    if data.split is not None:
+        return _only_split(data, data.split)
+    first = len(data.data) - held_out
+    return Split(data.data[:first], data.data[first:]) if data.rendered is None else None
+
+
+def write_split(path: Path, split: Split) -> None:
+    """Write a split file with absolute paths. Raises OutputError."""
+    for_glob = {key: [glob.escape(str(folder.resolve())) for folder in getattr(split, key)] for key in KEYS}
+    text = "".join(f"{key} = {json.dumps(folders, ensure_ascii=False)}\n" for key, folders in for_glob.items())
+    write_whole(path, text.encode())
+
+
+def training_drives(
+    data: DriveOptions, held_out: int, cache: Path, config: ModelConfig, rigs: RigDistribution | None
+) -> tuple[Drives, Drives]:
+    """The drives to train on, and those to score on: of the split file, or else the last `held_out`.
+
+    Raises InputError as `read_split` and `split_drives`.
+    """
+    if data.split is None:
+        drives = open_drives(data.data, data.rendered, cache, config, rigs, data.class_map)
+        return split_drives(drives, held_out)
+    split = _only_split(data, data.split)
+    train, validate = (FolderDrives(folders, config, data.class_map) for folders in (split.train, split.validate))
+    return train, validate
+
+
+def scored_drives(data: DriveOptions, config: ModelConfig, rig: CameraRig | RigDistribution | None = None) -> Drives:
+    """The drives to score on. rig: of rendered ones, as for `open_drives`. Raises InputError as `read_split`."""
+    if data.split is None:
+        return open_drives(data.data, data.rendered, data.cache, config, rig, data.class_map)
+    return FolderDrives(_only_split(data, data.split).validate, config, data.class_map)
+
+
+def _only_split(data: DriveOptions, path: Path) -> Split:
+    if data.data or data.rendered is not None:
+        raise InputError(f"{path}: states the drives: remove `{'data' if data.data else 'rendered'}`, or `split`")
+    return read_split(path)
+
+
+def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f'{path}: {key}: expected a list of folders, such as ["drives/a"], found {names!r:.60}')
+    folders: list[Path] = []
+    for name in names:
+        matching = sorted(glob.glob(str(path.parent / name))) if set(name) & set("*?[") else [str(path.parent / name)]
+        if not matching or not all(Path(folder).exists() for folder in matching):
+            raise InputError(f"{path}: {key}: {name}: there is no such folder")
+        folders += map(Path, matching)
+    if not folders:
+        raise InputError(f"{path}: {key}: leaves no drive (expected at least one folder)")
+    return tuple(folders)

@@ -70,13 +70,6 @@ class RenderOptions:
         minimum=1,
         maximum=4,
     )
-    workers: int = option(
-        default=1,
-        help="Number of processes that render; each takes some 0.4 GB. The files are the same for any number.",
-        metavar="N",
-        minimum=1,
-        maximum=256,
-    )
     force: bool = option(default=False, help="Replace a sequence in OUT.")
 
     def __post_init__(self) -> None:
@@ -97,9 +90,7 @@ class DemoOptions:
 
     out: Path = option(default=Path("runs/demo"), help="Folder for the drive and the results.")
     seed: int = option(
-        default=1_000_001,
-        help="Seed of the drive. The model was trained on seeds below 1000000 only.",
-        minimum=0,
+        default=1_000_001, help="Seed of the drive. The model was trained on seeds below 1000000 only.", minimum=0
     )
     frames: int = option(default=8, help="Number of frames, two per second.", metavar="N", flag="--count", minimum=1)
     view: bool = option(default=True, help="Open the viewer at the end.", flag="--view/--no-view")

@@ -1,17 +1,125 @@
-"""The rigs that are rendered: the default one, one from a file, or one drawn at random for training and validation."""
+"""The rigs that are rendered, and the pinhole images from which the image of a camera with distortion is resampled.
+
+A rig is the default one, one from a file, or one drawn at random for training and validation.
+"""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
+from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, Distortion, default_ego_from_bev, fisheye_table
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration
-from bevcli.workshop.synth.render.lens import lens_parts
+
+WIDEST = 4.0  # tangent of the widest angle off the optical axis in one pinhole image; wider ones would be too large
+SMALLEST_ANGLE = np.arctan(WIDEST)  # a lens model that ends inside the image, at a smaller angle, is a mistake
+STEP = 16  # pixels between those whose rays are computed; a spline gives the others within 1e-4 pixels
+# (5, 3, 3) camera_from_face: the faces of a cube around the camera, but that behind it.
+FACES = np.array(
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # ahead
+        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # left
+        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # right
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # above
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # below
+    ],
+    dtype=np.float64,
+)
+
+
+@dataclass(frozen=True)
+class LensPart:
+    """A pinhole image that gives a part of the image of a camera with distortion.
+
+    Columns and rows are OUTSIDE for pixels that another part gives, or none.
+    """
+
+    pinhole: Camera
+    columns: NDArray[np.float32]  # (H, W) in the pinhole image, for each pixel of the camera's image
+    rows: NDArray[np.float32]  # (H, W)
+    needed: NDArray[np.uint8]  # (H', W') 1 for the pixels of the pinhole image that are needed, else 0
+
+
+def lens_parts(camera: Camera) -> tuple[LensPart, ...]:
+    """The pinhole images that give the image of a camera with distortion: a wider one, or up to five for a fisheye.
+
+    They cost as much as rendering the image, so keep them for all frames.
+    Raises InputError where a lens that is not "kannala_brandt" sees more than about 75 degrees off its optical axis,
+    where the model of a fisheye ends within the image at a smaller angle, and where the whole image would be black.
+    """
+    from scipy.interpolate import RectBivariateSpline  # 0.2 s that other rigs do not need
+
+    assert camera.distortion is not None
+    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    some_u, some_v = (np.linspace(0, p[-1], max(len(p) // STEP, 4)) for p in (u, v))
+    directions = _directions(camera, some_u, some_v)
+    if (np.abs(directions[..., :2]) <= WIDEST * directions[..., 2:]).all():
+        some = directions[..., :2] / directions[..., 2:]
+        rays = [RectBivariateSpline(some_v, some_u, some[..., axis])(v, u) for axis in range(2)]
+        return (_part(camera, FACES[0], rays),)
+    if camera.distortion.model == "kannala_brandt":
+        return _fisheye_parts(camera, _directions(camera, u, v))
+    raise InputError(
+        "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis, or a "
+        '"kannala_brandt" lens): remove "distortion" from the rig or use a narrower lens'
+    )
+
+
+def _directions(camera: Camera, u: Array, v: Array) -> Array:
+    """(V, U, 3) in the camera frame, of the pixels in columns (U,) and rows (V,)."""
+    return camera.rays(np.stack(np.meshgrid(u, v), -1))
+
+
+def _fisheye_parts(camera: Camera, directions: Array) -> tuple[LensPart, ...]:
+    """directions: (H, W, 3) of the pixels in the camera frame; NaN where the image is black."""
+    assert camera.distortion is not None
+    end = fisheye_table(camera.distortion.coefficients)[0][-1]
+    if end < SMALLEST_ANGLE and np.isnan(directions).any():
+        raise InputError(
+            f"its lens model ends {np.degrees(end):.0f} degrees off the optical axis, inside the image "
+            '(expected at least 75): check "distortion" and "intrinsics"'
+        )
+    nearest = np.where(np.isfinite(directions).all(-1), (directions @ FACES[:, :, 2].T).argmax(-1), -1)
+    parts = []
+    for face, camera_from_face in enumerate(FACES):
+        turned = directions @ camera_from_face
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rays = np.where(nearest == face, np.moveaxis(turned[..., :2] / turned[..., 2:], -1, 0), np.nan)
+        if (nearest == face).any():
+            parts.append(_part(camera, camera_from_face, rays))
+    if not parts:
+        raise InputError('no pixel sees less than 120 degrees off the optical axis: check "intrinsics"')
+    return tuple(parts)
+
+
+def _part(camera: Camera, camera_from_part: Array, rays: Sequence[Array] | Array) -> LensPart:
+    """camera_from_part: (3, 3). rays: x and y (H, W) in the part's frame at a depth of 1; NaN for pixels of others."""
+    low, high = (np.array([limit(axis) for axis in rays]) for limit in (np.nanmin, np.nanmax))
+    focal = np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]])
+    width, height = (int(np.ceil(n)) + 2 for n in (high - low) * focal)
+    offset = -low * focal + 1
+    intrinsics = np.array([[focal[0], 0, offset[0]], [0, focal[1], offset[1]], [0, 0, 1.0]])
+    ego_from_part = camera.ego_from_camera @ rigid((0, 0, 0), camera_from_part)
+    pinhole = replace(
+        camera, width=width, height=height, intrinsics=intrinsics, ego_from_camera=ego_from_part, distortion=None
+    )
+    columns, rows = (
+        np.nan_to_num((axis * scale + shift).astype(np.float32), copy=False, nan=OUTSIDE)
+        for axis, scale, shift in zip(rays, focal, offset, strict=True)
+    )
+    given = columns >= 0
+    used = np.zeros((height, width), np.uint8)
+    used[rows[given].astype(np.int64), columns[given].astype(np.int64)] = 1
+    needed = cv2.dilate(used, np.ones((2, 2), np.uint8), anchor=(1, 1))  # with the pixels at the right and below
+    return LensPart(pinhole, columns, rows, needed.astype(np.uint8, copy=False))
+
 
 # name: x, y, z in the ego frame (metres), yaw (degrees), focal length (pixels at 1600 x 900)
 _MOUNTS = {
@@ -28,10 +136,10 @@ EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
     """Six horizontal cameras around the vehicle. width, height: of the images, pixels; the fields of view stay."""
     cameras = []
-    for name, (*place, yaw_deg, focal) in _MOUNTS.items():
+    for name, (*position, yaw_deg, focal) in _MOUNTS.items():
         intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
         rotation = rotation_about_z(np.radians(yaw_deg)) @ EGO_AXES_FROM_CAMERA
-        camera = Camera(name, 1600, 900, intrinsics, rigid(place, rotation))
+        camera = Camera(name, 1600, 900, intrinsics, rigid(position, rotation))
         cameras.append(camera.scaled(width / 1600, height / 900))
     return CameraRig(tuple(cameras), default_ego_from_bev())
 
@@ -44,20 +152,20 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
     Raises InputError where the file is wrong, or a camera has too wide a field of view for its lens model.
     """
     if rig is None:
-        where, found = "", nuscenes_like_rig()
+        where, chosen = "", nuscenes_like_rig()
     elif isinstance(rig, CameraRig):
-        where, found = "rig: ", rig
+        where, chosen = "rig: ", rig
     else:
-        where, found = f"{rig}: ", read_calibration(Path(rig))
+        where, chosen = f"{rig}: ", read_calibration(Path(rig))
     if size is not None:
-        found = replace(found, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in found.cameras))
-    for camera in found.cameras:
+        chosen = replace(chosen, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in chosen.cameras))
+    for camera in chosen.cameras:
         if camera.distortion is not None:
             try:
                 lens_parts(camera)
             except InputError as error:
                 raise InputError(f"{where}camera {camera.name}: {error}") from None
-    return found
+    return chosen
 
 
 _STREAM = 0x7269_6773  # keeps the draws apart from those of the street with the same seed
@@ -80,56 +188,30 @@ class RigDistribution:
     """The [training.rigs] table: the distribution of the rigs, and of how their images were taken.
 
     A share is a probability from 0 to 1. A range is the lowest and the highest value, drawn uniformly.
-
-    Attributes:
-        random_share: share of the drives with a random rig. The others have the default rig.
-        cameras: range of the number of cameras.
-        fov_deg: range of the horizontal field of view. The cameras of a rig that looks all around get at least the
-            field of view at which they leave no gap, as far as the range allows.
-        fov_spread: cameras of a rig differ in their field of view by a factor of at most 1 + this, up or down.
-        aspects: widths divided by heights of the images; one of them for each rig.
-        focal_ratio: largest relative difference of the focal lengths along x and y.
-        principal_point: largest distance of the principal point from the middle, relative to width and height.
-        height_m: range of the cameras' height above the ground; the cameras of a rig differ by at most 0.15 m.
-        radius_m: range of the cameras' distance from the middle of the roof, along x; half of it along y.
-        front_share: share of the rigs that look ahead and to the sides only.
-        yaw_jitter_deg: largest deviation of a camera from even spacing.
-        tilt_deg: largest pitch and roll of a camera.
-        bev_tilt_deg: largest pitch and roll of the bev frame.
-        bev_height_m: range of the height of the bev frame's origin above the ground.
-        distorted_share: share of the rigs with lens distortion.
-        delayed_share: share of the rigs whose cameras take their images at different times.
-        delay_s: largest time of an image after that of its frame.
-        supersampled_share: share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel.
-        coarse_share: share of the rigs with images of a lower resolution than the model's, by a factor from
-            `coarsest` to 1.
-        coarsest: see `coarse_share`.
-        jpeg_quality: range of the quality of the images.
-        varied_share: share of the drives whose looks are varied: shapes, colours, patterns, light, nameless objects.
     """
 
-    random_share: float = 0.0
-    cameras: tuple[int, int] = (4, 8)
-    fov_deg: Range = (45.0, 110.0)
-    fov_spread: float = 0.2
-    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)
-    focal_ratio: float = 0.02
-    principal_point: float = 0.06
-    height_m: Range = (0.8, 2.8)
-    radius_m: Range = (0.2, 1.8)
-    front_share: float = 0.2
-    yaw_jitter_deg: float = 12.0
-    tilt_deg: float = 3.0
-    bev_tilt_deg: float = 2.0
-    bev_height_m: Range = (0.0, 2.5)
-    distorted_share: float = 0.2
-    delayed_share: float = 0.4
-    delay_s: float = 0.05
-    supersampled_share: float = 0.5
-    coarse_share: float = 0.15
-    coarsest: float = 0.6
+    random_share: float = 0.0  # share of the drives with a random rig; the others have the default rig
+    cameras: tuple[int, int] = (4, 8)  # number of cameras
+    fov_deg: Range = (45.0, 110.0)  # horizontal; rigs that look all around get enough to leave no gap, if possible
+    fov_spread: float = 0.2  # cameras of a rig differ in it by a factor of at most 1 + this, up or down
+    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)  # width / height of the images
+    focal_ratio: float = 0.02  # largest relative difference of the focal lengths along x and y
+    principal_point: float = 0.06  # largest distance from the image centre, relative to width and height
+    height_m: Range = (0.8, 2.8)  # of the cameras above the ground; those of a rig differ by at most 0.15 m
+    radius_m: Range = (0.2, 1.8)  # distance from the middle of the roof, along x; half of it along y
+    front_share: float = 0.2  # share of the rigs that look ahead and to the sides only
+    yaw_jitter_deg: float = 12.0  # largest deviation of a camera from even spacing
+    tilt_deg: float = 3.0  # largest pitch and roll of a camera
+    bev_tilt_deg: float = 2.0  # largest pitch and roll of the bev frame
+    bev_height_m: Range = (0.0, 2.5)  # height of the bev frame's origin above the ground
+    distorted_share: float = 0.2  # share of the rigs with lens distortion
+    delayed_share: float = 0.4  # share of the rigs whose cameras take their images at different times
+    delay_s: float = 0.05  # largest time of an image after that of its frame
+    supersampled_share: float = 0.5  # share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel
+    coarse_share: float = 0.15  # share of the rigs with images of a lower resolution than the model's,
+    coarsest: float = 0.6  # by a factor from this to 1
     jpeg_quality: tuple[int, int] = (60, 95)
-    varied_share: float = 0.0
+    varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
 
     def __post_init__(self) -> None:
         for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
@@ -152,21 +234,13 @@ class RigDistribution:
 
 @dataclass(frozen=True)
 class DrawnRig:
-    """The rig of a drive, and how its images are taken.
-
-    Attributes:
-        rig: the cameras.
-        delays_s: camera name to the time of its images after that of the frame, seconds; empty for none.
-        supersampling: samples per pixel along each axis.
-        jpeg_quality: 1 to 100.
-        varied: whether the looks of the drive are varied.
-    """
+    """The rig of a drive, and how its images are taken."""
 
     rig: CameraRig
-    delays_s: dict[str, float] = field(default_factory=dict)
-    supersampling: int = 1
-    jpeg_quality: int = 90
-    varied: bool = False
+    delays_s: dict[str, float] = field(default_factory=dict)  # camera -> time of its images after the frame's
+    supersampling: int = 1  # samples per pixel along each axis
+    jpeg_quality: int = 90  # 1 to 100
+    varied: bool = False  # whether the looks of the drive are varied
 
 
 def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:
@@ -205,11 +279,11 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
         spread = random.uniform(-1, 1)
         own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
         intrinsics = _intrinsics(image_size, own_fov, distribution, random)
-        place = _place(yaw_deg, radius, height, distribution, random)
+        position = _position(yaw_deg, radius, height, distribution, random)
         tilt = _tilt(distribution.tilt_deg, random)
         rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
         distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
-        cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(place, rotation), distortion))
+        cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(position, rotation), distortion))
     return CameraRig(tuple(cameras), _ego_from_bev(distribution, random))
 
 
@@ -227,7 +301,6 @@ def _yaws_deg(
 
 
 def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribution, random: Generator) -> Array:
-    """(3, 3) pixels."""
     width, height = size
     focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
     ratio = 1 + random.uniform(-1, 1) * distribution.focal_ratio
@@ -235,7 +308,7 @@ def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribu
     return np.array([[focal, 0, x * width], [0, focal * ratio, y * height], [0, 0, 1.0]])
 
 
-def _place(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
+def _position(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
     """(3,) ego, metres: on an ellipse around the middle of the vehicle, in the viewing direction."""
     around = np.radians(yaw_deg + random.uniform(-20, 20))
     x = _CENTER_X_M + radius * np.cos(around)

@@ -1,6 +1,9 @@
-"""Augmentation: photometric distortion, exposure, noise, missing images, corruptions, grid mask, calibration noise.
+"""Augmentation of a clip's images and calibration; boxes and maps stay as they are.
 
-Boxes and maps stay as they are.
+Of the images as read: photometric distortion, exposure, noise, missing images, corruptions, grid mask. Of the images
+that enter the network, on its device: randomisation, so that a model trained on renderings learns shapes and not
+textures. Each image of each camera then gets its own draw of random convolution (Xu et al. 2021, "Robust and
+generalizable visual representation learning via random convolutions"), contrast, colour, saturation, blur and noise.
 """
 
 from collections import defaultdict
@@ -11,6 +14,7 @@ from statistics import NormalDist
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,13 +22,40 @@ from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.cameras import CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
+from bevcli.model.config import ImageConfig
+from bevcli.model.upload import upload
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption
-from bevcli.workshop.training.randomisation import RandomisationConfig
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
-CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
+DISTORTION_RANGE = (0.5, 1.5)  # factors of contrast and saturation
 MAX_HUE_DEG = 18.0
+
+
+@dataclass(frozen=True)
+class RandomisationConfig:
+    """The [training.augmentation.randomisation] table: probabilities (0 to 1) of each change of an image.
+
+    Attributes:
+        convolution: a random convolution, 1, 3, 5 or 7 pixels wide, mixed with the image by a random share.
+        contrast: contrast and brightness.
+        color: a gain of each channel.
+        saturation: from an image without colour to stronger colours.
+        blur: the mean of 3 x 3 pixels.
+        noise: independent noise of each pixel and channel.
+    """
+
+    convolution: float = 0.0
+    contrast: float = 0.0
+    color: float = 0.0
+    saturation: float = 0.0
+    blur: float = 0.0
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        wrong = [name for name, share in vars(self).items() if not 0 <= share <= 1]
+        if wrong:
+            raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -128,7 +159,7 @@ def noisy(pixels_bgr: NDArray[np.uint8], deviation: float, random: np.random.Gen
 @cache
 def _quantiles() -> Array:
     """(4096,) equally likely values of the standard normal distribution."""
-    return np.array([NormalDist().inv_cdf((place + 0.5) / 4096) for place in range(4096)])
+    return np.array([NormalDist().inv_cdf((index + 0.5) / 4096) for index in range(4096)])
 
 
 @njit(nogil=True)
@@ -140,9 +171,9 @@ def _add_noise(pixels, levels, seed, out) -> None:  # type: ignore[no-untyped-de
         bits = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         bits ^= bits >> np.uint64(31)
-        for place in range(start, min(start + 5, len(pixels))):
-            pixel = np.int32(pixels[place]) + np.int32(levels[bits & np.uint64(4095)])
-            out[place] = np.uint8(min(max(pixel, np.int32(0)), np.int32(255)))
+        for index in range(start, min(start + 5, len(pixels))):
+            pixel = np.int32(pixels[index]) + np.int32(levels[bits & np.uint64(4095)])
+            out[index] = np.uint8(min(max(pixel, np.int32(0)), np.int32(255)))
             bits >>= np.uint64(12)
 
 
@@ -169,15 +200,15 @@ class BadConditions:
             self._corruption = corrupt, int(random.choice(levels))
         if random.random() < config.lost_cameras_share:
             self._lost, self._black = int(random.integers(1, MOST_LOST_CAMERAS + 1)), bool(random.random() < 0.5)
-        self._order: dict[str, int] = {}  # camera -> its place among those that are lost one after the other
+        self._order: dict[str, int] = {}  # camera -> its rank among those that are lost one after the other
 
     def __call__(self, frame: Frame) -> Frame:
         """A copy of the frame with its images corrupted, and some of them left out or black."""
         if self._corruption is None and not self._lost:
             return frame
         if not self._order:
-            places = self._random.permutation(len(frame.rig.names))
-            self._order = dict(zip(frame.rig.names, map(int, places), strict=True))
+            ranks = self._random.permutation(len(frame.rig.names))
+            self._order = dict(zip(frame.rig.names, map(int, ranks), strict=True))
         lost = min(self._lost, len(self._order) - 1)
         images = {}
         for name, image in frame.images.items():
@@ -218,15 +249,18 @@ def distort_images(frame: Frame, probability: float, random: np.random.Generator
     """A copy of the frame with `distort` applied to each image."""
     if probability == 0:
         return frame
-    pixels = {name: distort(image.pixels_bgr, probability, random) for name, image in frame.images.items()}
-    return replace(frame, images={name: replace(frame.images[name], pixels_bgr=each) for name, each in pixels.items()})
+    images = {
+        name: replace(image, pixels_bgr=distort(image.pixels_bgr, probability, random))
+        for name, image in frame.images.items()
+    }
+    return replace(frame, images=images)
 
 
 def distort(pixels_bgr: NDArray[np.uint8], probability: float, random: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 with brightness, contrast, saturation and hue changed, each with the given probability."""
     applied = random.random(4) < probability
     brightness = random.uniform(-MAX_BRIGHTNESS, MAX_BRIGHTNESS) * applied[0]
-    contrast, saturation = random.uniform(*CONTRAST_RANGE), random.uniform(*SATURATION_RANGE)
+    contrast, saturation = random.uniform(*DISTORTION_RANGE), random.uniform(*DISTORTION_RANGE)
     hue_deg = random.uniform(-MAX_HUE_DEG, MAX_HUE_DEG) * applied[3]
     pixels = (pixels_bgr.astype(np.float32) + np.float32(brightness)) * np.float32(contrast if applied[1] else 1)
     if applied[2] or applied[3]:
@@ -250,3 +284,111 @@ def mask_images(images: Tensor, probability: float, random: np.random.Generator)
 def _stripes(extent: int, period: int, random: np.random.Generator) -> NDArray[np.bool_]:
     """(extent,) bool: true in the first half of each period, with a random phase."""
     return (np.arange(extent) + random.integers(period)) % period < period / 2
+
+
+KERNEL_SIZES = (1, 3, 5, 7)
+CONTRAST_RANGE = (0.6, 1.5)  # factors of the differences to grey
+BRIGHTNESS_RANGE = (-51.0, 51.0)  # added to pixel values of 0 to 255
+COLOR_RANGE = (0.7, 1.3)  # factors of each channel
+SATURATION_RANGE = (0.0, 1.6)  # factors of the differences to an image without colour
+NOISE_RANGE = (0.0, 19.0)  # standard deviations, of pixel values of 0 to 255
+GREY = 127.0
+
+
+def randomised(images: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:
+    """A copy of images, each with its own changes. Padding, and images that are missing, stay zero.
+
+    Args:
+        images: (..., 3, H, W) float32, normalised and padded, on any device.
+        config: the probabilities.
+        image: the normalisation of the images.
+        generator: on the CPU; everything but the noise itself is drawn there, so that no draw waits for a GPU.
+    """
+    if not any(vars(config).values()):
+        return images
+    x = images.flatten(0, -4)  # (M, 3, H, W)
+    y = _blurred(_recolored(_convolved(x, config, generator), config, image, generator), config, generator)
+    y = _noisy(y, config, image, generator)
+    return (y * _inside(x)).view_as(images)
+
+
+def renormalised(images: Tensor, image: ImageConfig, other: ImageConfig) -> Tensor:
+    """Images (..., 3, H, W), normalised as one model takes them, as another model takes them. Padding stays zero."""
+    x = images.flatten(0, -4)
+    std, mean, other_std, other_mean = (
+        upload(torch.tensor(values)[:, None, None], x.device)
+        for values in (image.std, image.mean, other.std, other.mean)
+    )
+    y = x * std + mean
+    y = y if image.color_order == other.color_order else y.flip(1)
+    return ((y - other_mean) / other_std * _inside(x)).view_as(images)
+
+
+def _inside(x: Tensor) -> Tensor:
+    """(M, 1, H, W) bool: the rows and columns of images (M, 3, H, W) that are no padding; none where one is missing."""
+    shown = x.ne(0)
+    return shown.any(dim=3, keepdim=True).any(1, keepdim=True) & shown.any(dim=2, keepdim=True).any(1, keepdim=True)
+
+
+def _convolved(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
+    """(M, 3, H, W) of which some are mixed with a random convolution that keeps their contrast."""
+    chosen = _chosen(len(x), config.convolution, generator)
+    sizes = torch.randint(len(KERNEL_SIZES), (len(chosen),), generator=generator)
+    shares = torch.rand(len(chosen), 1, 1, 1, generator=generator)
+    y = x.clone()
+    for index_of_size, size in enumerate(KERNEL_SIZES):
+        of_size = (sizes == index_of_size).nonzero()[:, 0]
+        count = len(of_size)
+        if not count:
+            continue
+        weights = torch.randn(3 * count, 3, size, size, generator=generator)
+        index, share = upload(chosen[of_size], x.device), upload(shares[of_size], x.device)
+        part = x[index]
+        z = F.conv2d(part.flatten(0, 1)[None], upload(weights, x.device), padding=size // 2, groups=count)
+        z = z.view_as(part)
+        contrast = (part.std(dim=(1, 2, 3)) + 1e-3) / (z.std(dim=(1, 2, 3)) + 1e-3)
+        y[index] = torch.lerp(z * contrast[:, None, None, None], part, share)
+    return y
+
+
+def _recolored(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:
+    """(M, 3, H, W) with contrast, brightness, colour and saturation changed: one matrix and one offset an image."""
+    count = len(x)
+
+    def draw(share: float, channels: int, low: float, high: float, unchanged: float) -> Tensor:
+        drawn = low + (high - low) * torch.rand(count, channels, 1, generator=generator)
+        return drawn.where(torch.rand(count, 1, 1, generator=generator) < share, unchanged)
+
+    contrast, brightness = draw(1.0, 1, *CONTRAST_RANGE, 1.0), draw(1.0, 1, *BRIGHTNESS_RANGE, 0.0)
+    changed = torch.rand(count, 1, 1, generator=generator) < config.contrast
+    contrast, brightness = contrast.where(changed, 1.0), brightness.where(changed, 0.0)
+    colors = draw(config.color, 3, *COLOR_RANGE, 1.0)
+    saturation = draw(config.saturation, 1, *SATURATION_RANGE, 1.0)
+    mixing = saturation * torch.eye(3) + (1 - saturation) / 3  # (M, 3, 3)
+    # On pixel values p minus GREY: mixing @ (colors * (contrast * p + brightness)), and p = std * x + mean - GREY.
+    std, mean = (torch.tensor(values, dtype=torch.float32)[:, None] for values in (image.std, image.mean))
+    matrix = mixing * (colors * contrast).transpose(1, 2)
+    offset = matrix @ (mean - GREY) + mixing @ (colors * brightness) - (mean - GREY)
+    matrix, offset = matrix * std.T / std, offset / std
+    return torch.baddbmm(upload(offset, x.device), upload(matrix, x.device), x.flatten(2)).view_as(x)
+
+
+def _blurred(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
+    index = upload(_chosen(len(x), config.blur, generator), x.device)
+    return x.index_copy(0, index, F.avg_pool2d(x[index], 3, 1, padding=1, count_include_pad=False))
+
+
+def _noisy(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:
+    chosen = _chosen(len(x), config.noise, generator)
+    low, high = NOISE_RANGE
+    deviation = low + (high - low) * torch.rand(len(chosen), 1, 1, 1, generator=generator)
+    deviation = deviation / torch.tensor(image.std)[:, None, None]  # (K, 3, 1, 1)
+    seed = int(torch.randint(2**62, (), generator=generator))
+    of_device = torch.Generator(x.device).manual_seed(seed)
+    noise = torch.randn(len(chosen), *x.shape[1:], generator=of_device, device=x.device)
+    return x.index_add(0, upload(chosen, x.device), noise * upload(deviation, x.device))
+
+
+def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
+    """Indices of images, each chosen with a probability."""
+    return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]

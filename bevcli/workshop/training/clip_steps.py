@@ -2,13 +2,19 @@
 
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
+from bevcli.model.bevformer_v2.window import WindowFrame
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs
 from bevcli.registry import for_model
 from bevcli.workshop.training.samples import Batch
+
+WindowMemory = list[FeatureMaps]  # the image features of all frames of the clip so far
 
 
 class ClipSteps(Protocol):
@@ -44,3 +50,32 @@ class RecurrentSteps:
         """See `ClipSteps`."""
         outputs = self._model(clip.inputs[frame], memory)
         return outputs, outputs.bev.detach()
+
+
+class WindowSteps:
+    """Of a BEVFormerV2: its BEV encoder and its fusion are trained on the whole window."""
+
+    def __init__(self, model: BEVFormerV2) -> None:
+        self._model = model
+
+    def history(self, clip: Batch, frame: int, memory: WindowMemory | None) -> WindowMemory:
+        """See `ClipSteps`."""
+        inputs = clip.inputs[frame]
+        return [*(memory or ()), self._model.image_features(inputs.images, inputs.camera_index)]
+
+    def outputs(self, clip: Batch, frame: int, memory: WindowMemory | None) -> tuple[ModelOutputs, WindowMemory]:
+        """See `ClipSteps`."""
+        features = self.history(clip, frame, memory)
+        indices = [frame + offset for offset in self._model.config.frames]
+        window = [_seen_from(frame, clip, features[index], index) if index >= 0 else None for index in indices]
+        return self._model(window), [FeatureMaps(maps.tokens.detach(), maps.level_shapes) for maps in features]
+
+
+def _seen_from(current: int, clip: Batch, features: FeatureMaps, index: int) -> WindowFrame:
+    """The frames of the clips with an index, seen from the bev frames of the current ones."""
+    inputs = clip.inputs[index]
+    image_from_bev = inputs.image_from_bev
+    if index != current:
+        moved = torch.linalg.solve(clip.world_from_bev[index], clip.world_from_bev[current])
+        image_from_bev = (image_from_bev.double() @ moved[:, None]).float()
+    return WindowFrame(features, image_from_bev, inputs.has_image, inputs.image_size)

@@ -69,11 +69,6 @@ def load_checkpoint(
         contents = file.with_tensors()
         if contents["format"] != FORMAT:
             raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r:.60}')
-        if any(key.startswith("picture_reader.") for key in contents["model"]):
-            raise WeightsError(
-                f"{path}: was written by an earlier version, with [training.picture_loss], and cannot be resumed; "
-                f"start a new training with `weights={path.with_name('weights.safetensors')}` and another `out`"
-            )
         trained.load_state_dict(contents["model"])
         settings = [dict(group) for group in optimizer.param_groups]
         optimizer.load_state_dict(contents["optimizer"])
@@ -167,7 +162,6 @@ def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: st
 
 
 def _scores(row: Row) -> Row:
-    """The step and the scores from 0 to 1 over all classes: mAP, NDS and IoU."""
     return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
 
 

@@ -1,17 +1,13 @@
-"""All losses of a frame, and what exists in training only: auxiliary heads, and a teacher.
-
-The teacher sees the images and the calibration before they were augmented, or, where a model learns its features, the
-images that the model sees.
-"""
+"""All losses of a frame, and what exists in training only: auxiliary heads, and a teacher."""
 
 import contextlib
 import copy
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +22,7 @@ from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelInputs, ModelOutputs
+from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.clip_steps import clip_steps
 from bevcli.workshop.training.detection_loss import (
     AnyTargets,
@@ -37,8 +34,7 @@ from bevcli.workshop.training.detection_loss import (
     padded,
 )
 from bevcli.workshop.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
-from bevcli.workshop.training.randomisation import renormalised
-from bevcli.workshop.training.samples import Batch, Targets
+from bevcli.workshop.training.samples import Batch, Targets, own_heads
 from bevcli.workshop.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 
 
@@ -111,95 +107,54 @@ class DistillationLossConfig:
     """The [training.distillation_loss] table.
 
     Attributes:
-        weight: of the mean squared difference of the BEV maps; 0 disables this part.
-        feature_weight: of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0
-            disables this part. With it the teacher sees the images that the model sees, with all augmentation.
+        weight: of the mean squared difference of the BEV maps; 0 disables it.
         teacher: weights of the teacher, a file or a model's name.
         model: name or TOML file of the teacher's model, which may have another backbone and normalisation of images;
             "" for the model that is trained.
     """
 
     weight: float = 0.0
-    feature_weight: float = 0.0
     teacher: str = ""
     model: str = ""
 
     def __post_init__(self) -> None:
-        if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
-            raise ValueError(
-                "weight and feature_weight must not be negative, and teacher must name weights where one is positive"
-            )
-
-    @property
-    def active(self) -> bool:
-        """Some part of the loss is not disabled."""
-        return max(self.weight, self.feature_weight) > 0
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """The results of a teacher for one frame of B clips with N cameras.
-
-    Attributes:
-        bev: (B, Y·X, C) float32; None where only the features are learned.
-        features: (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned.
-    """
-
-    bev: Tensor | None
-    features: tuple[Tensor, ...]
+        if self.weight < 0 or (self.weight and not self.teacher):
+            raise ValueError("weight must not be negative, and teacher must name weights where it is positive")
 
 
 class Teacher:
-    """The model that another one learns from, in evaluation mode."""
+    """The model whose BEV maps another one learns, in evaluation mode.
+
+    It sees the images and the calibration before they were augmented.
+    """
 
     def __init__(self, model: Network, config: DistillationLossConfig, device: torch.device) -> None:
         """Raises BevcliError where the weights or the teacher's model are missing, or do not fit the model."""
-        self._config, self._taught = config, model.config
+        self._image = model.config.image
         self._network = build_network(load_config(config.model)) if config.model else copy.deepcopy(model)
         load_weights(weights_file(Path(config.teacher)), self._network, config.model)
-        own, other = _maps_of(model.config), _maps_of(self._network.config)
+        own, other = _map_of(model.config), _map_of(self._network.config)
         if own != other:
             raise ConfigError(f"{config.model}: cannot teach {model.config.name}: it has {other} (expected {own})")
         self._network.eval().requires_grad_(False).to(device)
         choose_kernels(self._network, device)
 
     @torch.no_grad()
-    def lessons(self, clip: Batch) -> Iterator[Lesson]:
-        """The results for each frame of clips, lazily."""
-        image, own, network = self._taught.image, self._network.config.image, self._network
-        steps, memory = clip_steps(network), None
-        if image != own:
-            clip = replace(
-                clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
-            )
-        for place, inputs in enumerate(clip.inputs):
-            bev = None
-            with last_outputs(network.neck) as features:
-                if self._config.weight:
-                    outputs, memory = steps.outputs(clip, place, memory)
-                    bev = outputs.bev.float()
-                else:
-                    network.image_features(inputs.images, inputs.camera_index)
-            yield Lesson(bev, tuple(x.float() for x in features[0]) if self._config.feature_weight else ())
+    def bev_maps(self, clip: Batch) -> Iterator[Tensor]:
+        """(B, Y·X, C) float32 for each frame of clips, lazily."""
+        own, steps, memory = self._network.config.image, clip_steps(self._network), None
+        if self._image != own:
+            images = [renormalised(one.images, self._image, own) for one in clip.inputs]
+            inputs = (replace(one, images=each) for one, each in zip(clip.inputs, images, strict=True))
+            clip = replace(clip, inputs=tuple(inputs))
+        for frame in range(len(clip.inputs)):
+            outputs, memory = steps.outputs(clip, frame, memory)
+            yield outputs.bev.float()
 
 
-def _maps_of(config: ModelConfig) -> str:
-    """What a teacher and the model have in common, in words."""
-    sizes = " and ".join(f"{height} x {width}" for height, width in config.level_shapes)
-    grid = config.bev_grid
-    maps = f"{config.neck.levels} maps of {config.channels} channels and {sizes} cells"
-    return f"{maps}, {grid.rows} x {grid.columns} BEV cells"
-
-
-@contextlib.contextmanager
-def last_outputs(part: nn.Module) -> Iterator[deque[Any]]:
-    """Inside, the only item is what the last forward pass of a part returned. No hook remains."""
-    kept = deque[Any](maxlen=1)
-    hook = part.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
-    try:
-        yield kept
-    finally:
-        hook.remove()
+def _map_of(config: ModelConfig) -> str:
+    grid, (width, height) = config.bev_grid, config.image.size
+    return f"{grid.rows} x {grid.columns} BEV cells of {config.channels} channels, images of {width} x {height}"
 
 
 @dataclass(frozen=True)
@@ -211,8 +166,7 @@ class LossConfigs:
         segmentation_loss: the segmentation head's, where the model has one.
         dense_loss: auxiliary, on the BEV map.
         perspective_loss: auxiliary, on the image features.
-        distillation_loss: auxiliary, against the BEV map or the image features of a teacher.
-        RENAMED_KEYS: tables of earlier versions, and what replaces them.
+        distillation_loss: auxiliary, against the BEV map of a teacher.
     """
 
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
@@ -220,10 +174,6 @@ class LossConfigs:
     dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
     perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)
     distillation_loss: DistillationLossConfig = field(default_factory=DistillationLossConfig)
-
-    RENAMED_KEYS: ClassVar[Mapping[str, str]] = {
-        "picture_loss": "[training.perspective_loss] replaces it, with other keys (docs/training.md)"
-    }
 
 
 class FrameLosses:
@@ -237,8 +187,9 @@ class FrameLosses:
     def __init__(self, model: Network, configs: LossConfigs) -> None:
         classes = len(model.config.classes)
         self.configs = configs
-        self._head_losses = model.head_losses
+        self._config, self._own_heads = model.config, own_heads(model.config)
         self._query_groups = model.config.decoder.training_groups
+        self._feature_maps = deque[Any](maxlen=1)  # of the last forward pass
         self._dense_head: DenseHead | None = None
         self._perspective_head: PerspectiveHead | None = None
         self.auxiliary_heads = nn.ModuleDict()
@@ -252,16 +203,21 @@ class FrameLosses:
     @contextlib.contextmanager
     def watching(self, model: Network) -> Iterator[None]:
         """Inside, each forward pass of the model keeps its image features for the losses on them. No hook remains."""
-        with last_outputs(model.neck) as self._feature_maps:
+        kept = self._feature_maps
+        hook = model.neck.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
+        try:
             yield
+        finally:
+            hook.remove()
+            kept.clear()
 
     def __call__(
-        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Lesson | None = None
+        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Tensor | None = None
     ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
         Call it inside `watching`, right after the forward pass that made the outputs.
-        taught: by the teacher.
+        taught: the BEV map of the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
         losses = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
@@ -278,16 +234,12 @@ class FrameLosses:
                 targets.perspective,
                 self.configs.perspective_loss,
             )
-        if taught is not None and taught.bev is not None:
-            difference = nn.functional.mse_loss(outputs.bev.float(), taught.bev)
+        if taught is not None:
+            difference = nn.functional.mse_loss(outputs.bev.float(), taught)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
-        if taught is not None and taught.features:
-            pairs = zip(self._feature_maps[0], taught.features, strict=True)
-            shares = [nn.functional.mse_loss(own.float(), other) / other.var() for own, other in pairs]
-            losses |= {"features": self.configs.distillation_loss.feature_weight * torch.stack(shares).mean()}
-        if targets.truths:
+        if self._own_heads is not None:
             matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
-            losses |= self._head_losses(outputs, targets.truths, matches)
+            losses |= self._own_heads.losses(outputs, targets.truths, matches, self._config)
         if outputs.segmentation is not None and targets.segmentation is not None:
             losses |= segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
         return losses

@@ -1,37 +1,37 @@
 """Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
 
 import contextlib
+import difflib
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, field, replace
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.distributed
 from torch import Tensor, nn
 
-from bevcli.config import TRAINING, load_config, load_table
-from bevcli.errors import InputError, OutputError
+from bevcli.config import TRAINING, load_config, load_table, settings_of_table
+from bevcli.errors import ConfigError, InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
-from bevcli.workshop.synth.drives import Drives, check_training_seeds
+from bevcli.workshop.synth.drives import Drives, check_training_seeds, split_of, training_drives, write_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
-from bevcli.workshop.synth.splits import split_of, training_drives, write_split
 from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.backbone_weights import start_backbone
-from bevcli.workshop.training.changes import with_changes
-from bevcli.workshop.training.drive_checks import check_training_drives
 from bevcli.workshop.training.files import require_tensorboard
 from bevcli.workshop.training.frame_losses import LossConfigs
 from bevcli.workshop.training.options import Log, TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.warm_start import WarmStart, warm_start
+from bevcli.workshop.training.validation import check_training_drives
+from bevcli.workshop.training.warm_start import WarmStart, start_backbone, warm_start
 from bevcli.writing import write_whole
 
 
@@ -303,3 +303,46 @@ def check_folder(out: Path, *, resume: bool) -> None:
         raise OutputError(
             f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
         )
+
+
+def with_changes(config: TrainingConfig, changes: Mapping[str, str]) -> TrainingConfig:
+    """The settings with some of them changed.
+
+    changes: values by key, such as {"optimizer.learning_rate": "1e-4"}, as in TOML; a text may lack its quotes.
+    Raises ConfigError for an unknown key, which names the nearest, or a wrong value.
+    """
+    table: dict[str, Any] = asdict(config)
+    known = list(_keys(config))
+    for key, text in changes.items():
+        key = key.removeprefix(f"{TRAINING}.")
+        if key not in known:
+            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, known)}')
+        *tables, name = key.split(".")
+        inner = table
+        for each in tables:
+            inner = inner[each]
+        inner[name] = _value(text)
+    return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes`")
+
+
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    for name, value in vars(config).items():
+        if is_dataclass(value):
+            yield from _keys(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def _value(text: str) -> Any:
+    """The value of a text in TOML; the text itself where it is none."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        return text
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    """The key with the most similar name or, without its table, with the most similar last part."""
+    last = {name.rpartition(".")[2]: name for name in reversed(known)}
+    found = difflib.get_close_matches(key, known, 1) or [last[name] for name in difflib.get_close_matches(key, last, 1)]
+    return f'did you mean "{found[0]}"?' if found else "the keys are in the table of docs/training.md"

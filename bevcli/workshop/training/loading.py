@@ -11,13 +11,13 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from bevcli.errors import OutputError
 from bevcli.inference.background import read_ahead
 from bevcli.model.config import ModelConfig
 from bevcli.workshop.synth.drives import Drives
-from bevcli.workshop.synth.workers import blocked_interrupts
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.samples import Batch, ClipConfig, draw_clip, joined, load_batch
 
@@ -69,12 +68,12 @@ class BatchMaker:
 
     def __call__(self, step: int, turn: int) -> Batch:
         """The batch of a step (0 to `clips.in_turn` - 1 are its turns). It depends on no other batch."""
-        return joined([self.clip(step, turn, place) for place in range(self.clips.batch)])
+        return joined([self.clip(step, turn, index) for index in range(self.clips.batch)])
 
-    def clip(self, step: int, turn: int, place: int) -> Batch:
-        """The clip at a place (0 to `clips.batch` - 1) of that batch. It depends on no other clip."""
+    def clip(self, step: int, turn: int, index: int) -> Batch:
+        """The clip at an index (0 to `clips.batch` - 1) of that batch. It depends on no other clip."""
         seed = [self.seed, step, self.rank, turn]
-        clip, random = draw_clip(self.drives, self.clips, seed, place, with_gap=self.with_gap)
+        clip, random = draw_clip(self.drives, self.clips, seed, index, with_gap=self.with_gap)
         return load_batch(
             self.drives, [clip], self.model, self.augmentation, random,
             learn_all=self.clips.learn == "all", plain=self.plain, in_bytes=self.in_bytes,
@@ -82,9 +81,9 @@ class BatchMaker:
 
 
 def loaded_batches(
-    maker: BatchMaker, places: Iterable[tuple[int, int]], loaders: int, *, pin: bool = False
+    maker: BatchMaker, turns: Iterable[tuple[int, int]], loaders: int, *, pin: bool = False
 ) -> Generator[Batch]:
-    """The batches at these places (step, turn), in order, made ahead by `loaders`: one thread, or several processes.
+    """The batches of these turns (step, turn), in order, made ahead by `loaders`: one thread, or several processes.
 
     pin: copy them to memory that a GPU reads by itself. Close the generator to end the processes.
     Raises what making a batch raises, and OutputError where a process ends early.
@@ -92,7 +91,7 @@ def loaded_batches(
     count = maker.clips.batch
     depth = max(maker.clips.in_turn, -(-2 * loaders // count))  # two clips a process are waiting
     if loaders == 1:
-        yield from read_ahead(lambda place: maker(*place), places, depth)
+        yield from read_ahead(lambda turn: maker(*turn), turns, depth)
         return
     context = get_context("spawn")
     line_end, line = context.Pipe(duplex=False)
@@ -100,9 +99,9 @@ def loaded_batches(
     folders = tuple(Path(tempfile.mkdtemp(prefix="bevcli-batches-", dir=parent)) for parent in parents)
     pool = ProcessPoolExecutor(loaders, context, _start_loader, (maker, line_end, folders))
 
-    def load(place: tuple[int, int]) -> Batch:
+    def load(turn: tuple[int, int]) -> Batch:
         try:
-            packed = [pool.submit(_make_packed, (*place, index)) for index in range(count)]
+            packed = [pool.submit(_make_packed, (*turn, index)) for index in range(count)]
             clips = [clip.result().unpack() for clip in packed]
         except BrokenProcessPool:
             raise OutputError(
@@ -115,7 +114,7 @@ def loaded_batches(
         with blocked_interrupts():
             for _ in range(loaders):  # starts a process each
                 pool.submit(int)
-        with closing(read_ahead(load, places, depth, threads=depth)) as batches:  # threads that only wait
+        with closing(read_ahead(load, turns, depth, threads=depth)) as batches:  # threads that only wait
             yield from batches
     finally:
         line.close()  # the processes end at once
@@ -170,15 +169,15 @@ class _Packed:
         return batch
 
 
-def _make_packed(place: tuple[int, int, int]) -> _Packed:
-    """place: step, turn, and place in the batch."""
+def _make_packed(clip: tuple[int, int, int]) -> _Packed:
+    """clip: step, turn, and index in the batch."""
     maker, folders = _loader
     arrays: list[pickle.PickleBuffer] = []
     rest = BytesIO()
-    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker.clip(*place))
+    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker.clip(*clip))
     needed = FREE_CLIPS * sum(array.raw().nbytes for array in arrays)
     roomy = (folder for folder in folders if shutil.disk_usage(folder).free >= needed)
-    path, ends = next(roomy, folders[-1]) / "-".join(map(str, place)), []
+    path, ends = next(roomy, folders[-1]) / "-".join(map(str, clip)), []
     with open(path, "wb") as file:
         for array in arrays:
             start = file.tell()
@@ -202,3 +201,14 @@ class _Pickler(pickle.Pickler):
 
 def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
     return torch.from_numpy(array).permute(np.argsort(order).tolist())
+
+
+@contextmanager
+def blocked_interrupts() -> Iterator[None]:
+    """Processes that start in the block never see Ctrl-C: it reaches their parent, which ends them."""
+    resource_tracker.ensure_running()  # it would be started with the first process, and unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

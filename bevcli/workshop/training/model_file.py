@@ -1,51 +1,213 @@
-"""A new model file for a data set, with what its training costs on this machine."""
+"""A new model file for a data set, from a preset and the facts about the data."""
 
-import contextlib
+import copy
 import json
+import math
 import re
-import tempfile
-import time
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
-from bevcli.config import TRAINING, load_config
+from bevcli.config import TRAINING, load_config, read_model_file
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Sequence
-from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.inference.machine import peak_memory
-from bevcli.printing import counted, duration
-from bevcli.sequences.open import open_sequence
+from bevcli.frame import Frame, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig, level_rig
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, class_of_size
+from bevcli.geometry.transforms import Array
+from bevcli.inference.training_rigs import rigs_of
+from bevcli.model.config import BevFrameConfig
+from bevcli.printing import counted
+from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.synth.splits import read_split
-from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
-from bevcli.workshop.training.options import Preset, TrainOptions
-from bevcli.workshop.training.presets import INSIDE_PERCENT, PRESETS, DataFacts, look_at, model_table
-from bevcli.workshop.training.trainer import Trainer
+from bevcli.workshop.training.job import TrainingConfig
+from bevcli.workshop.training.options import Preset
+from bevcli.workshop.training.samples import ClipConfig, ground_truth_boxes
+from bevcli.workshop.training.validation import longest_scene
 from bevcli.writing import write_whole
 
-LONGEST_S = 10.0  # of the measurement of the cost; an update that takes longer is still finished
-MEMORY_SHARE = 0.7  # of a GPU's memory, that a batch may take
-LARGEST_BATCH = 32  # clips; more keep no GPU busier
+INSIDE_PERCENT = 95.0  # of the boxes that the BEV range takes in
+LARGEST_HELD_OUT = 10  # drives
+NEAREST_RATE = 0.75  # data with at least this share of the preset's frame rate is trained at the preset's
 
 
-def write_model_file(
-    path: Path, data: DriveOptions, preset: Preset, device: torch.device, longest_s: float = LONGEST_S
-) -> list[str]:
-    """Write a model file for the drives, from a preset, and return its first lines: the facts and the cost.
+@dataclass(frozen=True)
+class DataFacts:
+    """What some drives contain.
 
-    The file is trained for some seconds before it is written, so that it is known to work.
+    Attributes:
+        drives: the drives, with all their frames.
+        frames: number of frames with ground truth.
+        class_counts: number of boxes by class, the most frequent first.
+        class_sizes: median length, width and height of the boxes by class, metres.
+        rigs: the rig of each drive.
+        rate_hz: median rate of the frames with ground truth, per second.
+        centers_bev: (N, 3) centres of all boxes in the bev frame, metres.
+        map_reach_m: distance that all ground-truth maps cover to each side, metres; 0 without maps.
+    """
+
+    drives: tuple[Sequence, ...]
+    frames: int
+    class_counts: dict[str, int]
+    class_sizes: dict[str, tuple[float, float, float]]
+    rigs: tuple[CameraRig, ...]
+    rate_hz: float
+    centers_bev: Array
+    map_reach_m: float
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras of all rigs."""
+        return tuple(dict.fromkeys(name for rig in self.rigs for name in rig.names))
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """The most frequent width and height of the images, pixels."""
+        sizes = Counter((camera.width, camera.height) for rig in self.rigs for camera in rig.cameras)
+        return sizes.most_common(1)[0][0]
+
+    @property
+    def reach_m(self) -> float:
+        """Half the side of a square around the vehicle that holds 95 % of the boxes, metres."""
+        return float(np.percentile(np.abs(self.centers_bev[:, :2]).max(axis=1), INSIDE_PERCENT))
+
+    def shortest(self, rate_hz: float) -> int:
+        """Frames of the longest scene of the shortest drive, at a frame rate."""
+        return min(longest_scene(select_rate(drive, rate_hz)) for drive in self.drives)
+
+
+def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
+    """Read the ground truth of all frames of some drives. Raises InputError where there is none, or no box.
+
+    bev_frame: of the model, for the centres of the boxes.
+    """
+    labelled: list[Boxes3D] = []
+    gaps_s: list[Array] = []
+    map_reaches: list[float] = []
+    for drive in drives:
+        frames = [drive.ground_truth_frame(index) for index in range(len(drive.stamps))]
+        frames = [frame for frame in frames if frame.ground_truth is not None]
+        if not frames:
+            raise InputError(f"{drive.name}: has no ground truth boxes (expected for training): leave it out")
+        labelled += [_boxes_bev(frame, bev_frame) for frame in frames]
+        stamps = [frame.stamp for frame in frames]
+        gaps_s += [np.diff([stamps[i].timestamp_ns for i in scene]) / 1e9 for scene in scenes_of(stamps)]
+        maps = [frame.ground_truth_map for frame in frames if frame.ground_truth_map is not None]
+        map_reaches += [min(abs(end) for end in (*each.x_range_m, *each.y_range_m)) for each in maps]
+    names = np.concatenate([boxes.classes for boxes in labelled])
+    if not len(names):
+        raise InputError(f"the {len(drives)} drives have no boxes (expected some to train on)")
+    counts = dict(Counter(names.tolist()).most_common())
+    sizes = np.concatenate([boxes.sizes_lwh for boxes in labelled])
+    medians = {name: tuple(np.median(sizes[names == name], axis=0).tolist()) for name in counts}
+    gaps = np.concatenate(gaps_s)
+    rate_hz = 1 / float(np.median(gaps)) if len(gaps) else 2.0
+    rigs = tuple(drive.rig for drive in drives)
+    reach_m = min(map_reaches, default=0.0)
+    centers = np.concatenate([boxes.centers for boxes in labelled])
+    return DataFacts(tuple(drives), len(labelled), counts, medians, rigs, rate_hz, centers, reach_m)
+
+
+def _boxes_bev(frame: Frame, bev_frame: BevFrameConfig) -> Boxes3D:
+    rig = level_rig(frame.rig, bev_frame.height_m) if bev_frame.level else frame.rig
+    return ground_truth_boxes(replace(frame, rig=rig))
+
+
+Changes = Mapping[str, Mapping[str, Any]]  # of a model's file: keys of its tables with new values; None removes a key
+# The demo model on smaller images and shorter clips, for a training that starts from its weights. The rate and the
+# average are those with which docs/fine-tune.md was measured.
+_QUICK: Changes = {
+    "image": {"size": [384, 216], "focal_px": None, "max_pixels": None},
+    "training": {"steps": 75, "evaluate_every": 15, "checkpoint_every": 5},
+    "training.clips": {"frames": 8, "batch": 2, "in_turn": 2},
+    "training.optimizer": {"learning_rate": 2e-4, "warm_up_steps": 10, "average": 0.99},
+    "training.perspective_loss": {"weight": 0.0},
+}
+_ONE_CLIP: Changes = {"training.clips": {"batch": 1}}  # as published, on each of eight GPUs
+# The known model whose file a preset starts from, and the changes.
+PRESETS: Mapping[Preset, tuple[str, Changes]] = {
+    "quick": ("demo", _QUICK),
+    "demo": ("demo", {}),
+    "tiny": ("tiny", _ONE_CLIP),
+    "base": ("base", _ONE_CLIP),
+}
+
+
+def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
+    """The contents of a model's file for a data set.
+
+    The number of BEV cells and all layers are those of the preset's model, so that its weights fit, except those of
+    its classes and cameras. The settings are for a training that starts from these weights. name: of the new model.
+    """
+    model, changes_by_table = PRESETS[preset]
+    table = copy.deepcopy(read_model_file(model)[0])
+    for path, changes in changes_by_table.items():
+        _change(table, path, changes)
+    known = [each for each in NUSCENES_CLASSES if each in facts.class_counts]
+    own = [each for each in facts.class_counts if each not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": known + own, "cameras": list(facts.cameras)}
+    if own:
+        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
+    table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
+    table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
+    table["image"]["size"] = _image_size(facts, table["image"]["size"][0])
+    _set_range(table["bev_grid"], facts)
+    table["training_rigs"] = rigs_of(facts.rigs)
+    if facts.map_reach_m < table["bev_grid"]["x_range_m"][1]:
+        table["heads"] = ["detection"]
+        table.pop("segmentation", None)
+    training = table.setdefault(TRAINING, {})
+    training.pop("rigs", None)  # of rendered drives
+    training["freeze_batch_norm"] = True  # a few small batches of other images would spoil the statistics
+    training["held_out"] = 0 if len(facts.drives) == 1 else min(LARGEST_HELD_OUT, max(1, len(facts.drives) // 5))
+    clips = training.setdefault("clips", {})
+    clips["frames"] = min(clips.get("frames", TrainingConfig().clips.frames), facts.shortest(table["rate_hz"]))
+    return table
+
+
+def rate_for(facts: DataFacts, preset_hz: float) -> float:
+    """The frame rate to train at: the preset's, or that of data with fewer frames."""
+    return preset_hz if facts.rate_hz >= NEAREST_RATE * preset_hz else float(f"{facts.rate_hz:.2g}")
+
+
+def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> None:
+    for name in path.split("."):
+        table = table.setdefault(name, {})
+    for key, value in changes.items():
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+
+
+def _image_size(facts: DataFacts, width_px: int) -> list[int]:
+    """The preset's width, or that of smaller images, with the data's aspect ratio."""
+    width, height = facts.image_size
+    size = min(width_px, width)
+    return [size, max(1, round(size * height / width))]
+
+
+def _set_range(grid: dict[str, Any], facts: DataFacts) -> None:
+    """A square of whole metres that holds most boxes, with as many cells as before; a higher one if it is needed."""
+    half = float(max(4, math.ceil(round(facts.reach_m, 3))))
+    grid["x_range_m"] = grid["y_range_m"] = [-half, half]
+    low, high = np.percentile(facts.centers_bev[:, 2], (1, 99))
+    z0, z1 = grid["z_range_m"]
+    grid["z_range_m"] = [float(min(z0, math.floor(low))), float(max(z1, math.ceil(high)))]
+
+
+def write_model_file(path: Path, data: DriveOptions, preset: Preset) -> list[str]:
+    """Write a model file for the drives, from a preset, and return its first lines: the facts about the drives.
 
     Args:
         path: the file, which ends in .toml and does not exist.
         data: the drives, folders.
-        device: to measure on.
-        longest_s: time of the measurement, seconds.
 
     Raises BevcliError where the drives, or the path, are wrong; nothing is written then.
     """
@@ -55,35 +217,10 @@ def write_model_file(
     facts = look_at(_open_drives(data), load_config(PRESETS[preset][0]).bev_frame)
     table = model_table(name, preset, facts)
     lines = [f"Model {name} for {counted(len(facts.drives), 'drives')}, preset {preset}.", *_facts_lines(facts, table)]
-    cost = _cost_of(table, device, data, longest_s)
-    if device.type == "cuda":
-        clips, card_bytes = cost.config.clips, torch.cuda.get_device_properties(device).total_memory
-        most = min(LARGEST_BATCH, facts.frames // clips.frames)
-        batch = fitting_batch(clips.batch, cost.memory_bytes, card_bytes, most)
-        if batch > clips.batch:
-            table[TRAINING]["clips"]["batch"] = batch
-            cost = _cost_of(table, device, data, longest_s)
-    lines += [f"Cost, measured on this machine: {cost}.", f"In this file {cost.config.clips}."]
+    lines.append(f"In this file {ClipConfig(**table[TRAINING]['clips'])}.")
     text = "\n".join([*(f"# {line}" for line in lines), _toml(table)])
     write_whole(path, text.encode(), parents=True)
     return lines
-
-
-def _cost_of(table: Mapping[str, Any], device: torch.device, data: DriveOptions, longest_s: float) -> "Cost":
-    """The cost of the training of a model's file with these contents."""
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / "model.toml"
-        trial.write_text(_toml(table), encoding="utf-8")
-        job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
-        return measure_cost(job, longest_s)
-
-
-def fitting_batch(batch: int, used_bytes: int, card_bytes: int, most: int) -> int:
-    """The clips of a batch that fill a card, at least `batch`, which used so much memory, and else at most `most`.
-
-    The memory of a clip is overestimated by its share of the memory that does not depend on the batch.
-    """
-    return max(batch, min(most, int(MEMORY_SHARE * card_bytes * batch / used_bytes)))
 
 
 def _open_drives(data: DriveOptions) -> list[Sequence]:
@@ -136,67 +273,3 @@ def _json(value: Any) -> str:
 
 def _key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _json(name)
-
-
-class _EnoughMeasured(Exception):
-    """Ends the training that is measured."""
-
-
-@dataclass(frozen=True)
-class Cost:
-    """The cost of a training.
-
-    Attributes:
-        config: its settings.
-        machine: the device, in words.
-        update_s: time of an update of the weights, while another thread reads the next batch.
-        reading_s: time until the first batch was read, at most; 0 where processes read, for which `update_s` waits.
-        memory_bytes: the largest memory, of the process or of a GPU.
-    """
-
-    config: TrainingConfig
-    machine: str
-    update_s: float
-    reading_s: float
-    memory_bytes: int
-
-    @property
-    def step_s(self) -> float:
-        """Time of a step: of its updates, or of reading its batches where this takes longer."""
-        clips = self.config.clips
-        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s)
-
-    def __str__(self) -> str:
-        """The cost on one line."""
-        steps, updates = self.config.steps, self.config.clips.updates
-        step = f"{self.update_s:.2g} s an update"
-        if updates > 1:
-            step += f", {duration(self.step_s)} a step of {updates}"
-        whole = f"{duration(steps * self.step_s)} for {counted(steps, 'steps')} without scoring"
-        return f"{self.machine}: {step}, {whole}; memory {self.memory_bytes / 1e9:.1f} GB"
-
-
-def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
-    """Train for some seconds, at least one update. Changes the job's model; writes curves into its folder.
-
-    Raises BevcliError as the training would.
-    """
-    times = [time.perf_counter()]
-
-    def after_update(loss: float) -> None:
-        times.append(time.perf_counter())
-        if times[-1] - times[0] >= longest_s:
-            raise _EnoughMeasured
-
-    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
-    config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
-    machine = f"{job.device.type}, {torch.get_num_threads()} threads"
-    if job.device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(job.device)
-        machine = torch.cuda.get_device_name(job.device)
-    with contextlib.suppress(_EnoughMeasured):
-        Trainer(replace(job, config=config)).run(after_update=after_update)
-    spans = [later - earlier for earlier, later in pairwise(times)]
-    update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
-    reading_s = max(spans[0] - update_s, 0.0) if job.loaders == 1 else 0.0  # processes take seconds to start
-    return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))

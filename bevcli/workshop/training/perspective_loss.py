@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from bevcli.geometry.boxes import BOX_EDGES
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.upload import upload
-from bevcli.workshop.training.detection_loss import AnyTargets, PaddedTargets, padded
-from bevcli.workshop.training.matching import focal_loss
+from bevcli.workshop.training.detection_loss import AnyTargets, PaddedTargets, focal_loss, padded
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)

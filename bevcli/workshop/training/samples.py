@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence as Items
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,16 +19,17 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, joined_inputs, model_inputs
+from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
+from bevcli.model.temporal_model import model_class
 from bevcli.model.upload import pinned, upload
-from bevcli.sequences.selection import scenes_of
+from bevcli.printing import counted
+from bevcli.registry import for_model
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.workshop.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
-from bevcli.workshop.training.frame_truth import frame_truth
-from bevcli.workshop.training.pixels import images_from_bytes, write_bytes
 from bevcli.workshop.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
@@ -66,15 +68,11 @@ class ClipConfig:
 
     def __str__(self) -> str:
         """A step in words."""
-        clips = f"{_counted(self.batch, 'clip', 'clips')} of {_counted(self.frames, 'frame', 'frames')}"
+        clips = f"{counted(self.batch, 'clips')} of {counted(self.frames, 'frames')}"
         if self.learn == "last":
             return f"a step is one update of the weights, on {clips}"
-        batches = f"{_counted(self.in_turn, 'batch', 'batches')} of {clips}"
+        batches = f"{counted(self.in_turn, 'batches')} of {clips}"
         return f"a step is {self.updates} updates of the weights, one for each frame of a batch: {batches}"
-
-
-def _counted(count: int, one: str, many: str) -> str:
-    return f"{count} {one if count == 1 else many}"
 
 
 @dataclass(frozen=True)
@@ -91,9 +89,9 @@ class Clip:
 
 
 def draw_clip(
-    drives: Drives, config: ClipConfig, seed: Items[int], place: int, *, with_gap: bool = True
+    drives: Drives, config: ClipConfig, seed: Items[int], index: int, *, with_gap: bool = True
 ) -> tuple[Clip, np.random.Generator]:
-    """The clip at a place of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
+    """The clip at an index of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
 
     It depends on no other clip, but all clips of a batch have the same length, and images that fit into one batch.
 
@@ -101,13 +99,13 @@ def draw_clip(
         seed: of the batch.
         with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
     """
-    of_batch, random = np.random.default_rng(seed), np.random.default_rng([*seed, place + 1])
+    of_batch, random = np.random.default_rng(seed), np.random.default_rng([*seed, index + 1])
     frames = config.frames
     if frames > 1 and of_batch.random() < config.short_share:
         frames = int(of_batch.integers(1, frames))
     first, shapes = int(of_batch.integers(len(drives))), drives.input_shapes
     alike = range(len(drives)) if shapes is None else _similar_drives(shapes, first)
-    drive = int(alike[random.integers(len(alike))]) if place else first
+    drive = int(alike[random.integers(len(alike))]) if index else first
     leave_out = with_gap and config.learn == "last"
     return Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)), random
 
@@ -143,6 +141,27 @@ def draw_frames(
 
 
 @dataclass(frozen=True)
+class OwnHeads:
+    """The training of a model's heads beyond boxes and maps, registered as "training_heads CLASS".
+
+    Attributes:
+        missing: the truth that a frame lacks, in words, and its file; None where nothing is missing.
+        truth: of a frame of a drive, at an index, on the CPU. Raises InputError where some of it is missing.
+        losses: the weighted scalar losses by name. They take the outputs for B frames, B truths, and of each frame the
+            queries that the detection loss matches to boxes, with the indices of these.
+    """
+
+    missing: Callable[[Frame, Any], tuple[str, str] | None]
+    truth: Callable[[Frame, Sequence, int, Any], Any]
+    losses: Callable[[Any, Items[Any], Items[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
+
+
+def own_heads(config: ModelConfig) -> OwnHeads | None:
+    """The registered training of a model's own heads, if it has some."""
+    return next(iter(for_model("training_heads", model_class(config))), None)
+
+
+@dataclass(frozen=True)
 class Targets:
     """The targets of B frames, one of each clip.
 
@@ -150,13 +169,13 @@ class Targets:
         detection: B, the boxes inside the BEV grid.
         perspective: B, all boxes, for the perspective loss.
         segmentation: B, or None if the model has no segmentation head.
-        truths: B, for heads of the model's own, on the CPU; empty if it has none.
+        truths: B, see `OwnHeads`; empty for a model without heads of its own.
     """
 
     detection: PaddedTargets
     perspective: PaddedTargets
     segmentation: PaddedMasks | None
-    truths: tuple[FrameTruth, ...] = ()
+    truths: tuple[Any, ...] = ()
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
@@ -167,7 +186,6 @@ class Targets:
         return self._changed(pinned)
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
-        """A copy with other tensors."""
 
         def changed(part: Any) -> Any:
             tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
@@ -233,39 +251,23 @@ def load_batch(
 
     Raises InputError where a frame to train on has no ground truth.
     """
-    return joined(
-        [_load_clip(drives, clip, config, augmentation, random, learn_all, plain, in_bytes) for clip in clips]
-    )
 
+    def load_clip(clip: Clip) -> Batch:
+        drive = drives.open(clip.drive)
+        loaded = [drive.load(index) for index in clip.frames]
+        shown = augmented(loaded, augmentation, random)
+        prepared = _prepared(shown, config, in_bytes)
+        inputs = _inputs(prepared, config)
+        for step in inputs:
+            mask_images(step.images, augmentation.grid_mask, random)
+        poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev] for one in prepared]
+        world_from_bev = torch.from_numpy(np.array(poses))
+        learned = list(zip(prepared, clip.frames, strict=True))[0 if learn_all else -1 :]
+        targets = tuple(_targets(one.frame, drive, index, config) for one, index in learned)
+        before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
+        return Batch(inputs, world_from_bev, targets, before)
 
-def _load_clip(
-    drives: Drives,
-    clip: Clip,
-    config: ModelConfig,
-    augmentation: AugmentationConfig,
-    random: np.random.Generator,
-    learn_all: bool,
-    plain: bool,
-    in_bytes: bool,
-) -> Batch:
-    drive = drives.open(clip.drive)
-    loaded = [drive.load(index) for index in clip.frames]
-    shown = augmented(loaded, augmentation, random)
-    changed = augmentation.grid_mask > 0 or any(one is not before for one, before in zip(shown, loaded, strict=True))
-    prepared = _prepared(shown, config, in_bytes)
-    inputs = _inputs(prepared, config)
-    for step in inputs:
-        mask_images(step.images, augmentation.grid_mask, random)
-    poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev] for one in prepared]
-    world_from_bev = torch.from_numpy(np.array(poses))
-    learned = slice(None) if learn_all else slice(-1, None)
-    places = list(zip(prepared, clip.frames, strict=True))[learned]
-    targets = tuple(_targets(one.frame, drive, index, config) for one, index in places)
-    before: Batch | None = None
-    if plain:
-        unchanged = _inputs(_prepared(loaded, config, in_bytes), config) if changed else inputs
-        before = Batch(unchanged, world_from_bev, ())
-    return Batch(inputs, world_from_bev, targets, before)
+    return joined([load_clip(clip) for clip in clips])
 
 
 def joined(batches: Items[Batch]) -> Batch:
@@ -299,11 +301,12 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def _targets(frame: Frame, drive: Sequence, place: int, config: ModelConfig) -> Targets:
-    """place: of the frame in the drive."""
+def _targets(frame: Frame, drive: Sequence, index: int, config: ModelConfig) -> Targets:
+    """index: of the frame in the drive."""
     boxes = ground_truth_boxes(frame)
     detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
-    truths = (frame_truth(frame, drive, place, config),) if config.results else ()
+    heads = own_heads(config)
+    truths = () if heads is None else (heads.truth(frame, drive, index, config),)
     if "segmentation" not in config.heads:
         return Targets(detection, perspective, None, truths)
     masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
@@ -318,3 +321,41 @@ def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[Pr
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
     poses = [None, *(one.frame.world_from_ego for one in frames[:-1])]
     return tuple(model_inputs([one], [pose], config) for one, pose in zip(frames, poses, strict=True))
+
+
+def _grey(image: ImageConfig) -> NDArray[np.uint8]:
+    """(3,) uint8 the pixel value of each channel that is nearest to 0 after normalisation."""
+    return np.rint(image.mean).astype(np.uint8)
+
+
+def write_bytes(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.uint8]) -> None:
+    """As `write_network_image`, but as uint8 pixel values less the mean grey, modulo 256.
+
+    So padding and missing images, which are 0, become 0. An image that is not resized loses nothing.
+
+    pixels_bgr: (H, W, 3) uint8. out: (3, H', W') uint8, channels last in memory.
+    """
+    (height, width), (left, top, right, bottom) = pixels_bgr.shape[:2], image.crop_box
+    scale = min(image.size[0] / width, image.size[1] / height)
+    rows, columns = max(0, min(round(height * scale), bottom) - top), max(0, min(round(width * scale), right) - left)
+    if (scale, left, top) == (1, 0, 0):
+        pixels = pixels_bgr[:rows, :columns]
+        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)) if image.color_order == "rgb" else pixels
+    else:
+        values = np.empty((rows, columns, 3), np.float32)
+        rounded = replace(image, mean=(-0.5, -0.5, -0.5), std=(1.0, 1.0, 1.0))  # adds 0.5
+        write_network_image(pixels_bgr, rounded, values.transpose(2, 0, 1))
+        pixels = values.astype(np.uint8)
+    lines = out.transpose(1, 2, 0).reshape(out.shape[1], -1)[:rows, : 3 * columns]  # faster than three by three
+    np.subtract(pixels.reshape(rows, -1), np.tile(_grey(image), columns), out=lines)
+
+
+def images_from_bytes(images: Tensor, image: ImageConfig) -> Tensor:
+    """The normalised images of `write_bytes` (B, N, 3, H, W), on the same device, channels last."""
+    flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
+    grey, mean, std = (
+        torch.tensor(of_channels, dtype=torch.float32).view(3, 1, 1).to(flat.device, non_blocking=True)
+        for of_channels in (_grey(image).tolist(), image.mean, image.std)
+    )
+    pixels = (flat + grey.to(torch.uint8)).float()
+    return pixels.sub_(mean).div_(std).unflatten(0, images.shape[:2])

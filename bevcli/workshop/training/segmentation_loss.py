@@ -17,8 +17,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
-from bevcli.workshop.training.detection_loss import has_points, pad_rows
-from bevcli.workshop.training.matching import focal_cost, focal_loss, hungarian_matchings
+from bevcli.workshop.training.detection_loss import focal_cost, focal_loss, has_points, hungarian_matchings, pad_rows
 
 # A cell belongs to a class that covers at least this share of it. Lines are thinner than a cell: their share is lower.
 MIN_SHARES = {"drivable_road": 0.4, "lane_boundary": 0.2, "pedestrian_crossing": 0.4}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -25,11 +24,11 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.training import files
+from bevcli.workshop.training.augmentation import randomised
 from bevcli.workshop.training.clip_steps import clip_steps
-from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
+from bevcli.workshop.training.frame_losses import FrameLosses, Teacher
 from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.workshop.training.loading import BatchMaker, loaded_batches
-from bevcli.workshop.training.randomisation import randomised_inputs
 from bevcli.workshop.training.samples import Batch
 from bevcli.workshop.training.validation import Validation, validate
 
@@ -94,14 +93,14 @@ def forward_clip(
     steps, memory = clip_steps(model), None
     model.eval()
     with torch.no_grad():
-        for place in range(first_learned):
-            memory = steps.history(batch, place, memory)
+        for frame in range(first_learned):
+            memory = steps.history(batch, frame, memory)
     model.train()
     for module in model.modules():
         if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
-    for place in range(first_learned, frames):
-        outputs, memory = steps.outputs(batch, place, memory)
+    for frame in range(first_learned, frames):
+        outputs, memory = steps.outputs(batch, frame, memory)
         yield outputs
 
 
@@ -144,23 +143,20 @@ def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], deca
         average[key].copy_(state[key])
 
 
-class _Update:
-    """The numbers of an update, on their way from the device."""
+def _numbers_on_their_way(numbers: Mapping[str, Tensor]) -> Callable[[], dict[str, float]]:
+    """A function that gives the numbers of an update by name. It waits for a GPU to finish it, but none after it."""
+    values = torch.stack([value.detach() for value in numbers.values()])
+    arriving = values.to("cpu", non_blocking=True)
+    done = torch.cuda.Event() if values.device.type == "cuda" else None
+    if done is not None:
+        done.record()
 
-    def __init__(self, numbers: Mapping[str, Tensor]) -> None:
-        self._names = tuple(numbers)
-        values = torch.stack([value.detach() for value in numbers.values()])
-        self._values = values.to("cpu", non_blocking=True)
-        self._arrived: torch.cuda.Event | None = None
-        if values.device.type == "cuda":
-            self._arrived = torch.cuda.Event()
-            self._arrived.record()
+    def read() -> dict[str, float]:
+        if done is not None:
+            done.synchronize()
+        return dict(zip(numbers, arriving.tolist(), strict=True))
 
-    def read(self) -> dict[str, float]:
-        """The numbers by name. Waits for a GPU to finish this update, but none after it."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return dict(zip(self._names, self._values.tolist(), strict=True))
+    return read
 
 
 class Trainer:
@@ -174,7 +170,6 @@ class Trainer:
         optimizer: of their parameters.
         done: the number of steps done.
         maker: makes the batches.
-        waited_s: time for which the training had to wait for batches, seconds.
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
@@ -187,15 +182,15 @@ class Trainer:
         self._average: dict[str, Tensor] | None = None
         if job.config.optimizer.average > 0:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
-        self.done, self.waited_s = 0, 0.0
+        self.done = 0
         if resume:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
-        self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
+        self._teacher = Teacher(job.model, taught, job.device) if taught.weight else None
         self.maker = BatchMaker(
             job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
-            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
+            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None,
             in_bytes=job.device.type == "cuda",
         )  # fmt: skip
         self._frozen: FrozenStages | None = None
@@ -227,46 +222,24 @@ class Trainer:
         turns = product(remaining, range(config.clips.in_turn))
         loaded = loaded_batches(self.maker, turns, job.loaders, pin=gpu)
         with contextlib.closing(loaded) as batches, rounded_products(gpu):
-            self._run(batches, after_step, after_validation, stop, after_update)
+            stopped = False
+            while self.done < config.steps and not stopped:
+                row = self._step(islice(batches, config.clips.in_turn), after_update)
+                trim_memory()
+                self.done += 1
+                last, stopped = self.done == config.steps, stop()
+                if job.group.leads:
+                    self._loss_curve.add(self.done, row)
+                    if self.done % config.evaluate_every == 0 or last:
+                        after_validation(self.done, self._validate())
+                    if self.done % config.checkpoint_every == 0 or last or stopped:
+                        self._save_checkpoint()
+                    after_step()
         job.model.eval()
 
-    def _run(
-        self,
-        batches: Iterator[Batch],
-        after_step: Callable[[], None],
-        after_validation: Callable[[int, Validation], None],
-        stop: Callable[[], bool],
-        after_update: Callable[[float], None],
-    ) -> None:
-        job, config = self.job, self.job.config
-        while self.done < config.steps:
-            row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
-            trim_memory()
-            self.done += 1
-            last, stopped = self.done == config.steps, stop()
-            if job.group.leads:
-                self._loss_curve.add(self.done, row)
-                if self.done % config.evaluate_every == 0 or last:
-                    after_validation(self.done, self._validate())
-                if self.done % config.checkpoint_every == 0 or last or stopped:
-                    files.save_checkpoint(job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
-                after_step()
-            if stopped:
-                break
-
-    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """The same batches, with the time spent waiting for them added to `waited_s`."""
-        for _ in repeat(None):
-            begun = time.perf_counter()
-            batch = next(batches, None)
-            self.waited_s += time.perf_counter() - begun
-            if batch is None:
-                return
-            yield batch
-
-    @property
-    def _learn_all(self) -> bool:
-        return self.job.config.clips.learn == "all"
+    def _save_checkpoint(self) -> None:
+        path = self.job.out / CHECKPOINT
+        files.save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
 
     def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
         """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
@@ -279,37 +252,43 @@ class Trainer:
             seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
             torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
             rows = []
-            learned = alternated(self._clip_losses(self._uploaded(batch)) for batch in batches)
-            for update in delayed(map(self._update, learned), 1 if gpus else 0):
-                rows.append(self._read(update))
-                after_update(rows[-1]["loss"])
+            uploaded = (batch.to(job.device).normalised(job.model.config.image) for batch in batches)
+            learned = alternated(map(self._clip_losses, uploaded))
+            for read_numbers in delayed(map(self._update, learned), 1 if gpus else 0):
+                rows.append(read_numbers())
+                loss = rows[-1]["loss"]
+                if not math.isfinite(loss):
+                    raise BevcliError(
+                        f"step {self.done + 1}: the loss is {loss}; lower the learning rate, and `resume` from the "
+                        f"last checkpoint in {job.out}"
+                    )
+                after_update(loss)
         job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
 
-    def _uploaded(self, batch: Batch) -> Batch:
-        """The batch on the device, with its images normalised."""
-        return batch.to(self.job.device).normalised(self.job.model.config.image)
-
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
         job, config = self.job, self.job.config
         random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
-        batch = replace(batch, inputs=randomised_inputs(batch.inputs, *random))
-        outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
+        batch = replace(
+            batch, inputs=tuple(replace(one, images=randomised(one.images, *random)) for one in batch.inputs)
+        )
+        outputs = forward_clip(
+            job.model, batch, learn_all=config.clips.learn == "all", freeze_batch_norm=config.freeze_batch_norm
+        )
         learned = len(batch.targets)
-        lessons: Iterator[Lesson | None] = repeat(None)
-        if self._teacher is not None:
-            shown = batch if batch.plain is None else batch.plain
-            lessons = islice(self._teacher.lessons(shown), len(batch.inputs) - learned, None)
+        teacher_maps: Iterator[Tensor | None] = repeat(None)
+        if self._teacher is not None and batch.plain is not None:
+            teacher_maps = islice(self._teacher.bev_maps(batch.plain), len(batch.inputs) - learned, None)
         for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                output, taught = next(outputs), next(lessons)
+                output, taught = next(outputs), next(teacher_maps)
             yield self._losses(inputs, output, targets, taught)
 
-    def _update(self, losses: dict[str, Tensor]) -> _Update:
-        """One update of the weights."""
+    def _update(self, losses: dict[str, Tensor]) -> Callable[[], dict[str, float]]:
+        """One update of the weights. Returns a function that gives its numbers."""
         total = torch.stack(list(losses.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -318,17 +297,7 @@ class Trainer:
         self.optimizer.step()
         if self._average is not None:
             update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
-        return _Update({"loss": total, **losses, "gradient norm": norm})
-
-    def _read(self, update: _Update) -> dict[str, float]:
-        """The numbers of an update. Raises BevcliError if the loss is not finite."""
-        row = update.read()
-        if not math.isfinite(row["loss"]):
-            raise BevcliError(
-                f"step {self.done + 1}: the loss is {row['loss']}; lower the learning rate, and `resume` "
-                f"from the last checkpoint in {self.job.out}"
-            )
-        return row
+        return _numbers_on_their_way({"loss": total, **losses, "gradient norm": norm})
 
     def averaged_model(self) -> Network:
         """A copy of the model, with the running mean of its weights where `optimizer.average` asks for it."""
@@ -338,7 +307,6 @@ class Trainer:
         return model
 
     def _validate(self) -> Validation:
-        """Scores the model, writes its weights and the learning curves."""
         job = self.job
         options = StepOptions(temporal=job.config.clips.frames > 1)
         # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
@@ -354,12 +322,12 @@ class Trainer:
         return scores
 
 
-def delayed(items: Iterable[T], places: int) -> Iterator[T]:
+def delayed(items: Iterable[T], by: int) -> Iterator[T]:
     """The items, each when so many later ones have been made."""
     waiting = deque[T]()
     for item in items:
         waiting.append(item)
-        if len(waiting) > places:
+        if len(waiting) > by:
             yield waiting.popleft()
     yield from waiting
 

@@ -32,11 +32,9 @@ def validate(
     """
     from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
-    from bevcli.workshop.synth.drives import count_frames
-    from bevcli.workshop.synth.splits import scored_drives
-    from bevcli.workshop.training.drive_checks import check_scored_drives
+    from bevcli.workshop.synth.drives import count_frames, scored_drives
     from bevcli.workshop.training.job import rig_for_drives
-    from bevcli.workshop.training.validation import validate as validate_model
+    from bevcli.workshop.training.validation import check_scored_drives, validate as validate_model
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)

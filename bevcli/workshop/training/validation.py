@@ -1,24 +1,142 @@
-"""Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
+"""Checks of drives before they are trained on or scored, and scores of a model over several drives.
+
+Each drive is run as by `bevcli run`, and all are scored as by `bevcli eval`.
+"""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from bevcli.evaluation.config import DetectionConfig, TrackingConfig
+from bevcli.errors import InputError
+from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.scores_report import FrameScores, finite
+from bevcli.evaluation.evaluate import FrameScores, finite
+from bevcli.evaluation.inputs import Compared, FramePairs
+from bevcli.evaluation.scorers import score_results
 from bevcli.evaluation.segmentation import evaluate_segmentation
-from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
+from bevcli.frame import MAP_CLASSES, Frame, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
-from bevcli.geometry.object_classes import ObjectClass
-from bevcli.geometry.transforms import Array, inverse
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
-from bevcli.workshop.synth.drives import Drives
-from bevcli.workshop.tracking_scores.scoring import TrackingScores, evaluate_tracking
+from bevcli.model.config import ModelConfig
+from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.sequences.files.class_names import ClassNames, count_classes
+from bevcli.sequences.native.folder import BOXES_FILE
+from bevcli.sequences.open import scenes_of
+from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.samples import ClipConfig, own_heads
+
+
+def check_training_drives(
+    data: DriveOptions, drives: Drives, held_out: Drives | None, clips: ClipConfig, config: ModelConfig
+) -> tuple[str, ...]:
+    """Notes about the drives of a training, each set once. Renders no drive.
+
+    drives: to train on. held_out: to score on; None for the same drives.
+    Raises InputError where a frame to train on has no ground truth or a drive is shorter than a clip, and as
+    `check_classes`.
+    """
+    if data.rendered is not None:
+        if clips.frames > FRAMES_PER_DRIVE:
+            raise _too_short(f"rendered drives ({FRAMES_PER_DRIVE})", clips.frames, FRAMES_PER_DRIVE)
+        _check_rendered_classes(data.class_map, config)
+        return ()
+    lengths = {drive.name: longest_scene(drive) for drive in map(drives.open, range(len(drives)))}
+    short = {name: frames for name, frames in lengths.items() if frames < clips.frames}
+    if short:
+        named = ", ".join(f"{name} ({frames})" for name, frames in short.items())
+        raise _too_short(named, clips.frames, min(short.values()))
+    _check_ground_truth(drives, clips, config)
+    notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
+    if held_out is not None:
+        notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
+    return tuple(notes)
+
+
+def check_scored_drives(data: DriveOptions, drives: Drives, config: ModelConfig) -> tuple[str, ...]:
+    """Notes about drives that are scored. Renders no drive. Raises InputError as `check_classes`."""
+    if data.rendered is not None:
+        _check_rendered_classes(data.class_map, config)
+        return ()
+    return tuple(check_classes(drives, _count(drives), "scored", config))
+
+
+def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> Iterator[str]:
+    """Notes about the classes in the ground truth of drives: boxes that are left out, and classes without a box.
+
+    Args:
+        drives: folders; opens each of them, and reads the frames of a format that has no table of its boxes.
+        where: the set of drives, for messages, such as "the 4 held-out drives".
+        use: what happens to boxes of known classes: "trained on" or "scored".
+
+    Raises InputError where no box has a class of the model.
+    """
+    counts: Counter[str] = Counter()
+    for drive in map(drives.open, range(len(drives))):
+        truths = (drive.ground_truth_frame(index).ground_truth for index in range(len(drive.stamps)))
+        counts.update(drive.class_counts or count_classes(boxes for boxes in truths if boxes is not None))
+    absent = [name for name in config.classes if not counts[name]]
+    if counts and len(absent) == len(config.classes):
+        named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+        raise _no_known_class(f"the ground truth of {where}", named, counts.most_common(1)[0][0], config)
+    yield from ClassNames(classes=config.classes).note(counts, where, use)
+    if counts and absent:
+        yield f"{where}: no box has the class {' or '.join(absent)} of the model {config.name}"
+
+
+def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -> None:
+    names = ClassNames(class_map, config.classes)
+    if not {names[name] for name in NUSCENES_CLASSES} & set(config.classes):
+        raise _no_known_class("the ground truth of rendered drives", ", ".join(NUSCENES_CLASSES), "car", config)
+
+
+def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
+    first, heads = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0, own_heads(config)
+    for drive in map(drives.open, range(len(drives))):
+        places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
+        without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): []}
+        for frame in map(drive.ground_truth_frame, places):
+            if frame.ground_truth is None:
+                without["boxes", BOXES_FILE].append(frame.stamp.index)
+            lacking = None if heads is None else heads.missing(frame, config)
+            if lacking is not None:
+                without.setdefault(lacking, []).append(frame.stamp.index)
+        for (truth, file), missing in without.items():
+            if missing:
+                raise InputError(
+                    f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
+                    f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
+                )
+
+
+def longest_scene(drive: Sequence) -> int:
+    """The number of frames of the longest scene of a drive."""
+    return max(map(len, scenes_of(drive.stamps)), default=0)
+
+
+def _count(drives: Drives) -> str:
+    return "the drive" if len(drives) == 1 else f"the {len(drives)} drives"
+
+
+def _too_short(drives: str, clip_frames: int, frames: int) -> InputError:
+    return InputError(
+        f"drives with fewer frames than a clip, {clip_frames} at the model's frame rate: {drives}: leave them out, or "
+        f'pass `changes={{"clips.frames": {frames}}}`'
+    )
+
+
+def _no_known_class(where: str, found: str, example: str, config: ModelConfig) -> InputError:
+    return InputError(
+        f"{where} has no class of the model {config.name} (expected {', '.join(config.classes)}; found {found}): "
+        f"pass `class_map={{{example!r}: {config.classes[0]!r}}}`, or set classes in the model's file"
+    )
 
 
 @dataclass(frozen=True)
@@ -92,22 +210,23 @@ def validate(
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     classes = runner.config.object_classes
     config = DetectionConfig.of(classes).cut_at(range_m)
-    tracking = None if runner.options.tracker is None else TrackingConfig.of(classes).cut_at(range_m)
+    tracked = runner.options.tracker is not None
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
-    tracks: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]] = []
+    tracks: list[tuple[FrameBoxes, FrameBoxes]] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
         places, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
         for frame, prediction, _ in runner.run(sequence, places, preprocessor):
             if frame.ground_truth is not None:
-                if tracking is not None:
+                if tracked:
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
-                    place = frame.world_from_ego.translation[:2]
-                    tracks.append((prediction.boxes_world, frame.ground_truth, stamp, place))
+                    sides = (prediction.boxes_world, frame.ground_truth)
+                    found, true = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
+                    tracks.append((found, true))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -121,12 +240,12 @@ def validate(
     return Validation(
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
-        None if tracking is None else _score_tracks(tracks, tracking),
+        score_results({"tracking": True}, Compared(_pairs(tracks), classes, range_m)) if tracked else {},
         drives=tuple(of_drives),
     )
 
 
-def drives_table(drives: Sequence[DriveScores]) -> str:
+def drives_table(drives: Items[DriveScores]) -> str:
     """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
     width = max(len("drive"), *(len(drive.name) for drive in drives))
     lines = [f"{'drive':{width}}  cameras    mAP    NDS"]
@@ -146,7 +265,8 @@ def boxes_ego(
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
-def _score_tracks(frames: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]], config: TrackingConfig) -> TrackingScores:
-    """Tracking scores. frames: predicted and ground truth boxes in the world frame, stamp, and place of the vehicle."""
-    found, true, stamps, places = zip(*frames, strict=True) if frames else ((),) * 4
-    return evaluate_tracking(found, true, stamps, config, np.array(places).reshape(-1, 2))
+def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
+    """Predicted and true boxes in the world frame, for the scores of tracks."""
+    found, true = zip(*frames, strict=True) if frames else ((), ())
+    poses = [frame.world_from_ego.matrix for frame in true]
+    return FramePairs("world", found, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())

@@ -58,4 +58,4 @@ _RENAMES: Renames = (
 )
 
 # The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
-OFFICIAL_NAMES = OfficialNames(r"^query_embedding\.weight$", _RENAMES, _UNUSED)
+OFFICIAL_NAMES = OfficialNames(r"^(query_embedding|memory_bank|query_interact|seg_head)\.", _RENAMES, _UNUSED)

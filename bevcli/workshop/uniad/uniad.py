@@ -19,6 +19,7 @@ from bevcli.model.decoder import ObjectQueries
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.tensors import without_autocast
 from bevcli.model.upload import upload
 from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
 from bevcli.workshop.uniad.map_merging import merge_map
@@ -155,13 +156,13 @@ class UniAD(BEVFormer):
         """
         bev = self.compute(self.geometry(inputs, history), False)  # the CPU chooses the tracks
         outputs = self.track(bev, tracks, motion)
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             return replace(outputs, map=self.map_head(bev.float()))
 
     def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
         """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
         # In float32, as the decoder of BEVFormer.
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             queries = self._queries(tracks, motion)
             class_logits, box_codes, embedding = self.decoder(bev.float(), self.detection_head, queries)
             scores = class_logits[-1, 0].sigmoid().amax(-1)

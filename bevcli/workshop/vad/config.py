@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field
 from typing import ClassVar
 
-from bevcli.frame import FrameResult, MapLines, Plan
+from bevcli.frame import FrameResult
 from bevcli.model.config import ModelConfig
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig
+from bevcli.workshop.vad.map_lines import MapLines
 from bevcli.workshop.vad.motion_head import MotionConfig
+from bevcli.workshop.vad.plan import Plan
 
 
 @dataclass(frozen=True)

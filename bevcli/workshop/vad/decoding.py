@@ -6,7 +6,6 @@ from typing import Self
 import numpy as np
 from torch import Tensor
 
-from bevcli.frame import MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.box_coding import best_boxes
@@ -14,7 +13,9 @@ from bevcli.model.decoder import best_classes
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.line_decoder import LineOutputs
+from bevcli.workshop.vad.map_lines import MapLines
 from bevcli.workshop.vad.motion_head import MotionOutputs
+from bevcli.workshop.vad.plan import Plan
 
 
 @dataclass(frozen=True, kw_only=True)

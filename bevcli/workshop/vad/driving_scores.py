@@ -3,30 +3,38 @@
 The futures of true objects are the places where the same objects are in later frames of the ground truth.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.inputs import ScoredInput
-from bevcli.evaluation.pairing import FramePairs
-from bevcli.frame import FrameStamp, Plan
+from bevcli.evaluation.evaluate import number
+from bevcli.evaluation.inputs import Compared, FramePairs, ScoredInput
+from bevcli.frame import FrameStamp, Ground, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.printing import aligned, counted
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.workshop.vad.line_scores import LineScores, evaluate_lines
-from bevcli.workshop.vad.lines_file import LinesWriter, read_lines
-from bevcli.workshop.vad.motion_scores import MotionSums, evaluate_motion
-from bevcli.workshop.vad.plan_file import PlanWriter, read_plans
-from bevcli.workshop.vad.planning_scores import PlannedFrame, PlanScores, evaluate_plans
+from bevcli.sequences.nuscenes.format import is_nuscenes_root
+from bevcli.workshop.vad.driving_metrics import (
+    THRESHOLDS_M,
+    LineScores,
+    MotionSums,
+    PlannedFrame,
+    PlanScores,
+    evaluate_lines,
+    evaluate_motion,
+    evaluate_plans,
+)
+from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.vad.plan import Plan, read_plans
+from bevcli.workshop.vad.score_options import DrivingScoreOptions
 
-Scored = Literal["map", "motion", "plan"]
-DRIVING: tuple[Scored, ...] = ("map", "motion", "plan")
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
 LATE_S = 0.1  # a frame this near counts as one at the time of a step
 
@@ -63,11 +71,11 @@ def with_true_futures(boxes: Boxes3D, stamp: FrameStamp, drives: Drives, times_s
         frame = drives.after(stamp, seconds)
         later = Boxes3D.empty() if frame is None else frame.boxes
         names = () if later.instances is None else later.instances
-        row_of = {name: row for row, name in enumerate(names) if name}
-        for place, name in enumerate(() if boxes.instances is None else boxes.instances):
-            alive[place] &= name in row_of
-            if alive[place]:
-                places[place, 0, step] = later.centers[row_of[name], :2]
+        row_of = {name: index for index, name in enumerate(names) if name}
+        for row, name in enumerate(() if boxes.instances is None else boxes.instances):
+            alive[row] &= name in row_of
+            if alive[row]:
+                places[row, 0, step] = later.centers[row_of[name], :2]
     seconds = np.broadcast_to(np.asarray(times_s)[:, None], (*places.shape[:3], 1))
     return replace(boxes, futures=np.concatenate([seconds, places], axis=-1))
 
@@ -81,18 +89,68 @@ class DrivingScores:
     plan: PlanScores | None = None
     notes: tuple[str, ...] = ()
 
+    def to_dict(self) -> dict[str, Any]:
+        content: dict[str, Any] = {}
+        if (lines := self.lines) is not None:
+            aps = {name: {f"{limit:.1f}": ap for limit, ap in of_class.items()} for name, of_class in lines.ap.items()}
+            content["map"] = {
+                "mean_ap": lines.mean_ap,
+                "label_aps": aps,
+                "mean_dist_aps": lines.mean_by_class,
+                "ground_truth_lines": dict(lines.truth_count),
+                "frames": lines.frame_count,
+            }
+        if (motion := self.motion) is not None:
+            content["motion"] = {name: {**sums.metrics, "ground_truth": sums.truths} for name, sums in motion.items()}
+        if (plan := self.plan) is not None:
+            content["plan"] = {
+                "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
+                "at_horizon": _horizons(plan, plan.at, plan.collisions_with_vehicles),
+                "frames": len(plan.distances_m),
+            }
+        return content
 
-def evaluate_driving(
-    asked: Sequence[Scored], predictions: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs
-) -> DrivingScores:
-    """Score what is asked for.
+    def tables(self) -> Iterator[str]:
+        """One table for each kind of scores that was asked for."""
+        if (lines := self.lines) is not None:
+            rows = [("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in THRESHOLDS_M))]
+            for name, of_class in lines.ap.items():
+                numbers = (lines.mean_by_class[name], *of_class.values())
+                rows.append((name, str(lines.truth_count[name]), *map(number, numbers)))
+            yield f"{aligned(rows)}\n\nmap mAP {number(lines.mean_ap)} ({counted(lines.frame_count, 'frames')})"
+        if (motion := self.motion) is not None:
+            rows = [("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate")]
+            for name, sums in motion.items():
+                rows.append((name, str(sums.truths), *map(number, sums.metrics.values())))
+            yield aligned(rows)
+        if (plan := self.plan) is not None:
+            averaged = _horizons(plan, plan.averaged, plan.collisions)
+            at = _horizons(plan, plan.at, plan.collisions_with_vehicles)
+            rows = [("planned path", *averaged["L2"], "", *averaged["L2"])]
+            for name, unit, factor in (("L2", "m", 1), ("collision", "%", 100)):
+                cells = [[number(factor * value) for value in of[name].values()] for of in (averaged, at)]
+                rows.append((f"{name} {unit}", *cells[0], "", *cells[1]))
+            explained = "left: mean up to the horizon (ST-P3, VAD); right: at the horizon, vehicles only (UniAD)"
+            yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"
 
-    predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
-    """
-    folder = predictions if predictions.is_dir() else predictions.parent
-    lines = _lines(folder / LinesWriter.file_name, truth, pairs) if "map" in asked else None
-    motion = _motion(found, truth, pairs) if "motion" in asked else None
-    plan, notes = _plan(folder / PlanWriter.file_name, truth, pairs) if "plan" in asked else (None, ())
+
+def _horizons(plan: PlanScores, of: Callable[[Any, float], float], collisions: Any) -> dict[str, dict[str, float]]:
+    """Distances and shares of collisions by horizon, in one convention."""
+    seconds = [s for s in (1, 2, 3) if s <= plan.step_s * plan.distances_m.shape[1] + 1e-6]
+    return {
+        "L2": {f"{s}s": of(plan.distances_m, s) for s in seconds},
+        "collision": {f"{s}s": of(collisions, s) for s in seconds},
+    }
+
+
+def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> DrivingScores:
+    """Score what the options ask for: the function of a `Scorer`. Raises InputError where a side lacks it."""
+    predicted, truth, pairs = compared.predictions, compared.truth, compared.pairs
+    assert predicted is not None
+    assert truth is not None
+    lines = _lines(predicted.path.with_name(MapLines.file_name), truth, pairs) if options.map else None
+    motion = _motion(predicted, truth, pairs) if options.motion else None
+    plan, notes = _plan(predicted.path.with_name(Plan.file_name), truth, pairs) if options.plan else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 
@@ -109,25 +167,45 @@ def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
 
 
 def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
-    assert truth.lines is not None
-    found, true = read_lines(file), truth.lines()
-    if found.frame_of_reference != true.frame_of_reference:
+    predicted, true = read_lines(file), _true_lines(truth)
+    if predicted.frame_of_reference != true.frame_of_reference:
         raise InputError(
-            f"`map`: predicted lines are in the {found.frame_of_reference} frame, true ones in the "
+            f"`map`: predicted lines are in the {predicted.frame_of_reference} frame, true ones in the "
             f"{true.frame_of_reference} frame (expected the same)"
         )
-    found_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (found, true))
+    predicted_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (predicted, true))
     stamps = [(one.stamp, other.stamp) for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)]
-    lines = [(found_of[one], true_of[other]) for one, other in stamps if one in found_of and other in true_of]
+    lines = [(predicted_of[one], true_of[other]) for one, other in stamps if one in predicted_of and other in true_of]
     if not lines:
         raise InputError("`map`: no frame has both predicted and true lines")
     return evaluate_lines(lines, true.classes)
 
 
-def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
+def _true_lines(truth: ScoredInput) -> LinesFile:
+    """The true lines of the map: those next to a boxes file, or those of a drive in the world frame."""
+    if truth.open_drive is None:
+        file = truth.path.with_name(TRUE_LINES)
+        if not file.exists():
+            raise InputError(
+                f"{file}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)"
+            )
+        return read_lines(file)
+    drive, frames = truth.open_drive(), []
+    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
+        if (lines := result_of(MapLines, frame.ground_truth_results)) is None:
+            expansion = f"the map expansion in {truth.path / 'maps' / 'expansion'}"
+            expected = expansion if is_nuscenes_root(truth.path) else "a drive that has them"
+            where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
+            raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
+        ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)
+        frames.append(FrameLines(frame.stamp, replace(lines, points=tuple(map(ground.points, lines.points)))))
+    return LinesFile("world", LINE_CLASSES, tuple(frames))
+
+
+def _motion(predicted: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
     """The scores of forecasts of the objects whose centre is in the area that the model sees."""
     drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
-    ranges = [found.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
+    ranges = [predicted.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
     low, high = np.array(ranges, dtype=np.float64).T
 
     def inside(boxes: Boxes3D, bev_from_world: Array) -> Boxes3D:

@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from shapely import LineString, box, get_coordinates, get_parts, line_interpolate_point, line_merge
 from torch import Tensor
 
-from bevcli.frame import MapLines
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.training.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.detection_loss import focal_cost, focal_loss, hungarian_matching
 from bevcli.workshop.vad.config import LossWeights
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
+from bevcli.workshop.vad.map_lines import MapLines
 
 CLOSED_M = 0.01  # a line whose ends are so near to each other is closed
 SHORTEST_M = 0.5  # shorter rests of lines that the range cuts are left out

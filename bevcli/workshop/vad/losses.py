@@ -10,13 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from bevcli.frame import LINE_CLASSES
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.step import FrameTruth
-from bevcli.workshop.training.matching import focal_loss
+from bevcli.workshop.training.detection_loss import focal_loss
+from bevcli.workshop.training.samples import OwnHeads
 from bevcli.workshop.vad.config import LossWeights, VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs
+from bevcli.workshop.vad.frame_truth import FrameTruth, frame_truth, missing_truth
 from bevcli.workshop.vad.line_loss import line_losses, line_targets
+from bevcli.workshop.vad.map_lines import LINE_CLASSES
 from bevcli.workshop.vad.motion_head import MotionOutputs
 
 DIVIDER, _, BOUNDARY = LINE_CLASSES
@@ -190,3 +191,6 @@ def direction_loss(path: Tensor, dividers: Tensor) -> Tensor:
     moved = torch.cat([path.diff(dim=0), path.diff(dim=0)[-1:]])
     angles = torch.atan2(_cross(moved, along).abs(), (moved * along).sum(-1).abs())
     return angles * (near <= LANE_M)
+
+
+HEADS = OwnHeads(missing_truth, frame_truth, head_losses)

@@ -1,8 +1,7 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
-import torch
 from torch import Tensor
 
 from bevcli.frame import BevMap, FrameResult
@@ -10,11 +9,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.network import STAGES
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
-from bevcli.model.step import FrameTruth, ModelOutputs
+from bevcli.model.step import ModelOutputs
+from bevcli.model.tensors import without_autocast
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
-from bevcli.workshop.vad.losses import head_losses
 from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
 from bevcli.workshop.vad.official_keys import OFFICIAL_NAMES
 from bevcli.workshop.vad.planner import Planner
@@ -48,7 +47,7 @@ class VAD(BEVFormer):
 
     def detect(self, bev: Tensor) -> VADOutputs:
         """The outputs for a BEV map (B, Y·X, C)."""
-        with torch.autocast(bev.device.type, enabled=False):
+        with without_autocast(bev.device):
             class_logits, box_codes, features = self.decoder(bev.float(), self.detection_head)
             lines, motion, plan = self.further(bev.float(), box_codes[-1], features)
         return VADOutputs(bev, class_logits, box_codes, lines=lines, motion=motion, plan=plan)
@@ -74,12 +73,6 @@ class VAD(BEVFormer):
         yield decode_futures(outputs, self.config)
         yield decode_lines(outputs, self.config)
         yield decode_plan(outputs, self.config)
-
-    def head_losses(
-        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
-        assert isinstance(outputs, VADOutputs)
-        return head_losses(outputs, truths, matches, self.config)
 
 
 def fix_first_attentions(model: VAD) -> None:

@@ -1,9 +1,7 @@
 """MCAP files and ROS 2 bags as sequences. Needs the extra `bevcli[ros]`, but no ROS installation.
 
-sequence: RosSequence, a bag as a Sequence.
-bag: Bag, the files of one recording as topics with indexed messages. storage: MCAP and SQLite.
+format: the format and its options. sequence: the frames of a bag, and decoding image messages and video packets.
+bag: the files of one recording as topics with indexed messages; the topics of each camera. storage: MCAP and SQLite.
 messages: the bytes of a message -> its fields -> this package's types.
-topics: the topics of each camera, found or stated in a TOML file.
-ego_motion: poses on demand, from a topic or from transforms; the place on Earth.
-images: decoding image messages and video packets.
+vehicle: the rig, poses on demand, from a topic or from transforms, and the place on Earth.
 """

@@ -1,10 +1,23 @@
-"""The files of one recording as topics with indexed messages."""
+"""The files of one recording as topics with indexed messages; the topics of each camera and of the vehicle's poses.
+
+A TOML states what type and name of a topic do not show:
+ego_frame = "base_link"                                  # the frame of the vehicle
+world_frame = "map"                                      # the frame that poses from /tf refer to
+ego_motion = "/localization/kinematic_state"             # a topic with poses, or /tf
+[cameras]                                                # only these cameras are used
+CAM_FRONT = "/sensing/camera/camera0/image_raw/compressed"
+[calibration]                                            # a camera's CameraInfo
+CAM_FRONT = "/sensing/camera/camera0/camera_info"
+[frames]                                                 # a camera's optical frame
+CAM_FRONT = "camera0/camera_optical_link"
+"""
 
 import importlib.util
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence as Indices
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence as Indices
 from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,11 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.parsing.documents import read_yaml
-from bevcli.parsing.files import MIB, decompressed
-from bevcli.printing import reason_of
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, read_yaml
+from bevcli.parsing.files import MIB, decompressed, read_text
+from bevcli.printing import aligned, counted, reason_of
 from bevcli.workshop.formats.ros.format import METADATA, SUFFIXES, is_packed_bag
-from bevcli.workshop.formats.ros.messages import decoder
+from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, frame_of
 
 if TYPE_CHECKING:
     from bevcli.workshop.formats.ros.storage import McapFile, SqliteFile
@@ -168,3 +181,212 @@ def spread(count: int, wanted: int) -> Indices[int]:
     """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
     indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)).tolist()
     return indices
+
+
+# Parts of a topic's name that do not name a camera.
+GENERIC = re.compile(
+    r"(image|img)?_?(raw|rect|rectified|color|colour|rgb|bgr|mono|compressed|image|img|video|h264|h265|stream|_)*"
+)
+# Parts of names of images that no camera took, or not in the visible spectrum.
+NOT_A_CAMERA = re.compile(
+    r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
+)
+RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
+PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
+GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
+
+
+@dataclass(frozen=True)
+class StatedTopics:
+    """Statements of the user about a bag, by the keys of the TOML above. "" and missing cameras: to be found.
+
+    renamed: camera -> image topic, as `topics` states it; other cameras are still found.
+    """
+
+    ego_frame: str = ""
+    world_frame: str = ""
+    ego_motion: str = ""
+    cameras: Mapping[str, str] = field(default_factory=dict)
+    calibration: Mapping[str, str] = field(default_factory=dict)
+    frames: Mapping[str, str] = field(default_factory=dict)
+    renamed: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopics:
+    """The statements of a TOML file (None: no file) and of `topics`.
+
+    topics: camera -> image topic. Raises InputError for broken TOML, an unknown key or a wrong type.
+    """
+    if path is None:
+        return StatedTopics(renamed=topics)
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    known = [one.name for one in fields(StatedTopics) if one.name != "renamed"]
+    for key, value in stated.items():
+        if key not in known:
+            raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
+        is_table = key in ("cameras", "calibration", "frames")
+        if is_table and not (isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values())):
+            raise InputError(f'{path}: "{key}": expected a table of names, such as CAM_FRONT = "..."')
+        if not (is_table or isinstance(value, str)):
+            raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
+    return StatedTopics(**stated, renamed=topics)
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """The topics of one camera: of its images, and of its intrinsics. is_video: the images are packets of a video."""
+
+    camera: str
+    images: str
+    calibration: str | None
+    is_video: bool = False
+
+    @property
+    def is_rectified(self) -> bool:
+        """True if the name of the topic says that lens distortion was removed from the images."""
+        return RECTIFIED.search(self.images) is not None
+
+
+class TopicFinder:
+    """The topics of a bag that have messages, by kind. stated: what the user states. Raises InputError as its methods.
+
+    Attributes:
+        cameras: the topics of each camera, in order of their names.
+        left_out: image topics without a calibration topic.
+    """
+
+    def __init__(self, bag: Bag, stated: StatedTopics, calibrated: Iterable[str] | None = None) -> None:
+        """calibrated: the cameras of a calibration file, which all must be found. None: the bag is the calibration."""
+        self._bag, self._stated = bag, stated
+        self._kinds = {
+            name: KINDS[topic.short_type]
+            for name, topic in bag.topics.items()
+            if topic.short_type in KINDS and len(bag.times(name))
+        }
+        for name in (*stated.cameras.values(), *stated.renamed.values(), *stated.calibration.values()):
+            self._check_exists(name)
+        found = self._found_images()
+        found = dict(_for_calibration(found, tuple(calibrated), bag)) if calibrated is not None else found
+        cameras = [
+            CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
+            for name, images in found.items()
+        ]
+        without = [one for one in cameras if one.calibration is None and calibrated is None]
+        for one in without:
+            if one.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
+                raise InputError(
+                    f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
+                    f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
+                )
+        self.left_out = tuple(one.images for one in without)
+        self.cameras = tuple(one for one in cameras if one not in without)
+        if not self.cameras:
+            raise InputError(
+                f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
+            )
+
+    def of_kind(self, kind: Kind) -> list[str]:
+        """Names of the topics of a kind that have messages."""
+        return [name for name, own in self._kinds.items() if own == kind]
+
+    def pose_topic(self) -> str | None:
+        """The topic of the vehicle's poses: Odometry rather than a pose. None: they may be in the transforms."""
+        stated = self._stated.ego_motion
+        if stated:
+            self._check_exists(stated)
+            return stated if self._kinds[stated] == "pose" else None
+        poses = [name for name in self.of_kind("pose") if not GOALS.search(name)]
+        return min(poses, key=lambda name: (name not in PREFERRED_POSES, self._preference(name), name), default=None)
+
+    def seen(self) -> str:
+        """The topics of the bag, for an error message."""
+        names = [f"{name} ({topic.short_type})" for name, topic in self._bag.topics.items()]
+        return "topics: " + (", ".join(names[:12]) + (", ..." if len(names) > 12 else "") if names else "none")
+
+    def table(self, pose: str) -> str:
+        """A table of the topics that are used and those that are not. pose: where poses come from, "" for nowhere."""
+        rows = []
+        for one in self.cameras:
+            rows.append((one.camera, one.images))
+            if one.calibration:
+                rows.append(("  calibration", one.calibration))
+        rows += [("ego-motion", pose)] if pose else []
+        rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
+        used = {name for _, name in rows}
+        rows += [("not used", name) for name in self._bag.topics if name not in used]
+        lines = [(f"  {role}", name, *self._facts(name)) for role, name in rows]
+        return "topics:\n" + aligned(lines, left=range(4))
+
+    def _facts(self, name: str) -> tuple[str, str]:
+        times = self._bag.times(name)
+        rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
+        return self._bag.topics[name].short_type, counted(len(times), "messages") + rate
+
+    def _check_exists(self, name: str) -> None:
+        if name not in self._bag.topics:
+            raise InputError(f"{self._bag.path}: has no topic {name} ({self.seen()})")
+        if name not in self._kinds:
+            kind = self._bag.topics[name].short_type
+            problem = f"type {kind} cannot be used" if len(self._bag.times(name)) else "has no messages"
+            raise InputError(f"{self._bag.path}: topic {name}: {problem} ({self.seen()})")
+
+    def _found_images(self) -> dict[str, str]:
+        """Camera -> image topic: the stated ones, and one for each other group of topics."""
+        if self._stated.cameras:
+            return {**self._stated.cameras, **self._stated.renamed}
+        taken = {_camera_path(name) for name in self._stated.renamed.values()}
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name in sorted([*self.of_kind("image"), *self.of_kind("video")]):
+            if not NOT_A_CAMERA.search(name.lower()) and _camera_path(name) not in taken:
+                groups.setdefault(_camera_path(name), []).append(name)
+        best = {
+            path: min(topics, key=lambda name: (self._preference(name), not RECTIFIED.search(name), name))
+            for path, topics in groups.items()
+        }
+        return {**self._stated.renamed, **dict(_named(best))}
+
+    def _preference(self, name: str) -> int:
+        return list(KINDS).index(self._bag.topics[name].short_type)
+
+    def _calibration_of(self, camera: str, images: str) -> str | None:
+        """The calibration topic in the nearest namespace around the images, or else with the same frame."""
+        if camera in self._stated.calibration:
+            return self._stated.calibration[camera]
+        infos = self.of_kind("calibration")
+        around = [name for name in infos if images.startswith(name.rpartition("/")[0] + "/")]
+        nested = [name for name in around if name.rpartition("/")[0]]
+        if nested:
+            return max(nested, key=lambda name: (len(name.rpartition("/")[0]), name))
+        frame = frame_of(self._bag.message(images, 0))
+        same = [name for name in infos if frame_of(self._bag.message(name, 0)) == frame]
+        return same[0] if len(same) == 1 and frame else None
+
+
+def _camera_path(topic: str) -> tuple[str, ...]:
+    """The parts of a topic's name that name the camera: /camera/front/image_raw -> (camera, front)."""
+    parts = [part for part in topic.split("/") if part]
+    return tuple(part for part in parts if not GENERIC.fullmatch(part.lower())) or (parts[-1],)
+
+
+def _named(topics: Mapping[tuple[str, ...], str]) -> Iterator[tuple[str, str]]:
+    """Camera -> topic, with as many parts of each path as make the names different."""
+    for path, topic in topics.items():
+        for count in range(1, len(path) + 1):
+            if sum(other[-count:] == path[-count:] for other in topics) == 1:
+                break
+        yield "_".join(path[-count:]), topic
+
+
+def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag) -> Iterator[tuple[str, str]]:
+    """Camera of a calibration file -> topic: of the same name, or with the name as a part."""
+    for name in names:
+        lower = name.lower()
+        same = [topic for camera, topic in found.items() if camera.lower() == lower]
+        chosen = same or [topic for topic in found.values() if lower in topic.lower().split("/")]
+        if len(chosen) != 1:
+            offered = ", ".join(found.values()) or "none"
+            raise InputError(
+                f"{bag.path}: camera {name} of the calibration: its image topic was not found (image topics: "
+                f"{offered}): pass `topics={{{name!r}: '/TOPIC'}}`"
+            )
+        yield name, chosen[0]

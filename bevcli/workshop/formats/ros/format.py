@@ -56,7 +56,7 @@ FORMAT = Format(
     name="a ROS bag",
     expected=".mcap or .db3 files",
     recognises=lambda path: is_ros_bag(path) or path.suffix == ".bag",
-    opener="bevcli.workshop.formats.ros.sequence:RosSequence",
+    opener="bevcli.workshop.formats.ros.sequence:open_bag",
     options=BagOptions,
     precedence=10,
 )

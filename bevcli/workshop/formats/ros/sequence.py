@@ -1,99 +1,265 @@
-"""A ROS 2 bag or an MCAP file as a Sequence."""
+"""A ROS 2 bag or an MCAP file as a Sequence: its frames, and the images of its messages.
 
+Image messages are compressed files, raw pixels in ROS's encodings, or video packets. OpenCV decodes files only. So the
+packets from a keyframe to the next are written to a temporary file, and read from it.
+"""
+
+import re
+import tempfile
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.frame import CameraImage, DriveFacts, FrameStamp
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import is_there
-from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
-from bevcli.sequences.native.folder import rig_notes
-from bevcli.sequences.native.tables import read_ego_motion
-from bevcli.sequences.options import EgoMotionUse, SequenceOptions
-from bevcli.workshop.formats.ros.bag import Bag
-from bevcli.workshop.formats.ros.ego_motion import (
-    TransformTree,
+from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.printing import one_line
+from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
+from bevcli.sequences.images import (
+    MOST_PIXELS,
+    FrameEntry,
+    ListedSequence,
+    MessageSource,
+    Source,
+    UnreadableImage,
+    VideoReader,
+    bev_frame_notes,
+    decode,
+)
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
+from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
+from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
+from bevcli.workshop.formats.ros.vehicle import (
+    VehicleReader,
     capture_times,
     find_geo_origin,
-    is_static,
-    motion_from_poses,
-    motion_from_transforms,
-    sampled_transforms,
 )
-from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
-from bevcli.workshop.formats.ros.images import BagVideo, bag_image
-from bevcli.workshop.formats.ros.messages import camera_of, frame_of, pose_of
-from bevcli.workshop.formats.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
-# Usual names of the frame of the vehicle, and of the world.
-EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
+# Encoding -> channels, bytes a channel, conversion to BGR. ROS names the top left 2x2 pixels of a Bayer pattern.
+RAW_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
+    "bgr8": (3, 1, None),
+    "8UC3": (3, 1, None),
+    "rgb8": (3, 1, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2BGR),
+    "mono8": (1, 1, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, 1, cv2.COLOR_GRAY2BGR),
+    "mono16": (1, 2, cv2.COLOR_GRAY2BGR),
+    "bgr16": (3, 2, None),
+    "rgb16": (3, 2, cv2.COLOR_RGB2BGR),
+    "uyvy": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
+    "yuyv": (2, 1, cv2.COLOR_YUV2BGR_YUYV),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2BGR_YUYV),
+}
+for pattern in ("rggb", "bggr", "gbrg", "grbg"):
+    for bits in (8, 16):
+        conversion = getattr(cv2, f"COLOR_Bayer{pattern.upper()}2BGR")
+        RAW_ENCODINGS[f"bayer_{pattern}{bits}"] = (1, bits // 8, conversion)
+BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)(8|16)")
+COMPRESSED = re.compile("jpe?g|png|webp|tiff?|bmp", re.I)  # in the name of a format; "compressedDepth" is another one
+VIDEO_FORMATS = ("h264", "h265")
+LONGEST_GROUP = 600  # packets from one keyframe to the next
 SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the first of them leads
-CALIBRATION_FILE, EGO_MOTION_FILE = "calibration.json", "ego_motion.csv"
+EGO_MOTION_FILE = "ego_motion.csv"
 
 
-class RosSequence(Sequence):
+def bag_image(bag: Bag, topic: str, numbers: NDArray[np.int64], index: int, time_ns: int) -> MessageSource:
+    """Image `index` of a topic, read on demand. numbers: (N,) of its messages in order of capture. time_ns: roughly."""
+    number = int(numbers[index])
+    name = f"{bag.path}: {topic}: message {number}"
+    return MessageSource(name, time_ns, lambda: _read_message(bag, topic, number, time_ns, name))
+
+
+def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> CameraImage:
+    """The image, with the time that its message states.
+
+    Raises UnreadableImage if it is broken, and InputError for an unknown encoding or format.
+    """
+    try:
+        message = bag.message(topic, index)
+    except InputError as error:
+        raise UnreadableImage(str(error)) from None
+    time, data = timestamp_ns(message) or time_ns, payload(message)
+    if hasattr(message, "encoding"):
+        return CameraImage(time, _raw_pixels(message, data, name))
+    stated = str(getattr(message, "format", ""))
+    pixels, is_as_stored = _decoded(data, stated)
+    if pixels is None and stated and size_of_image(data) is None and not COMPRESSED.search(stated):
+        raise InputError(
+            f"{bag.path}: {topic}: images of format {one_line(stated, 60)} are not read (expected JPEG, PNG, WebP, "
+            "TIFF or BMP, or video as foxglove.CompressedVideo): write the topic in one of these"
+        )
+    if pixels is None:
+        raise UnreadableImage(f"{name} is not a complete image")
+    media_type = media_type_of(data) if is_as_stored else None
+    return CameraImage(time, pixels, data if media_type else None, media_type)
+
+
+def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
+    """(H, W, 3) uint8 BGR of a compressed image, None for a broken one; False if the file shows other colours.
+
+    stated: the format. After "compressed", ROS's image_transport names the encoding of what OpenCV compressed as if it
+    were BGR or grey, such as in "rgb8; png compressed rgb8" and "bayer_rggb8; jpeg compressed ".
+    """
+    before, _, after = stated.partition("compressed")
+    encoding = after.strip() or before.partition(";")[0]
+    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, MOST_PIXELS) if BAYER.fullmatch(encoding) else None
+    if pixels is not None and pixels.ndim == 2:
+        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        return cv2.cvtColor(pixels, RAW_ENCODINGS[encoding][2] or 0).astype(np.uint8, copy=False), False
+    pixels = decode(data)
+    if pixels is None or not (after.strip() and encoding.startswith("rgb")):
+        return pixels, True
+    return pixels[..., ::-1].copy(), False
+
+
+def _raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR of a sensor_msgs/Image or foxglove.RawImage.
+
+    Raises InputError for an encoding that is not supported, and UnreadableImage if bytes are missing.
+    """
+    known = RAW_ENCODINGS.get(str(message.encoding))
+    if known is None:
+        raise InputError(
+            f"{where}: encoding {message.encoding} is not supported (expected {', '.join(list(RAW_ENCODINGS)[:8])} or "
+            "a Bayer pattern)"
+        )
+    channels, depth, conversion = known
+    height, width = int(message.height), int(message.width)
+    row_bytes = width * channels * depth
+    step = int(message.step) or row_bytes
+    if len(data) < step * height or step < row_bytes:
+        raise UnreadableImage(f"{where} is not a complete image")
+    rows = np.frombuffer(data, dtype=np.uint8, count=step * height).reshape(height, step)[:, :row_bytes]
+    pixels = np.ascontiguousarray(rows)
+    if depth == 2:
+        wide = pixels.view(">u2" if getattr(message, "is_bigendian", 0) else "<u2")
+        pixels = (wide >> 8).astype(np.uint8)
+    pixels = pixels.reshape(height, width, channels) if channels > 1 else pixels
+    return pixels if conversion is None else cv2.cvtColor(pixels, conversion).astype(np.uint8, copy=False)
+
+
+class BagVideo:
+    """The images of a topic with video packets. In order, each packet is decoded once.
+
+    Raises InputError for a format that is not supported.
+    """
+
+    def __init__(self, bag: Bag, topic: str, numbers: NDArray[np.int64]) -> None:
+        """numbers: (N,) of the topic's messages in order of capture."""
+        self._bag, self._topic, self._numbers = bag, topic, numbers.tolist()
+        self._format = str(bag.message(topic, 0).format).lower()
+        if self._format not in VIDEO_FORMATS:
+            expected = " or ".join(VIDEO_FORMATS)
+            raise InputError(f"{bag.path}: {topic}: video format {self._format} is not supported (expected {expected})")
+        self._folder = tempfile.TemporaryDirectory(prefix="bevcli-video-")
+        self._group: range = range(0)  # messages of the group of pictures that is open
+        self._reader: VideoReader | None = None
+        self._lock = threading.Lock()
+
+    def image(self, index: int, time_ns: int) -> MessageSource:
+        """The source of image `index`. time_ns: according to the index of the bag."""
+        name = f"{self._bag.path}: {self._topic}: message {self._numbers[index]}"
+        return MessageSource(name, time_ns, lambda: self.read(index, time_ns))
+
+    def read(self, index: int, time_ns: int) -> CameraImage:
+        """Image `index`. Raises UnreadableImage if it cannot be decoded."""
+        with self._lock:
+            try:
+                if index not in self._group:
+                    self._open_group(index)
+                assert self._reader is not None
+                pixels = self._reader.read(index - self._group.start)
+                time = timestamp_ns(self._bag.message(self._topic, self._numbers[index])) or time_ns
+            except InputError as error:
+                raise UnreadableImage(f"{self._topic}: image {index} cannot be decoded ({error})") from None
+        return CameraImage(time, pixels)
+
+    def _open_group(self, index: int) -> None:
+        start = index
+        while not _is_keyframe(self._packet(start), self._format):
+            start -= 1
+            if start < 0 or index - start > LONGEST_GROUP:
+                raise InputError("there is no keyframe before it")
+        stop = index + 1
+        while stop < len(self._numbers) and not _is_keyframe(self._packet(stop), self._format):
+            stop += 1
+        path = Path(self._folder.name) / f"{start}.{self._format}"
+        path.write_bytes(b"".join(self._packet(number) for number in range(start, stop)))
+        if self._reader is not None:
+            self._reader.path.unlink(missing_ok=True)
+        self._reader, self._group = VideoReader(path), range(start, stop)
+
+    def _packet(self, index: int) -> bytes:
+        return payload(self._bag.message(self._topic, self._numbers[index]))
+
+
+def _is_keyframe(packet: bytes, video_format: str) -> bool:
+    """True for a packet at which decoding can start. Foxglove's schema puts parameter sets before each keyframe."""
+    heads = [unit[0] for unit in packet.split(b"\x00\x00\x01")[1:] if unit]  # first bytes of NAL units in Annex B
+    if video_format == "h264":
+        return any(head & 0x1F == 7 for head in heads)  # a parameter set, as for H.265
+    return any(head >> 1 & 0x3F in (32, 33) for head in heads)
+
+
+def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> ListedSequence:
     """A bag as a `Sequence`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
 
     Raises InputError if the bag is broken, or cameras, extrinsics or poses are not found.
     """
-
-    def __init__(self, path: Path, common: SequenceOptions = SequenceOptions(), own: BagOptions = BagOptions()) -> None:
-        if path.suffix == ".bag" and not is_ros_bag(path):
-            raise InputError(
-                f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
-            )
-        if path.is_file() and is_packed_bag(path):
-            raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
-        stated = read_topics_file(own.topics_file, own.topics)
-        rig = own.rig()
-        self.path = path
-        self.name = path.resolve().stem if path.is_file() else path.resolve().name
-        self._bag = Bag(path)
-        rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
-        finder = TopicFinder(self._bag, stated, rig.names if rig else None)
-        reader = _VehicleReader(self._bag, finder, stated)
-        self.rig = reader.rig() if rig is None else rig
-        self._motion, source, motion_notes = reader.motion(common.ego_motion, file)
-        self.has_ego_motion = self._motion is not None
-        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, self._motion))
-        self._entries, gaps = _covered(_entries(self._bag, finder.cameras), self._motion, path)
-        self.stamps = tuple(entry.stamp for entry in self._entries)
-        self.notes = (
-            finder.table(source),
-            *self._bag.notes,
-            *beside,
-            *reader.notes,
-            *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
-            *rig_notes(self.rig, "the calibration" if rig else "a bag"),
-            *motion_notes,
-            *gaps,
+    if path.suffix == ".bag" and not is_ros_bag(path):
+        raise InputError(
+            f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
         )
-        self._images = ImageReader(strict=common.strict)
-
-    @property
-    def input_files(self) -> tuple[Path, ...]:
-        return self._bag.file_paths
-
-    def load(self, place: int) -> Frame:
-        return read_frame(self._entries[place], self.rig, self._images, self._motion)
+    if path.is_file() and is_packed_bag(path):
+        raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
+    stated = read_topics_file(own.topics_file, own.topics)
+    rig = own.rig()
+    bag = Bag(path)
+    rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
+    finder = TopicFinder(bag, stated, rig.names if rig else None)
+    reader = VehicleReader(bag, finder, stated)
+    used_rig = reader.rig() if rig is None else rig
+    motion, source, motion_notes = reader.motion(common.ego_motion, file)
+    geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
+    entries, gaps = _covered(_entries(bag, finder.cameras), motion, path)
+    notes = (
+        finder.table(source),
+        *bag.notes,
+        *beside,
+        *reader.notes,
+        *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
+        *bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
+        *motion_notes,
+        *gaps,
+    )
+    anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
+    sequence = ListedSequence(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
+    sequence.facts = replace(facts, geo_origin=geo_origin)
+    if path.is_file():
+        sequence.name = path.resolve().stem
+    return sequence
 
 
 def _files_beside(
     folder: Path, rig: CameraRig | None, common: SequenceOptions, own: BagOptions
 ) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
     """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
-    calibration, notes = folder / CALIBRATION_FILE, []
+    calibration, notes = folder / CALIBRATION, []
     found, facts = read_rig_and_facts(calibration) if is_there(calibration) else (None, DriveFacts())
     if rig is None and found is not None:
         notes.append(f"{calibration} is used in place of the calibration in the bag")
@@ -102,120 +268,6 @@ def _files_beside(
         file = folder / EGO_MOTION_FILE
         notes.append(f"{file} is used in place of the poses in the bag")
     return found if rig is None else rig, facts, file, notes
-
-
-class _VehicleReader:
-    """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
-
-    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
-        self._bag, self._finder, self._stated = bag, finder, stated
-        static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
-        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
-        self.ego_frame = stated.ego_frame
-
-    def rig(self) -> CameraRig:
-        """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
-        cameras = self._finder.cameras
-        frames = {one.camera: self._stated.frames.get(one.camera) or self._frame_of(one) for one in cameras}
-        self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
-        found = tuple(self._camera(one, self._ego_from(frames[one.camera], one.camera)) for one in cameras)
-        return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
-
-    def _frame_of(self, topics: CameraTopics) -> str:
-        """The optical frame that the images name, or else the calibration."""
-        named = (
-            self._bag.first(topic, frame_of, "an image or a calibration")
-            for topic in (topics.images, topics.calibration)
-            if topic
-        )
-        return next(filter(None, named), "")
-
-    def _camera(self, topics: CameraTopics, ego_from_camera: Array) -> Camera:
-        assert topics.calibration is not None
-        where = f"{self._bag.path}: {topics.calibration}"
-        parse = partial(
-            camera_of, name=topics.camera, ego_from_camera=ego_from_camera, rectified=topics.is_rectified, where=where
-        )
-        return self._bag.first(topics.calibration, parse, "a calibration")
-
-    def _find_ego_frame(self, camera_frames: list[str]) -> str:
-        """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
-        above = [self._tree.up(frame) for frame in camera_frames]
-        pose = self._finder.pose_topic()
-        named = self._child_of(pose) if pose else ""
-        for name in (named, *EGO_FRAMES):
-            if name and name in self._tree.frames:
-                return name
-        common = [frame for frame in above[0] if all(frame in path for path in above)]
-        if not common or common[0] in camera_frames:
-            return EGO_FRAMES[0]
-        self.notes.append(
-            f'no frame is named {" or ".join(EGO_FRAMES[:2])}: "{common[0]}" is taken as the frame of the vehicle '
-            "(ego_frame in `topics_file=FILE.toml` states another)"
-        )
-        return common[0]
-
-    def _child_of(self, topic: str) -> str:
-        """The frame whose poses a topic has, "" if it names none."""
-        return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
-
-    def _ego_from(self, frame: str, camera: str) -> Array:
-        found = self._tree.between(self.ego_frame, frame)
-        if found is None:
-            frames = ", ".join(self._tree.frames[:12]) or "none"
-            raise InputError(
-                f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
-                f"(frames: {frames}; {self._finder.seen()}): pass `calibration=FILE`, or name the frames "
-                "with `topics_file=FILE.toml`"
-            )
-        if abs(found[2, 2]) > 0.7:
-            self.notes.append(
-                f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
-                "not, name the optical frame with `topics_file=FILE.toml`"
-            )
-        return found
-
-    def motion(self, use: EgoMotionUse, file: Path | None) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
-        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
-
-        Raises InputError if poses are required and not found.
-        """
-        if use == "static":
-            return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
-        if file is not None:
-            return read_ego_motion(file), "", ()
-        ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
-        topic = self._finder.pose_topic()
-        if topic is not None:
-            child = self._child_of(topic)
-            is_other = child not in ("", ego_frame)
-            child_from_ego = self._tree.between(child, ego_frame) if is_other else None
-            note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
-            motion, notes = motion_from_poses(self._bag, topic, child_from_ego)
-            return motion, topic, (*([note] if is_other and child_from_ego is None else ()), *notes)
-        path = self._moving_path(ego_frame)
-        if len(path) > 1:
-            changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
-            child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
-            motion, notes = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
-            return motion, changing[0], tuple(notes)
-        if use == "required":
-            raise InputError(
-                f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
-                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
-                "the vehicle stands, or `temporal=False` to run without history"
-            )
-        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
-
-    def _moving_path(self, ego_frame: str) -> list[str]:
-        """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
-        path = list(self._tree.up(ego_frame))
-        if self._stated.world_frame in path:
-            path = path[: path.index(self._stated.world_frame) + 1]
-        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
-        # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
-        path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
-        return path if len(path) == len(moving) + 1 else path[:1]
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:

@@ -1,0 +1,181 @@
+"""The meshes of the ego vehicle and of classes: each box of a class with a mesh has it in the scene, scaled to the box.
+
+The vehicle is a plain car by default.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from bevcli.errors import InputError
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import ObjectClass
+from bevcli.geometry.transforms import Array
+from bevcli.parsing.files import open_regular
+from bevcli.recording import entities
+from bevcli.recording.colors import EGO_COLOR, Color, class_colors
+from bevcli.recording.components import components
+from bevcli.recording.log_boxes import quaternions
+from bevcli.recording.mesh_file import Mesh, read_mesh
+
+BODY_LWH = (4.6, 1.86, 0.75)
+REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
+WHEELBASE, TRACK = 2.75, 1.64
+GLASS: Color = (32, 40, 52)
+RUBBER: Color = (20, 22, 26)
+OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
+FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
+LONGEST_M = 50.0  # a longer mesh is not in metres
+MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
+FARTHEST = 1e9  # of a vertex from the origin, in the file's units
+
+
+@dataclass(frozen=True)
+class VehicleMesh:
+    """The ego vehicle in the ego frame.
+
+    Attributes:
+        mesh: its triangles.
+        top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
+    """
+
+    mesh: Mesh
+    top_view: tuple[Array, ...]
+
+
+def load_vehicle(path: Path) -> VehicleMesh:
+    """The vehicle from a mesh file: .glb, .gltf, .ply, .obj, .stl or .off, read by trimesh.
+
+    The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
+    (.glb, .gltf) have glTF's axes: x left, y up, z forward. All other files have the ego frame's axes: x forward,
+    y left, z up. Parts without a colour get the default car's blue.
+
+    Materials, textures and buffers that the file names are read only in its own folder.
+
+    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
+    longer than 50 m.
+    """
+    mesh = read_mesh(path)
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    if not np.isfinite(mesh.vertices).all() or not (high - low).max() <= LONGEST_M:
+        size = " x ".join(f"{length:.4g}" for length in high - low)
+        raise InputError(
+            f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
+        )
+    return VehicleMesh(mesh, _top_view(low, high))
+
+
+def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
+    """The rectangle around a mesh from above, and an arrow at its front. low, high: (3,) corners in the ego frame."""
+    (x0, y0), (x1, y1) = low[:2], high[:2]
+    middle, half, length = (y0 + y1) / 2, (y1 - y0) / 2, x1 - x0
+    outline = np.array([[x1, y0], [x1, y1], [x0, y1], [x0, y0], [x1, y0]])
+    arrow = np.array([[-0.32 * length, -0.86 * half], [-0.08 * length, 0], [-0.32 * length, 0.86 * half]])
+    return outline, arrow + (x1, middle)
+
+
+def default_vehicle() -> VehicleMesh:
+    """A plain car with a cabin and four wheels."""
+    body = _box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62)
+    wheels = [_wheel() + (x, y, 0.34) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)]
+    return _joined([(body, EGO_COLOR), (_cabin(), GLASS), *((wheel, RUBBER) for wheel in wheels)])
+
+
+# The parts of the default car are triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside. They
+# are made with NumPy, because trimesh would take half a second to load at the start of every run.
+
+
+def _cabin() -> Array:
+    cabin = _box(2.5, 1.66, 0.6)
+    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
+    return cabin + (1.0, 0, 1.28)
+
+
+def _wheel(radius: float = 0.34, width: float = 0.24, sections: int = 20) -> Array:
+    turns = np.arange(sections) / sections * 2 * np.pi
+    standing = _prism(radius * np.stack([np.cos(turns), np.sin(turns)], -1), width)
+    return standing[..., [1, 2, 0]]
+
+
+def _box(length: float, width: float, height: float) -> Array:
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    return _prism(corners * (length, width), height)
+
+
+def _prism(outline: Array, height: float) -> Array:
+    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2."""
+    low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
+    low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
+    sides = [(low, low_next, high_next), (low, high_next, high)]
+    caps = [(low[:1].repeat(len(low), 0), low_next, low), (high[:1].repeat(len(high), 0), high, high_next)]
+    triangles = np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
+    # The first and the last triangle of each cap's fan have no area.
+    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]
+
+
+def _normals(triangles: Array) -> Array:
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
+    """Flat shading: each corner of each triangle is a vertex of its own."""
+    triangles = np.concatenate([part for part, _ in parts])
+    normals = _normals(triangles)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
+    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
+
+
+def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
+    """The meshes of the classes that have one, by class, scaled to a cube of 1 m around the origin.
+
+    Parts of a mesh without a colour have that of the class. A file that did not change is read once in a process.
+    Raises InputError for a file that `read_mesh` does not take, and for one of more than MOST_TRIANGLES triangles.
+    """
+    colors = class_colors(classes.values())
+    return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
+
+
+def _read(name: str, path: Path, color: Color) -> Mesh:
+    try:
+        with open_regular(path) as file:
+            changed_ns = os.fstat(file.fileno()).st_mtime_ns
+        return _unit_cube(path, color, changed_ns)
+    except InputError as error:
+        raise InputError(f'mesh of class "{name}": {error}') from None
+
+
+@lru_cache(maxsize=16)
+def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
+    """changed_ns: time of the file's last change; a file that has changed is read again."""
+    mesh = read_mesh(path, color)
+    if len(mesh.faces) > MOST_TRIANGLES:
+        raise InputError(f"{path}: the mesh has {len(mesh.faces):,} triangles (expected at most {MOST_TRIANGLES:,})")
+    if not np.abs(mesh.vertices).max() < FARTHEST:
+        raise InputError(f"{path}: a number of the mesh is not finite, or too large (expected less than {FARTHEST:g})")
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    extents = np.where(high > low, high - low, 1)  # a flat mesh stays flat
+    normals = mesh.normals * extents
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
+
+
+def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
+    """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
+    for name in (name for name, settings in classes.items() if settings.mesh):
+        own = boxes[boxes.classes == name]
+        # The last one has no size: an entity without poses would show its mesh at the origin.
+        poses = components(
+            rr.InstancePoses3D,
+            translations=np.append(own.centers, [[0, 0, 0]], axis=0),
+            quaternions=np.append(quaternions(own), [[0, 0, 0, 1]], axis=0),
+            scales=np.append(own.sizes_lwh, [[0, 0, 0]], axis=0),
+        )
+        stream.log(entities.class_mesh(name), poses)

@@ -1,1 +1,0 @@
-"""BEVFormer explained: figures of what each step of the model does with one frame."""

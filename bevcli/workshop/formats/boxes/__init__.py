@@ -1,1 +1,0 @@
-"""Box formats of other programs, written by `bevcli export`."""

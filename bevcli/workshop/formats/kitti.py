@@ -1,0 +1,211 @@
+"""KITTI's labels: read from a tracking file of a drive, or a folder with a file for each frame; and exported."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.evaluation.box_format import BoxFormat
+from bevcli.evaluation.options import ExportOptions
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, wrap_angle
+from bevcli.parsing.files import MIB, read_text
+from bevcli.printing import counted
+from bevcli.sequences.files.boxes_file import BoxesFile
+from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
+from bevcli.sequences.options import LabelOptions
+from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels
+from bevcli.writing import write_whole
+
+LARGEST_BYTES = 256 * MIB
+IGNORED = "DontCare"
+# The words of a line after frame and track: type, truncated, occluded, alpha, the box in the image, then height, width,
+# length, the middle of the bottom x, y, z in the frame of the camera, and rotation_y. Predictions add a score.
+WORDS = (15, 16)
+NAMES = ("height", "width", "length", "x", "y", "z", "rotation_y")
+OCCLUSION_UNKNOWN = 3
+NEAR_M = 0.1  # box edges are clipped at this depth
+
+
+def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
+    """The boxes of a tracking file, or of a folder with files NNNNNN.txt. Raises InputError that names the line.
+
+    They are in the frame of the camera `labels_camera`; by default of that which looks most directly ahead.
+    """
+    name = _looking_ahead(rig) if options.labels_camera is None else options.labels_camera
+    if name not in rig.names:
+        raise InputError(f"`labels_camera={name}`: is not in the rig (expected one of {', '.join(rig.names)})")
+    frames = _folder(path, rig[name]) if path.is_dir() else _tracking_file(path, rig[name])
+    note = f"the boxes are those that {name} sees, in its frame (`labels_camera`); others have no labels"
+    return Labels("ego", tuple(frames), lists_empty=path.is_dir(), notes=(note,))
+
+
+def _looking_ahead(rig: CameraRig) -> str:
+    return min(rig.cameras, key=lambda camera: abs(camera.yaw)).name
+
+
+def _folder(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
+    for file in sorted(path.glob("*.txt")):
+        if not file.stem.isdecimal():
+            raise InputError(f"{file}: expected the index of a frame as its name, such as 000042.txt")
+        boxes = Boxes3D.concatenate(_box(where, words, "", camera) for where, words in _lines(file))
+        yield LabelledFrame(int(file.stem), None, boxes)
+
+
+def _tracking_file(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
+    frames: dict[int, list[Boxes3D]] = {}
+    for where, words in _lines(path):
+        if not words[0].isdecimal() or len(words) < 2:
+            raise InputError(f'{where}: expected the index of a frame and a track, found "{" ".join(words):.40}"')
+        box = _box(where, words[2:], words[1], camera)
+        if len(box):
+            frames.setdefault(int(words[0]), []).append(box)
+    for index, boxes in frames.items():
+        yield LabelledFrame(index, None, Boxes3D.concatenate(boxes))
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Place and words of each line that is not blank."""
+    for number, line in enumerate(read_text(path, LARGEST_BYTES).splitlines(), 1):
+        if words := line.split():
+            yield f"{path}: line {number}", words
+
+
+def _box(where: str, words: list[str], track: str, camera: Camera) -> Boxes3D:
+    """The box of a line in the ego frame; none for an area without labels."""
+    if words and words[0] == IGNORED:
+        return Boxes3D.empty()
+    try:
+        height, width, length, x, y, z, rotation_y = (float(word) for word in words[8:15])
+    except ValueError:
+        raise InputError(
+            f"{where}: expected {WORDS[0]} or {WORDS[1]} words from the type on, with {', '.join(NAMES)} as numbers"
+        ) from None
+    if len(words) not in WORDS or not np.isfinite([height, width, length, x, y, z, rotation_y]).all():
+        raise InputError(f"{where}: expected {WORDS[0]} or {WORDS[1]} words, and finite numbers")
+    rotation = camera.ego_from_camera[:3, :3]
+    heading = rotation @ [np.cos(rotation_y), 0, -np.sin(rotation_y)]
+    center = rotation @ [x, y, z] + camera.ego_from_camera[:3, 3] + [0, 0, height / 2]
+    return Boxes3D(
+        center[None], np.array([[length, width, height]]), np.array([np.arctan2(heading[1], heading[0])]),
+        np.full((1, 2), np.nan), np.array([words[0]]), instances=np.array([track]),
+    )  # fmt: skip
+
+
+def _recognises(path: Path) -> bool:
+    return path.suffix.lower() == ".txt" or (path.is_dir() and next(path.glob("*.txt"), None) is not None)
+
+
+LABELS = LabelFormat("KITTI labels (.txt, or a folder of these)", _recognises, read_kitti_labels)
+
+
+def _export(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
+    """Write the labels of a camera, with the calibration that a run and a sequence folder have next to the boxes."""
+    path = options.calibration or source.parent / CALIBRATION
+    if options.calibration is None and not path.is_file():
+        raise InputError(
+            f"`form=kitti` needs `calibration`: KITTI labels are in a camera frame, and there is no {path} "
+            "(a run writes it for a drive of one scene)"
+        )
+    path = path / CALIBRATION if path.is_dir() else path
+    rig, name = read_calibration(path), options.camera
+    if name is None:
+        name = "CAM_FRONT" if "CAM_FRONT" in rig.names else _looking_ahead(rig)
+    if name not in rig.names:
+        raise InputError(f'{path}: has no camera "{name}" (expected one of {", ".join(rig.names)})')
+    labels = write_kitti(boxes, rig[name], rig.ego_from_bev, target)
+    return f"{counted(len(boxes.frames), 'frames')}, {counted(labels, 'labels')} of {name}"
+
+
+BOXES = BoxFormat("kitti", _export)
+
+
+def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: Path) -> int:
+    """Write label_2/NNNNNN.txt and calib/NNNNNN.txt for every frame; NNNNNN is the frame's index.
+
+    A label is written for each box that is at least partly inside the image without lens distortion. ego_from_bev:
+    (4, 4), for boxes in the bev frame, and as the lidar frame of the calibration. Returns the number of labels. Raises
+    InputError where frame indices repeat, and OutputError.
+    """
+    numbers = [frame.stamp.index for frame in boxes.frames]
+    if len(set(numbers)) < len(numbers):
+        raise InputError("frame indices repeat (KITTI's files are named by them): export each scene separately")
+    count, classes = 0, boxes.classes or NUSCENES_CLASSES
+    boxes = replace(boxes, ego_from_bev=Pose.from_matrix(ego_from_bev))
+    for frame in boxes.frames:
+        lines = kitti_labels(boxes.in_ego(frame), camera, classes)
+        name = f"{frame.stamp.index:06d}.txt"
+        write_whole(folder / "label_2" / name, "".join(f"{line}\n" for line in lines).encode(), parents=True)
+        write_whole(folder / "calib" / name, _calibration(camera, ego_from_bev).encode(), parents=True)
+        count += len(lines)
+    return count
+
+
+def kitti_labels(
+    boxes_ego: Boxes3D, camera: Camera, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
+) -> list[str]:
+    """One line for each box that the camera sees, in the order of the boxes.
+
+    The fields: type, truncated 0 to 1, occluded (3: unknown), alpha, 2D box (left, top, right, bottom) in pixels,
+    height, width and length in metres, centre of the bottom face in the camera frame, rotation_y, and the score if
+    there is one.
+    """
+    camera_from_ego = camera.camera_from_ego
+    locations = apply(camera_from_ego, boxes_ego.centers - boxes_ego.sizes_lwh * (0, 0, 0.5))
+    headings = np.stack([np.cos(boxes_ego.yaws), np.sin(boxes_ego.yaws), np.zeros(len(boxes_ego))], axis=-1)
+    headings = headings @ camera_from_ego[:3, :3].T
+    rotations_y = np.arctan2(-headings[:, 2], headings[:, 0])
+    alphas = wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2]))
+    lines = []
+    for row, corners in enumerate(boxes_ego.corners()):
+        seen = _image_box(apply(camera_from_ego, corners), camera)
+        if seen is None:
+            continue
+        rectangle, truncated = seen
+        length, width, height = boxes_ego.sizes_lwh[row]
+        numbers = [alphas[row], *rectangle, height, width, length, *locations[row], rotations_y[row]]
+        label = f"{_kitti_type(str(boxes_ego.classes[row]), classes)} {truncated:.2f} {OCCLUSION_UNKNOWN} "
+        score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[row]:.4f}"
+        lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
+    return lines
+
+
+def _kitti_type(name: str, classes: Mapping[str, ObjectClass]) -> str:
+    """A class's type in KITTI's files, whose columns are parted by spaces; "Misc" for a class that is not known."""
+    known = classes.get(name)
+    return "Misc" if known is None else "_".join((known.kitti or known.name).split())
+
+
+def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
+    """The rectangle around a box's projection, clipped to the image, and the share of its area that is clipped."""
+    points = _in_front_of_camera(corners)
+    if not len(points):
+        return None
+    pixels = (points @ camera.intrinsics.T)[:, :2] / points[:, 2:]
+    whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+    cut = np.clip(whole, 0, np.array([camera.width - 1, camera.height - 1] * 2))
+    area, whole_area = np.prod(cut[2:] - cut[:2]), np.prod(whole[2:] - whole[:2])
+    return (cut, float(1 - area / whole_area)) if area > 0 else None
+
+
+def _in_front_of_camera(corners: Array) -> Array:
+    """The corners (8, 3) in front of the camera, and the points where box edges intersect the plane at NEAR_M."""
+    a, b = corners[np.array(BOX_EDGES)].swapaxes(0, 1)  # (12, 3) each
+    crosses = (a[:, 2] < NEAR_M) != (b[:, 2] < NEAR_M)
+    a, b = a[crosses], b[crosses]
+    cut = a + ((NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
+    return np.concatenate([corners[corners[:, 2] >= NEAR_M], cut])
+
+
+def _calibration(camera: Camera, ego_from_bev: Array) -> str:
+    """KITTI's calibration: P0 to P3 are this camera's, R0_rect is the identity, the lidar frame is the bev frame."""
+    projection = np.concatenate([camera.intrinsics, np.zeros((3, 1))], axis=1)
+    rows = {f"P{number}": projection for number in range(4)}
+    rows["R0_rect"] = np.eye(3)
+    rows["Tr_velo_to_cam"] = (camera.camera_from_ego @ ego_from_bev)[:3]
+    rows["Tr_imu_to_velo"] = inverse(ego_from_bev)[:3]
+    return "".join(f"{name}: {' '.join(f'{number:.12e}' for number in row.ravel())}\n" for name, row in rows.items())

@@ -1,0 +1,357 @@
+"""The vehicle of a bag: its rig, its poses from a topic or from transforms, its place on Earth; the times of images."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial, reduce
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
+from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
+from bevcli.parsing.files import MIB
+from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.options import EgoMotionUse
+from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, spread
+from bevcli.workshop.formats.ros.messages import Transform, camera_of, frame_of, pose_of, timestamp_ns, transforms_of
+
+SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
+MOST_MESSAGES = 8192  # of a topic, while a frame has had no valid transform
+READ_WHOLE = 2048 * MIB  # of larger bags, not the times of all images are read
+KINEMATICS_STEP_NS = 50_000_000  # poses closer than this in time are thinned before they are differentiated
+SAMPLES = 5  # images of a topic
+LARGEST_SPREAD_NS = 50_000_000  # of the delay between capture and recording, among the samples
+FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
+FIXES_TRIED = 50
+MAX_OFFSET_M = 10_000.0  # from the world's origin; GeoOrigin counts the Earth as flat around it
+# Usual names of the frame of the vehicle, and of the world.
+EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
+
+
+class TransformTree:
+    """Frames and the transforms between them, each frame with one parent. The first transform of a frame counts."""
+
+    def __init__(self, transforms: Iterable[Transform] = ()) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+        for one in transforms:
+            if one.child != one.parent and one.parent_from_child is not None:
+                self._parents.setdefault(one.child, (one.parent, one.parent_from_child.matrix))
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames, sorted."""
+        return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
+
+    def between(self, a: str, b: str) -> Array | None:
+        """(4, 4) a_from_b in metres, None if the tree does not connect the frames."""
+        up_a, up_b = self.up(a), self.up(b)
+        common = next((frame for frame in up_b if frame in up_a), None)
+        return None if common is None else inverse(up_a[common]) @ up_b[common]
+
+    def up(self, frame: str) -> dict[str, Array]:
+        """(4, 4) ancestor_from_frame of a frame and of its ancestors, the root last."""
+        found = {frame: rigid()}
+        while frame in self._parents and self._parents[frame][0] not in found:
+            parent, parent_from_child = self._parents[frame]
+            found[parent] = parent_from_child @ found[frame]
+            frame = parent
+        return found
+
+
+def read_transforms(bag: Bag, topic: str, number: int) -> list[Transform]:
+    """The transforms of a message of a topic, or its pose. Raises InputError if it is broken."""
+    return bag.read(topic, number, lambda message: [*transforms_of(message)], "a pose")
+
+
+def is_static(topic: str) -> bool:
+    """True for a topic with transforms that never change."""
+    return topic.rstrip("/").endswith("static")
+
+
+def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform], list[Transform], list[str]]:
+    """Static transforms, the first ones of the topics with transforms that change, and notes.
+
+    More messages are read while a frame has had no valid transform.
+    """
+    static: list[Transform] = []
+    changing: list[Transform] = []
+    notes: list[str] = []
+    for topic in topics:
+        found: list[Transform] = []
+        for number in range(min(len(bag.times(topic)), MOST_MESSAGES)):
+            if number and number % SAMPLED_MESSAGES == 0:
+                valid = {one.child for one in found if one.parent_from_child is not None}
+                if valid.issuperset(one.child for one in found):
+                    break
+            found += read_transforms(bag, topic, number)
+        if is_static(topic):
+            notes += invalid_note(topic, [one.parent_from_child is not None for one in found])
+        (static if is_static(topic) else changing).extend(found)
+    return static, changing, notes
+
+
+def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
+    """A note on the poses that are left out; none where all are valid."""
+    invalid, reason = are_valid.count(False), "NaN, a rotation that is not a quaternion of norm 1, or a broken message"
+    return [f"{source}: {invalid} of {len(are_valid)} poses are left out: {reason}"] if invalid else []
+
+
+def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> tuple[EgoMotion, list[str]]:
+    """Poses of a topic with Odometry or poses, and notes. child_from_ego: (4, 4), None: the poses are the vehicle's."""
+    return _motion_from(bag, [topic], [topic], lambda one: topic, child_from_ego)
+
+
+def motion_from_transforms(
+    bag: Bag, topics: Sequence[str], frames: Sequence[str], child_from_ego: Array | None
+) -> tuple[EgoMotion, list[str]]:
+    """Poses along a chain of transforms, and notes. topics: with transforms that change.
+
+    frames: the frame of the world first, each the parent of the next. child_from_ego: (4, 4) from the last of them to
+    the ego vehicle, None if they are the same.
+    """
+    links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
+    by_child = dict(zip(frames[1:], links, strict=True))
+    return _motion_from(bag, topics, links, lambda one: by_child.get(one.child), child_from_ego)
+
+
+def _motion_from(
+    bag: Bag,
+    topics: Sequence[str],
+    links: Sequence[str],
+    link_of: Callable[[Transform], str | None],
+    child_from_ego: Array | None,
+) -> tuple[EgoMotion, list[str]]:
+    """Poses along links, which are multiplied, and notes. link_of: the link of a transform, None for none of them."""
+    samples: dict[str, dict[int, Pose]] = {link: {} for link in links}
+    are_valid: list[bool] = []
+    for time, topic, number in _in_order(bag, {topic: range(len(bag.times(topic))) for topic in topics}):
+        try:
+            stated = [(link, one) for one in read_transforms(bag, topic, number) if (link := link_of(one))]
+        except InputError:
+            are_valid.append(False)
+            continue
+        for link, one in stated:
+            are_valid.append(one.parent_from_child is not None)
+            if one.parent_from_child is not None:
+                samples[link][one.timestamp_ns or time] = one.parent_from_child
+    source = " and ".join(topics)
+    parts = [_motion(sorted(own.items())) for own in samples.values() if own]
+    first, last = max((part.first_ns for part in parts), default=0), min((part.last_ns for part in parts), default=0)
+    if len(parts) < len(links) or first > last:
+        raise InputError(f"{bag.path}: {source}: has no poses of {' and '.join(links)}")
+    notes = invalid_note(source, are_valid)
+    if len(parts) == 1 and child_from_ego is None:
+        return parts[0], notes  # with the sign of the quaternion as stated
+    times = np.unique(np.concatenate([part.timestamps_ns for part in parts]))
+    ego = [] if child_from_ego is None else [child_from_ego]
+    chains = (
+        (time, [*(part.pose_at(time).matrix for part in parts), *ego])
+        for time in times[(times >= first) & (times <= last)].tolist()
+    )
+    return _motion([(time, Pose.from_matrix(reduce(np.matmul, chain))) for time, chain in chains]), notes
+
+
+def _motion(samples: Sequence[tuple[int, Pose]]) -> EgoMotion:
+    """samples: times in ns and poses.
+
+    Kinematics come from poses at least KINEMATICS_STEP_NS apart, because differences of close poses are noise.
+    """
+    times = np.array([time for time, _ in samples], dtype=np.int64)
+    translations = np.stack([pose.translation for _, pose in samples])
+    quaternions = np.stack([pose.quaternion for _, pose in samples])
+    kept = [0]
+    for place, time in enumerate(times.tolist()):
+        if time - times[kept[-1]] >= KINEMATICS_STEP_NS:
+            kept.append(place)
+    seconds = (times - times[0]) / 1e9
+    kinematics = (
+        np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1)
+        for part in derive_kinematics(times[kept], translations[kept], quaternions[kept])
+    )
+    return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=False)
+
+
+def capture_times(bag: Bag, topics: Iterable[str]) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """By topic of images, (N,) times at which they were captured, ns, in order; and (N,) the numbers of the messages.
+
+    The index of a bag has the times of recording only, in another order where messages were late. So all messages are
+    read. Of a bag above READ_WHOLE, the delay is taken from a few messages; if it differs much among them, such as in
+    a bag that was replayed at another speed, all messages are read, too.
+    """
+    logged = {topic: bag.times(topic) for topic in topics}
+    numbers = {topic: range(len(own)) for topic, own in logged.items()}
+    samples = numbers if bag.size <= READ_WHOLE else {topic: spread(len(own), SAMPLES) for topic, own in logged.items()}
+    stated = _stated_times(bag, samples)
+    found = {}
+    for topic, own in logged.items():
+        delays = [time - int(own[number]) for number, time in stated[topic].items() if time] or [0]
+        if max(delays) - min(delays) > LARGEST_SPREAD_NS and len(stated[topic]) < len(own):
+            stated |= _stated_times(bag, {topic: numbers[topic]})
+        captured = own + int(np.median(delays))
+        if len(stated[topic]) == len(own):
+            captured = np.array([stated[topic][number] or rough for number, rough in enumerate(captured)], np.int64)
+        order = np.argsort(captured, kind="stable")
+        found[topic] = (captured[order], order)
+    return found
+
+
+def _stated_times(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> dict[str, dict[int, int]]:
+    """The times that messages state, ns, by topic and number; 0 for none."""
+    found: dict[str, dict[int, int]] = {topic: {} for topic in numbers}
+    for _, topic, number in _in_order(bag, numbers):
+        found[topic][number] = 0
+        with contextlib.suppress(InputError, AttributeError, ValueError):
+            found[topic][number] = timestamp_ns(bag.message(topic, number))
+    return found
+
+
+def _in_order(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> list[tuple[int, str, int]]:
+    """Time of recording, topic and number of messages, in the order of recording: each chunk is decompressed once."""
+    logged = {topic: bag.times(topic).tolist() for topic in numbers}
+    return sorted((logged[topic][number], topic, number) for topic, own in numbers.items() for number in own)
+
+
+def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
+    """The place of the world frame on Earth: the first valid NavSatFix, at the vehicle's place at its time.
+
+    The world's x axis is taken as east and y as north, as ROS's REP 103 and 105 say of a map frame. The antenna counts
+    as the vehicle's origin. None without poses, without a valid position, or if the vehicle is too far from the
+    world's origin.
+    """
+    topics = [name for name, topic in bag.topics.items() if topic.short_type in FIX_TYPES and len(bag.times(name))]
+    if motion is None or not topics:
+        return None
+    times = bag.times(topics[0])
+    for index in spread(len(times), FIXES_TRIED):
+        time = int(times[index])
+        if not motion.first_ns <= time <= motion.last_ns:
+            continue
+        fix = bag.message(topics[0], index)
+        position = np.array([fix.latitude, fix.longitude], dtype=np.float64)
+        is_valid = getattr(getattr(fix, "status", None), "status", 0) >= 0
+        if not (is_valid and np.isfinite(position).all() and np.any(position)):
+            continue
+        place = motion.pose_at(time).translation
+        if np.linalg.norm(place[:2]) > MAX_OFFSET_M:
+            return None
+        latitude, longitude = GeoOrigin(*position.tolist()).latitude_longitude(-place)
+        return GeoOrigin(float(latitude), float(longitude))
+    return None
+
+
+class VehicleReader:
+    """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
+
+    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
+        self._bag, self._finder, self._stated = bag, finder, stated
+        static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
+        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
+        self.ego_frame = stated.ego_frame
+
+    def rig(self) -> CameraRig:
+        """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
+        cameras = self._finder.cameras
+        frames = {one.camera: self._stated.frames.get(one.camera) or self._frame_of(one) for one in cameras}
+        self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
+        found = tuple(self._camera(one, self._ego_from(frames[one.camera], one.camera)) for one in cameras)
+        return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
+
+    def _frame_of(self, topics: CameraTopics) -> str:
+        """The optical frame that the images name, or else the calibration."""
+        named = (
+            self._bag.first(topic, frame_of, "an image or a calibration")
+            for topic in (topics.images, topics.calibration)
+            if topic
+        )
+        return next(filter(None, named), "")
+
+    def _camera(self, topics: CameraTopics, ego_from_camera: Array) -> Camera:
+        assert topics.calibration is not None
+        where = f"{self._bag.path}: {topics.calibration}"
+        parse = partial(
+            camera_of, name=topics.camera, ego_from_camera=ego_from_camera, rectified=topics.is_rectified, where=where
+        )
+        return self._bag.first(topics.calibration, parse, "a calibration")
+
+    def _find_ego_frame(self, camera_frames: list[str]) -> str:
+        """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
+        above = [self._tree.up(frame) for frame in camera_frames]
+        pose = self._finder.pose_topic()
+        named = self._child_of(pose) if pose else ""
+        for name in (named, *EGO_FRAMES):
+            if name and name in self._tree.frames:
+                return name
+        common = [frame for frame in above[0] if all(frame in path for path in above)]
+        if not common or common[0] in camera_frames:
+            return EGO_FRAMES[0]
+        self.notes.append(
+            f'no frame is named {" or ".join(EGO_FRAMES[:2])}: "{common[0]}" is taken as the frame of the vehicle '
+            "(ego_frame in `topics_file=FILE.toml` states another)"
+        )
+        return common[0]
+
+    def _child_of(self, topic: str) -> str:
+        """The frame whose poses a topic has, "" if it names none."""
+        return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
+
+    def _ego_from(self, frame: str, camera: str) -> Array:
+        found = self._tree.between(self.ego_frame, frame)
+        if found is None:
+            frames = ", ".join(self._tree.frames[:12]) or "none"
+            raise InputError(
+                f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
+                f"(frames: {frames}; {self._finder.seen()}): pass `calibration=FILE`, or name the frames "
+                "with `topics_file=FILE.toml`"
+            )
+        if abs(found[2, 2]) > 0.7:
+            self.notes.append(
+                f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
+                "not, name the optical frame with `topics_file=FILE.toml`"
+            )
+        return found
+
+    def motion(self, use: EgoMotionUse, file: Path | None) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
+        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
+
+        Raises InputError if poses are required and not found.
+        """
+        if use == "static":
+            return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
+        if file is not None:
+            return read_ego_motion(file), "", ()
+        ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
+        topic = self._finder.pose_topic()
+        if topic is not None:
+            child = self._child_of(topic)
+            is_other = child not in ("", ego_frame)
+            child_from_ego = self._tree.between(child, ego_frame) if is_other else None
+            note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
+            motion, notes = motion_from_poses(self._bag, topic, child_from_ego)
+            return motion, topic, (*([note] if is_other and child_from_ego is None else ()), *notes)
+        path = self._moving_path(ego_frame)
+        if len(path) > 1:
+            changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
+            child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
+            motion, notes = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
+            return motion, changing[0], tuple(notes)
+        if use == "required":
+            raise InputError(
+                f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
+                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
+                "the vehicle stands, or `temporal=False` to run without history"
+            )
+        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
+
+    def _moving_path(self, ego_frame: str) -> list[str]:
+        """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
+        path = list(self._tree.up(ego_frame))
+        if self._stated.world_frame in path:
+            path = path[: path.index(self._stated.world_frame) + 1]
+        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
+        # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
+        path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
+        return path if len(path) == len(moving) + 1 else path[:1]

@@ -1,0 +1,75 @@
+"""T4 datasets of TIER IV, as Autoware uses them: nuScenes' tables with additions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevcli.sequences.format import Format
+from bevcli.sequences.options import FormatOptions, SequenceOptions
+
+if TYPE_CHECKING:
+    from bevcli.frame import Sequence
+
+TABLES = ("scene", "sample", "sample_data")  # any of them makes a folder a T4 dataset
+LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
+# The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
+VISIBILITIES = {"full": 1.0, "most": 0.75, "partial": 0.3, "none": 0.05}
+
+# Class names; docs/other-inputs.md says what is lost. Older datasets have the longer names. Names are compared without
+# case; others stay as they are, and are not scored.
+CLASS_OF_CATEGORY = {
+    "vehicle.car": "car",
+    "police_car": "car",
+    "vehicle.police": "car",
+    "vehicle.emergency (ambulance & police)": "car",
+    "ambulance": "truck",
+    "vehicle.ambulance": "truck",
+    "fire_truck": "truck",
+    "vehicle.fire": "truck",
+    "vehicle.truck": "truck",
+    "forklift": "construction_vehicle",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.bus": "bus",
+    "vehicle.bus (bendy & rigid)": "bus",
+    "vehicle.trailer": "trailer",
+    "semi_trailer": "trailer",
+    "motorbike": "motorcycle",
+    "vehicle.motorbike": "motorcycle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "construction_worker": "pedestrian",
+    "police_officer": "pedestrian",
+    "pedestrian.adult": "pedestrian",
+    "pedestrian.child": "pedestrian",
+    "pedestrian.construction_worker": "pedestrian",
+    "pedestrian.police_officer": "pedestrian",
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "movable_object.traffic_cone": "traffic_cone",
+}
+
+
+def open_t4(path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
+    """The keyframes of a T4 dataset.
+
+    The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
+    lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableSequence`.
+    """
+    from bevcli.sequences.files.class_names import ClassNames
+    from bevcli.sequences.nuscenes.format import NuScenesOptions
+    from bevcli.sequences.nuscenes.index import Dialect
+    from bevcli.sequences.nuscenes.sequence import TableSequence
+
+    names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+    dialect = Dialect(LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, bev_is_lidar=False)
+    return TableSequence(path, path / "annotation", common, dialect, NuScenesOptions())
+
+
+FORMAT = Format(
+    name="a T4 dataset",
+    expected="annotation/sample_data.json",
+    recognises=lambda path: any((path / "annotation" / f"{name}.json").exists() for name in TABLES),
+    opener=open_t4,
+    annotated=True,
+)

@@ -1,0 +1,1 @@
+"""The nuScenes devkit's scores of tracks, and plots of detection scores."""

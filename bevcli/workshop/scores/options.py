@@ -1,0 +1,16 @@
+"""The option of `bevcli eval` that scores tracks."""
+
+from bevcli.evaluation.scorers import Scorer
+from bevcli.options import option, options
+
+
+@options()
+class TrackingScoreOptions:
+    """Whether tracks are scored."""
+
+    tracking: bool = option(
+        default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
+    )
+
+
+SCORER = Scorer(TrackingScoreOptions, "bevcli.workshop.scores.tracking:score_tracks")

@@ -1,0 +1,256 @@
+"""Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from itertools import cycle
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon
+
+from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.evaluate import Scores
+from bevcli.evaluation.inputs import FramePairs
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.writing import whole_file
+
+# Colours of classes on a white background, in the order of the classes; the eleventh has the first again.
+_PLOT_COLORS = (
+    "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
+)  # fmt: skip
+GRID_COLOR = "#e6e6e6"
+BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
+_ERROR_TITLES = {
+    "trans_err": "translation error (m)",
+    "scale_err": "scale error (1 - IoU)",
+    "orient_err": "orientation error (rad)",
+    "vel_err": "velocity error (m/s)",
+    "attr_err": "attribute error (1 - accuracy)",
+}
+
+
+def write_plots(scores: Scores, folder: Path) -> list[Path]:
+    """Write the plots of scores as PNG files into a folder; return their paths. Raises OutputError."""
+    figures = {
+        "precision_recall.png": draw_precision_recall(scores.detection),
+        "errors_by_range.png": draw_errors_by_range(scores.detection),
+        "misses_and_false_alarms.png": draw_bev_sheet(scores.detection, scores.pairs),
+    }
+    return save_figures(figures, folder)
+
+
+def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -> Figure:
+    """A figure with a heading. It needs no screen and changes no global state of matplotlib."""
+    figure = Figure(figsize=size_inches, layout="constrained")
+    figure.suptitle(f"{title}\n", fontsize=15, fontweight="bold", x=0.01, ha="left")
+    figure.text(0.01, 0.955, subtitle, fontsize=10, color="#555555", ha="left", va="top")
+    return figure
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write figures, by file name, into a folder, made where it is missing; return their paths. Raises OutputError."""
+    for name, figure in figures.items():
+        with whole_file(folder / name, parents=True) as unfinished:
+            figure.savefig(unfinished, dpi=110)
+    return [folder / name for name in figures]
+
+
+def plot_colors(classes: Iterable[str]) -> dict[str, str]:
+    """A colour for each class, by its place among the classes."""
+    return dict(zip(classes, cycle(_PLOT_COLORS), strict=False))
+
+
+def draw_precision_recall(detection: DetectionScores) -> Figure:
+    """One panel a class, with one curve for each matching distance."""
+    table = detection.overall
+    subtitle = f"mAP {table.mean_ap:.3f}, one curve for each matching distance"
+    figure = titled_figure((15, 7), "Precision and recall by class", subtitle)
+    panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True, squeeze=False)
+    for axes, (name, scores) in zip(panels.flat, table.classes.items(), strict=False):
+        _draw_precision_recall(axes, name, scores)
+    if len(table.classes) % 2:
+        panels[-1, -1].set_axis_off()
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=len(labels), frameon=False, title="matching distance")
+    for axes in panels[-1]:
+        axes.set_xlabel("recall")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("precision")
+    return figure
+
+
+def draw_errors_by_range(detection: DetectionScores) -> Figure:
+    """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean."""
+    bins = {ends: table for ends, table in detection.by_range.items() if table.classes}
+    subtitle = "thick: mean of the classes; no point where nothing was found"
+    figure = titled_figure((15, 8.5), "AP and errors by range", subtitle)
+    panels = figure.subplots(2, 3, sharex=True)
+    middles = [sum(ends) / 2 for ends in bins]
+    for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
+        for name, color in plot_colors(detection.overall.classes).items():
+            values = [_value(table.classes.get(name), error) for table in bins.values()]
+            axes.plot(middles, values, color=color, linewidth=1, marker=".", label=name, alpha=0.8)
+        means = [table.mean_ap if error is None else table.errors[error] for table in bins.values()]
+        axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
+        axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
+        axes.set_ylim(bottom=0)
+        axes.set_xticks(sorted({end for ends in bins for end in ends}))
+        axes.grid(color=GRID_COLOR)
+    for axes in panels[-1]:
+        axes.set_xlabel("distance from the ego vehicle (m)")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False)
+    return figure
+
+
+def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
+    axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
+    for (distance, curve), color in zip(scores.curves.items(), BLUES, strict=False):
+        reached = curve.score > 0
+        axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
+    axes.set(xlim=(0, 1), ylim=(0, 1.02))
+    axes.grid(color=GRID_COLOR)
+    aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
+    text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
+    axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
+
+
+def _value(scores: ClassScores | None, error: str | None) -> float:
+    """AP (error None) or an error of a class in a bin; NaN without true positives."""
+    if scores is None or (error is not None and not scores.recall > 0):
+        return np.nan
+    return scores.mean_ap if error is None else scores.errors[error]
+
+
+WORST_FRAMES = 4
+MAX_DOTS = 1500
+# Colour and style of the outlines, in the order of `_Outcome`.
+_OUTLINES = {"found": ("#3a9a4b", "-"), "missed": ("#d62728", "-"), "false positive": ("#ff9d1e", "--")}
+
+
+class _Outcome(NamedTuple):
+    """One class above the score threshold with the largest F1: ground truth found and missed, and false positives."""
+
+    found: ScoredBoxes
+    missed: ScoredBoxes
+    false: ScoredBoxes
+
+
+def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
+    """Draw all missed ground truths and false positives as dots, and below them the frames with most, as boxes.
+
+    Each class is cut at the score with the largest F1 at the error distance: an application would keep these boxes. The
+    vehicle's forward direction is up.
+    """
+    config = detection.config
+    outcomes = {matches.name: _best_outcome(matches, config.error_row) for matches in detection.matches}
+    threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
+    subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
+    figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
+    grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
+    radius = _radius(detection)
+    missed = {name: outcome.missed for name, outcome in outcomes.items()}
+    false = {name: outcome.false for name, outcome in outcomes.items()}
+    for column, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
+        axes = figure.add_subplot(grid[0, column * WORST_FRAMES : (column + 1) * WORST_FRAMES])
+        _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
+    for column, frame in enumerate(_worst_frames(outcomes.values())):
+        _draw_frame(figure.add_subplot(grid[1, 2 * column : 2 * column + 2]), frame, outcomes.values(), pairs, radius)
+    heading = {"title": "class: missed / false positives", "title_fontsize": 9}
+    handles = _legend(missed, false)
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
+    return figure
+
+
+def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
+    """Cut a class at the score with the largest F1. row: index of the matching distance."""
+    is_match = matches.matched[row] >= 0
+    f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
+    kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
+    is_found = np.zeros(len(matches.ground_truth), dtype=bool)
+    is_found[matches.matched[row][kept & is_match]] = True
+    truth = matches.ground_truth
+    return _Outcome(truth[is_found], truth[~is_found], matches.predictions[kept & ~is_match])
+
+
+def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
+    colors = plot_colors(missed)
+    dots = [
+        Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
+        for name, part in missed.items()
+    ]
+    return dots + [Line2D([], [], color=color, label=label) for label, (color, _) in _OUTLINES.items()]
+
+
+def _radius(detection: DetectionScores) -> float:
+    """The radius that is drawn, metres: that of the farthest box, at most 100."""
+    ranges = [part.ranges_m for match in detection.matches for part in (match.ground_truth, match.predictions)]
+    farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
+    return min(10 * np.ceil(farthest / 10), 100.0)
+
+
+def _worst_frames(outcomes: Iterable[_Outcome]) -> list[int]:
+    mistakes = [part.frames for outcome in outcomes for part in (outcome.missed, outcome.false)]
+    counts = Counter(np.concatenate(mistakes).tolist())
+    return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
+
+
+def _draw_dots(
+    axes: Axes, title: str, parts: Mapping[str, ScoredBoxes], reference_from_ego: Array, radius: float
+) -> None:
+    centers_ego, colors, of_class = [np.zeros((0, 3))], [], plot_colors(parts)
+    for name, part in parts.items():
+        ego_from_reference = inverse(reference_from_ego)[part.frames]
+        turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
+        centers_ego.append(turned + ego_from_reference[:, :3, 3])
+        colors += [of_class[name]] * len(part)
+    points = _in_plot(np.concatenate(centers_ego))
+    # A random subset in random order, so that no class hides another.
+    shown = np.random.default_rng(0).permutation(len(points))[:MAX_DOTS]
+    x, y = points[shown].T
+    axes.scatter(x, y, s=16, c=[colors[index] for index in shown], alpha=0.8, linewidths=0, zorder=3)
+    _draw_ground(axes, radius)
+    thinned = f", {MAX_DOTS} shown" if len(points) > MAX_DOTS else ""
+    axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
+
+
+def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: FramePairs, radius: float) -> None:
+    ego_from_reference = inverse(pairs.reference_from_ego[frame])
+    counts = np.zeros(3, dtype=int)
+    for outcome in outcomes:
+        parts = [part[part.frames == frame] for part in outcome]
+        for part, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
+            _draw_boxes(axes, part, ego_from_reference, color, style)
+        counts += [len(part) for part in parts]
+    _draw_ground(axes, radius)
+    stamp = pairs.ground_truth[frame].stamp
+    scene = f"{stamp.scene} " if stamp.scene else ""
+    axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
+
+
+def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
+    outlines = [_in_plot(apply(ego_from_reference, corners[:4])) for corners in part.boxes.corners()]
+    closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
+    axes.add_collection(LineCollection(closed, colors=color, linestyles=style, linewidths=1.3, zorder=3))
+
+
+def _draw_ground(axes: Axes, radius: float) -> None:
+    """Range rings every 10 m, and the ego vehicle."""
+    for ring in np.arange(10, radius + 1, 10):
+        axes.add_patch(Circle((0, 0), ring, fill=False, color="#dddddd", linewidth=0.8, zorder=1))
+    ego = np.array([[3.8, 0.0, 0], [2.6, 0.95, 0], [-1.0, 0.95, 0], [-1.0, -0.95, 0], [2.6, -0.95, 0]])
+    axes.add_patch(Polygon(_in_plot(ego), color="#333333", zorder=4))
+    axes.set(xlim=(-radius, radius), ylim=(-radius, radius), aspect="equal")
+    axes.axis("off")
+
+
+def _in_plot(points_ego: Array) -> Array:
+    """Points (N, 3) in the ego frame -> (N, 2) in the plot: x of the ego frame is up, y is left."""
+    return np.stack([-points_ego[:, 1], points_ego[:, 0]], axis=-1)

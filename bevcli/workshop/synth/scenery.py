@@ -1,0 +1,259 @@
+"""Objects without annotations: houses, kerbs, trees, street furniture and traffic signals."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bevcli.geometry.transforms import Array
+from bevcli.workshop.synth.city import (
+    CORNER_M,
+    DIRECTIONS,
+    KERB_M,
+    Block,
+    CityPlan,
+    right_of,
+    rounded_rectangle,
+    side_of,
+)
+from bevcli.workshop.synth.looks import Looks
+from bevcli.workshop.synth.mesh import (
+    Color,
+    Finish,
+    Material,
+    Mesh,
+    TriangleSoup,
+    darker,
+    from_faces,
+    joined,
+    linear,
+    prism,
+)
+from bevcli.workshop.synth.street_objects import TREE_KINDS, StreetFurniture
+from bevcli.workshop.synth.traffic import Signals
+
+BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
+PLASTER: tuple[Color, ...] = (
+    (214, 202, 178), (198, 178, 142), (186, 192, 190), (222, 214, 204), (176, 150, 128), (164, 178, 162),
+    (206, 172, 144),
+)  # fmt: skip
+OFFICE: tuple[Color, ...] = ((120, 126, 132), (150, 152, 150), (90, 98, 106), (176, 172, 164))
+ROOF: Color = (104, 98, 94)
+
+
+@dataclass(frozen=True)
+class FacadeStyle:
+    """The look of a wall."""
+
+    wall: Color  # sRGB colour of the wall
+    floor_m: float  # height of a storey, metres
+    pitch_m: float  # distance between the middles of two windows, metres
+    window_m: tuple[float, float]  # width and height of a window, metres
+    shop_m: float  # height of the ground floor, metres; below 1 it is a plinth instead of a shop front
+    brick: float  # contrast of the brick pattern, 0 to 1; 0 is plaster
+    band: bool  # whether the windows of a storey form one horizontal band
+    seed: int  # seed of the random details, 0 to 4095
+
+
+def houses(city: CityPlan, land: Block) -> Iterator[TriangleSoup]:
+    """Row houses along the four sides of a block, with some gaps: of each house its walls, and the rest of it."""
+    rng = city.stream("houses", land.column, land.row)
+    (x0, y0), (x1, y1) = land.inside()
+    depth = min(14.0, (x1 - x0) / 2 - 2, (y1 - y0) / 2 - 2)
+    for low, high in ((y0, y0 + depth), (y1 - depth, y1)):
+        for a, b in _lots(rng, x0, x1):
+            yield from _house(city, rng, (a, low), (b, high))
+    for low, high in ((x0, x0 + depth), (x1 - depth, x1)):
+        for a, b in _lots(rng, y0 + depth + 0.5, y1 - depth - 0.5):
+            yield from _house(city, rng, (low, a), (high, b))
+
+
+def _lots(rng: np.random.Generator, start: float, end: float) -> list[tuple[float, float]]:
+    """Cut a side of a block into lots of 9 to 24 m, given by start and end. One lot in ten stays empty."""
+    lots, at = [], start
+    while at < end - 8:
+        to = min(at + rng.uniform(9, 24), end)
+        if end - to < 8:
+            to = end
+        if rng.random() > 0.1:
+            lots.append((at, to))
+        at = to
+    return lots
+
+
+def _style(rng: np.random.Generator, height: float) -> FacadeStyle:
+    seed = int(rng.integers(4096))
+    shop = 3.9 if rng.random() < 0.6 else 0.6
+    kind = rng.random()
+    if kind < 0.42:
+        wall, brick, band = BRICK[rng.integers(len(BRICK))], 0.9, False
+    elif kind < 0.78 or height < 12:
+        wall, brick, band = PLASTER[rng.integers(len(PLASTER))], 0.0, False
+    else:
+        wall, brick, band = OFFICE[rng.integers(len(OFFICE))], 0.0, True
+    pitch = rng.uniform(2.2, 3.4)
+    window = (min(rng.uniform(1.0, 1.7), pitch - 0.5), rng.uniform(1.4, 1.9))
+    return FacadeStyle(wall, rng.uniform(3.0, 3.5), pitch, window, shop, brick, band, seed)
+
+
+def _house(
+    city: CityPlan, rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]
+) -> list[TriangleSoup]:
+    """The walls and the rest of a house on a plan rectangle, with its four corners mapped to the world."""
+    storeys = int(rng.choice([2, 3, 4, 5, 6, 8, 11], p=[0.12, 0.22, 0.22, 0.18, 0.12, 0.09, 0.05]))
+    style = _style(rng, storeys * 3.2)
+    height = style.shop_m + storeys * style.floor_m + 0.9 + KERB_M
+    setback = rng.choice([0.0, 0.0, 0.6])
+    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])], dtype=np.float64)
+    corners += setback * np.sign(corners.mean(0) - corners)
+    ground = city.bend(corners)
+    walls, rows = zip(*(_wall(ground[k], ground[(k + 1) % 4], height, style) for k in range(4)), strict=True)
+    rest = [_roof(ground, height, style)]
+    if style.shop_m > 1:
+        rest += _awnings(rng, ground)
+    middle = ground.mean(0)
+    for _ in range(int(rng.integers(0, 3))):
+        at = middle + rng.uniform(-3, 3, 2)
+        square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
+        rest.append(prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
+    facade = np.repeat(np.arange(4), 2).astype(np.int32)
+    return [TriangleSoup.from_mesh(joined(walls), facade, np.stack(rows)), TriangleSoup.from_mesh(joined(rest))]
+
+
+def _wall(start: Array, end: Array, height: float, style: FacadeStyle) -> tuple[Mesh, NDArray[np.float32]]:
+    """Two triangles between two world points (2,), and the (16,) numbers that describe them to the shading kernel."""
+    length = float(np.hypot(*(end - start)))
+    tangent = (end - start) / length  # counter-clockwise around the house
+    a, b, top_a, top_b = (*start, 0.0), (*end, 0.0), (*start, height), (*end, height)
+    mesh = from_faces([[a, b, top_b], [a, top_b, top_a]], Finish(style.wall, Material.FACADE))
+    row = [
+        *start, *tangent, height, length, style.floor_m, style.pitch_m, *style.window_m, style.shop_m, style.brick,
+        float(style.band) + 2.0 * style.seed, *linear(style.wall),
+    ]  # fmt: skip
+    return mesh, np.array(row, np.float32)
+
+
+def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
+    """A flat slab that overhangs the walls by 0.25 m."""
+    middle = ground.mean(0)
+    wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
+    rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
+    return prism(rings, darker(style.wall, 0.8) if style.band else ROOF)
+
+
+def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
+    colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
+    for k in range(4):
+        start, end = ground[k], ground[(k + 1) % 4]
+        length = np.hypot(*(end - start))
+        if rng.random() > 0.4 or length < 9:
+            continue
+        way = (end - start) / length
+        out = np.array([way[1], -way[0]])
+        a = start + way * rng.uniform(1.0, length - 5.5)
+        b = a + way * 4.0
+        footprint = np.array([a, a + out * 1.3, b + out * 1.3, b])
+        rings = [np.column_stack([footprint, (h, e, e, h)]) for h, e in ((3.15, 2.65), (3.3, 2.72))]
+        yield prism(rings, colors[int(rng.integers(len(colors)))])
+
+
+def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
+    """The raised ground of a block over a plan outline (P, 2): kerb stones around a top with the material GROUND."""
+    ring = city.bend(outline)
+    middle = ring.mean(0)
+    following = np.roll(ring, -1, axis=0)
+    a, b, top_a, top_b = (
+        np.column_stack([points, np.full(len(ring), z)]) for z in (0.0, KERB_M) for points in (ring, following)
+    )
+    center = np.tile([*middle, KERB_M], (len(ring), 1))
+    sides = np.concatenate([np.stack([a, b, top_b], 1), np.stack([a, top_b, top_a], 1)])
+    faces = np.concatenate([sides, np.stack([top_a, top_b, center], 1)]).astype(np.float32)
+    material = np.r_[np.full(len(sides), Material.MATTE), np.full(len(ring), Material.GROUND)].astype(np.uint8)
+    return Mesh(faces, np.tile(linear((176, 174, 168)), (len(faces), 1)), material)
+
+
+SIGNALS_REACH_M = 110.0  # traffic signals are drawn within this distance
+
+
+class Scenery:
+    """The scenery of a city. Blocks are made when they are first needed, and kept."""
+
+    def __init__(self, city: CityPlan, furniture: StreetFurniture, looks: Looks | None = None) -> None:
+        self.city, self.furniture, self._looks = city, furniture, looks
+        self._block = lru_cache(maxsize=None)(self._make_block)
+
+    def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
+        """Meshes within `reach_m` metres of a world point (2,)."""
+        meshes = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
+        spheres = np.concatenate([mesh.mesh_spheres for mesh in meshes])
+        distances = np.hypot(*(spheres[:, :2] - np.asarray(center, dtype=np.float64)).T)
+        # Draw walls first, near ones before far ones: they hide most of the rest, which is then skipped.
+        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in meshes]])
+        return TriangleSoup.gather([meshes[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
+
+    def _make_block(self, column: int, row: int) -> list[TriangleSoup]:
+        land, use = self.city.block(column, row), self.city.landuse(column, row)
+        meshes = [TriangleSoup.from_mesh(kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M)))]
+        if use == "houses":
+            meshes += houses(self.city, land)
+        rng = self.city.stream("furniture", column, row)
+        if use == "park":
+            meshes += self._park(land, rng)
+        for side in range(4):
+            meshes += self._side(land, side, rng)
+        return meshes
+
+    def _park(self, land: Block, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+        low, high = land.inside(1.5)
+        count = int(np.prod(high - low) / 75)
+        for point in low + rng.random((count, 2)) * (high - low):
+            kinds = self.furniture.trees if rng.random() < 0.7 else self.furniture.bushes
+            yield self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3))
+
+    def _side(self, land: Block, side: int, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+        """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""
+        start, way, inward, length = side_of(land.low, land.high, side)
+        street = self.city.street(side % 2, (land.row, land.column + 1, land.row + 1, land.column)[side])
+        outward = self.city.heading(start, -inward)
+        at, lamp_next = CORNER_M + 3.0, bool(rng.random() < 0.5)
+        while at < length - CORNER_M - 3:
+            point = start + way * at + inward * 0.75
+            if lamp_next:
+                yield self._put(self.furniture.lamp, point, outward)
+            elif street.trees and rng.random() < 0.8:
+                kind = (street.index * 5 + side * 3 + int(rng.integers(3))) % TREE_KINDS
+                yield self._put(self.furniture.trees[kind], point, rng.uniform(0, 6.3))
+            elif rng.random() < 0.5:
+                sign = self.furniture.signs[int(rng.integers(6))]
+                yield self._put(sign, point, self.city.heading(point, -way))
+            if rng.random() < 0.3:
+                extra = self.furniture.small[int(rng.integers(3))]
+                yield self._put(extra, point + way * rng.uniform(1.5, 3), outward + np.pi)
+            lamp_next = not lamp_next if rng.random() < 0.6 else False
+            at += rng.uniform(6.5, 9.5)
+        if rng.random() < 0.25:
+            spot = start + way * length * rng.uniform(0.3, 0.7) + inward * 1.9
+            yield self._put(self.furniture.shelter, spot, outward)
+        if self._looks is not None:
+            for mesh, along, away in self._looks.clutter(length, land.column, land.row, side):
+                yield self._put(mesh, start + way * along + inward * away, outward + along)
+
+    def _put(self, template: TriangleSoup, point: Array, yaw: float) -> TriangleSoup:
+        x, y = self.city.bend(point)
+        return template.placed((float(x), float(y), KERB_M), yaw)
+
+    def signals_around(self, here: ArrayLike, signals: Signals, time_s: float) -> Iterator[TriangleSoup]:
+        """Traffic signals around a world point (2,), with their lights at a time in seconds.
+
+        Each junction has one signal for each approach, behind the junction on the right.
+        """
+        city = self.city
+        for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
+            street, cross = city.street_at(node, direction), city.street_at(node, direction + 1)
+            ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
+            spot = city.node_center(node) + ahead + right_of(direction) * (street.half_width + 0.9)
+            template = self.furniture.signals[signals.light(node, direction % 2, time_s)]
+            yield self._put(template, spot, city.heading(spot, -DIRECTIONS[direction]))

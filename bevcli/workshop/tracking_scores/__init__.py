@@ -1,1 +1,0 @@
-"""Tracking metrics of nuScenes: AMOTA and the numbers that come with it."""
