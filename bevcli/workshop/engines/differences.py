@@ -16,7 +16,9 @@ from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.workshop.engines.engine import load_exported
-from bevcli.workshop.engines.export_cache import CENTER, NEAR_M
+
+NEAR_M = 0.1
+CENTER = (0, 1, 4)  # columns of box codes
 
 
 @dataclass(frozen=True)
