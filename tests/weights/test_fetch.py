@@ -363,8 +363,8 @@ def test_every_name_of_the_package_has_a_model() -> None:
         assert weights.source.url.startswith("https://") or weights.source.page
 
 
-def test_the_readme_lists_the_names_of_the_package() -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text()
+def test_the_page_of_weights_lists_the_names_of_the_package() -> None:
+    text = (Path(__file__).parents[2] / "docs/weights.md").read_text()
     table = text.partition("| name | file | published")[2].partition("\n\n")[0]
     assert re.findall(r"^\| `([\w-]+)` \|", table, re.MULTILINE) == list(all_weights())
 
