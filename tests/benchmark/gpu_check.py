@@ -192,7 +192,7 @@ class Check:
         text = (
             f"{TRAINED_MODEL}: {found['updates']} updates, {found['updates a second']:.2f} a second after the first, "
             f"{found['frames a second']:.0f} frames learned a second; first update after {found['first_s']:.1f} s; "
-            f"last loss {found['loss']:.3g}."
+            f"{found['without data']:.1%} of the time without data; last loss {found['loss']:.3g}."
         )
         if not found["finite"]:
             raise CheckFailed(text)
@@ -420,6 +420,7 @@ def train(model: str, device: torch.device, seconds: float) -> dict[str, Any]:
         "updates a second": a_second,
         "frames a second": a_second * trainer.job.config.clips.batch,
         "first_s": ends[0] - began,
+        "without data": getattr(trainer, "waited_s", math.nan) / (ends[-1] - began),
         "loss": losses[-1],
         "finite": all(map(math.isfinite, losses)),
     }

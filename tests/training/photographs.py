@@ -157,7 +157,7 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
         def after_update(loss: float) -> None:
             updates[0] += 1
             if updates[0] in (1, 2, 3) or updates[0] % 100 == 0:
-                say(f"update {updates[0]}, loss {loss:.4g}, {left(end_s):.0f} s left")
+                say(f"update {updates[0]}, loss {loss:.4g}, waited {trainer.waited_s:.1f} s, {left(end_s):.0f} s left")
 
         def after_step() -> None:
             if time.perf_counter() > due[0][1]:

@@ -1,4 +1,4 @@
-"""A model file for a data set follows from its drives, and states the facts about them."""
+"""A model file for a data set follows from its drives, can be trained as it is, and states the cost."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, class_of_size
 from bevcli.model.config import BevFrameConfig
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.job import TrainingConfig, prepare_training
+from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.model_file import (
     PRESETS,
+    Cost,
     _toml,
+    fitting_batch,
     look_at,
     model_table,
     write_model_file,
 )
-from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.samples import ClipConfig
 
+CPU = torch.device("cpu")
 FRAME = BevFrameConfig()
 
 
@@ -44,10 +47,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_file_trains_as_it_is_and_states_facts(fleet: Path) -> None:
+def test_the_file_trains_as_it_is_and_states_facts_and_cost(fleet: Path) -> None:
     path = fleet / "my model.toml"
     data = DriveOptions(data=(fleet / "d000", fleet / "d001"), class_map={"bicycle": "Fahrrad"})
-    lines = write_model_file(path, data, "quick")
+    lines = write_model_file(path, data, "quick", CPU, longest_s=0.0)
     config, training = load_config(path), load_table(path, TRAINING, TrainingConfig)
     assert (config.name, config.classes, config.image.size) == ("my model", ("car", "Fahrrad"), (80, 45))
     assert (config.bev_grid.y_range_m, config.rate_hz, config.heads) == ((-21, 21), 2.0, ("detection",))
@@ -58,12 +61,10 @@ def test_the_file_trains_as_it_is_and_states_facts(fleet: Path) -> None:
     assert lines[1] == "Boxes in 6 frames: car 6, Fahrrad 6."
     assert "Fahrrad like car" in lines[2]  # the drive's bicycles are as long as cars
     assert config.object_classes["Fahrrad"].gate_m == NUSCENES_CLASSES["car"].gate_m
-    assert lines[-1].startswith("In this file a step is 6 updates of the weights, one for each frame of a batch: ")
-    job = prepare_training(str(path), torch.device("cpu"), data, TrainOptions(out=fleet / "out"))
-    assert (len(job.drives), len(job.held_out)) == (1, 1)
-    job.lock.close()
+    assert "s an update" in lines[-2]
+    assert "memory" in lines[-2]
     with pytest.raises(BevcliError, match="exists already"):
-        write_model_file(path, data, "quick")
+        write_model_file(path, data, "quick", CPU)
 
 
 def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
@@ -96,7 +97,7 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
         (DriveOptions(rendered=(1,)), "rendered drives are trained with demo"),
     ):
         with pytest.raises(InputError, match=message):
-            write_model_file(tmp_path / "new.toml", data, "quick")
+            write_model_file(tmp_path / "new.toml", data, "quick", CPU)
     drive = ("--data", fleet / "d000")
     for arguments, message in (
         (("--init", "a.toml", "--steps", "3"), "--init trains nothing"),
@@ -106,6 +107,20 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
         done = command(tmp_path, "train", *arguments, *drive)
         assert (done.returncode, message in done.stderr, len(done.stderr.splitlines())) == (1, True, 1), done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_step_costs_its_updates_or_the_reading_of_its_batches() -> None:
+    config = TrainingConfig(steps=10, clips=ClipConfig(frames=4, learn="all", in_turn=2))
+    assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0
+    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 12.0
+
+
+def test_a_batch_fills_the_card_but_never_shrinks() -> None:
+    gigabytes = 10**9
+    assert fitting_batch(4, 7 * gigabytes, 20 * gigabytes, 32) == 8
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 32) == 32
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 3) == 4
+    assert fitting_batch(1, 7 * gigabytes, 8 * gigabytes, 32) == 1
 
 
 def test_a_class_is_like_that_of_the_nearest_size() -> None:

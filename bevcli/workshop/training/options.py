@@ -67,7 +67,7 @@ class ModelFileOptions:
     init: Path | None = option(
         default=None,
         help="Do not train: write a model file for the drives, with their classes, cameras, frame rate, image size and "
-        "BEV range.",
+        "BEV range, and with the time and memory of a training on this machine.",
         metavar="FILE.toml",
     )
     preset: Preset | None = option(

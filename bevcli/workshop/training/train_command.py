@@ -51,7 +51,8 @@ def train(
     if file_options.init is not None:
         if model or options != TrainOptions():
             raise InputError("`init` trains nothing: remove the model and the options of a training")
-        say(*write_model_file(file_options.init, drives, file_options.preset or "quick"))
+        device = choose_device(model_options.device)
+        say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
         return
     if file_options.preset is not None:
         raise InputError("`preset` is for `init`: remove it")

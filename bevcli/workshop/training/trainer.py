@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -170,6 +171,7 @@ class Trainer:
         optimizer: of their parameters.
         done: the number of steps done.
         maker: makes the batches.
+        waited_s: time for which the training had to wait for batches, seconds.
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
@@ -182,7 +184,7 @@ class Trainer:
         self._average: dict[str, Tensor] | None = None
         if job.config.optimizer.average > 0:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
-        self.done = 0
+        self.done, self.waited_s = 0, 0.0
         if resume:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
@@ -224,7 +226,7 @@ class Trainer:
         with contextlib.closing(loaded) as batches, rounded_products(gpu):
             stopped = False
             while self.done < config.steps and not stopped:
-                row = self._step(islice(batches, config.clips.in_turn), after_update)
+                row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
                 trim_memory()
                 self.done += 1
                 last, stopped = self.done == config.steps, stop()
@@ -240,6 +242,16 @@ class Trainer:
     def _save_checkpoint(self) -> None:
         path = self.job.out / CHECKPOINT
         files.save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
+
+    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """The same batches, with the time spent waiting for them added to `waited_s`."""
+        for _ in repeat(None):
+            begun = time.perf_counter()
+            batch = next(batches, None)
+            self.waited_s += time.perf_counter() - begun
+            if batch is None:
+                return
+            yield batch
 
     def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
         """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
