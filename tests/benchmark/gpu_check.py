@@ -33,6 +33,7 @@ from bevcli._version import __version__
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import choose_device
+from bevcli.inference.machine import describe_machine
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.transfer import image_uploader
@@ -42,7 +43,7 @@ from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.workshop.benchmark.measure import describe_machine, time_runs
+from bevcli.workshop.benchmark.measure import time_runs
 from bevcli.workshop.benchmark.versions import QueryResults, Version, difference, largest_differences, textbook_version
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import prepare_training

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from bevcli.errors import BevcliError
 from bevcli.inference.load import Model, installed_engines
+from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
 from bevcli.model.config import ModelConfig
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.workshop.benchmark.measure import WARM_UP_FRAMES, describe_machine
+from bevcli.workshop.benchmark.measure import WARM_UP_FRAMES
 from bevcli.workshop.benchmark.versions import Version, difference, largest_differences
 from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
 

@@ -1,8 +1,6 @@
 """The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
 import contextlib
-import platform
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -18,6 +16,7 @@ import torch
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
+from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.prepare import DTYPES, Precision
@@ -293,27 +292,6 @@ def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
     gemm_s = _best_seconds(lambda: torch.mm(matrix, matrix, out=product), device)
     copy_s = _best_seconds(lambda: target.copy_(source), device)
     return MachineLimits(2 * edge**3 / gemm_s / 1e9, 2 * 4 * COPIED_FLOATS / copy_s / 1e9)
-
-
-def describe_machine(device: torch.device) -> str:
-    """Name of the processor or GPU, number of threads and PyTorch's version."""
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text().splitlines() if cpu.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-
-
-def peak_memory(device: torch.device) -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
