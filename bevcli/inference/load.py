@@ -269,10 +269,12 @@ def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherw
 
     otherwise: ends the message of the WeightsError where there are none.
     """
-    bundled, named = bundled_weights(name), all_weights(options.weights_dir).get(name)
-    here = bundled or (None if named is None else named.here)
-    if here is not None:
-        return here
+    bundled = bundled_weights(name)
+    if bundled is not None:
+        return bundled
+    named = all_weights(options.weights_dir).get(name)
+    if named is not None and named.here is not None:
+        return named.here
     if named is None:
         how = "pass `weights=FILE` (the official .pth or a .safetensors)"
     elif named.file is None:
