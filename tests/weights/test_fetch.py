@@ -16,6 +16,7 @@ import torch
 from command_line import MINI_TOML, command
 from file_server import serving
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
@@ -394,3 +395,11 @@ def test_broken_hashes_are_told(server, model, tmp_path):
     (tmp_path / "weights/hashes.json").write_text("[1]")
     with pytest.raises(BevcliError, match=r"hashes\.json: broken .*: remove it"):
         fetch_weights(named_weights("own"))
+
+
+def test_convert_overwrites_a_file_only_with_force(tmp_path):
+    target = tmp_path / "weights.safetensors"
+    target.touch()
+    done = command(tmp_path, "weights", "convert", bundled_weights("demo"), target)
+    assert (done.returncode, target.stat().st_size) == (1, 0)
+    assert done.stderr.endswith("already exists; choose another name, or pass --force to overwrite it\n")
