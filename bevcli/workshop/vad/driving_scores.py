@@ -39,11 +39,7 @@ TURN_M = 2.0  # a path that ends further to a side is one to the right or left, 
 LATE_S = 0.1  # a frame this near counts as one at the time of a step
 
 
-<<<<<<< HEAD
 class FramesByTime:
-=======
-class TrueFrames:
->>>>>>> model
     """The frames of a ground truth by scene and time, with boxes in the world frame."""
 
     def __init__(self, truth: Iterable[FrameBoxes]) -> None:
@@ -63,11 +59,7 @@ class TrueFrames:
 
 
 def with_true_futures(
-<<<<<<< HEAD
     boxes: Boxes3D, stamp: FrameStamp, drives: FramesByTime, times_s: Sequence[float] | Array
-=======
-    boxes: Boxes3D, stamp: FrameStamp, drives: TrueFrames, times_s: Sequence[float] | Array
->>>>>>> model
 ) -> Boxes3D:
     """Boxes in the world frame with one future each: NaN from the first step on in which the object is not there.
 
@@ -164,11 +156,7 @@ def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> Drivin
     return DrivingScores(lines, motion, plan, notes)
 
 
-<<<<<<< HEAD
 def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> FramesByTime:
-=======
-def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> TrueFrames:
->>>>>>> model
     """The drives of the ground truth, which an option needs in the world frame."""
     if pairs.frame_of_reference != "world":
         raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
@@ -177,11 +165,7 @@ def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> TrueFrames:
             "forecasts and paths need ground truth in the world frame "
             f"(found the {truth.boxes.frame_of_reference} frame)"
         )
-<<<<<<< HEAD
     return FramesByTime(truth.boxes.frames)
-=======
-    return TrueFrames(truth.boxes.frames)
->>>>>>> model
 
 
 def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
