@@ -87,7 +87,7 @@ def _write_views(recording: Path, read_from: Path, options: ViewOptions) -> None
     from bevcli.viewer.video import frame_rate, write_video
 
     if options.summary:
-        say(summarise(recording, read_from).text())
+        say(summarise(recording, read_from))
     if options.screenshot is not None:
         views = take_screenshot(read_from, options.screenshot, options.frame)
         say(f"{options.screenshot}: {len(views)} views")

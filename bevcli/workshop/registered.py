@@ -54,8 +54,8 @@ OWN: dict[Group, dict[str, str]] = {
         "kitti-raw": "bevcli.workshop.formats.cuboids:TRACKLETS",
     },
     "bevcli.scores": {
-        "tracking": "bevcli.workshop.scores.options:SCORER",
-        "vad": "bevcli.workshop.vad.score_options:SCORER",
+        "tracking": "bevcli.workshop.scores:SCORER",
+        "vad": "bevcli.workshop.vad:SCORER",
     },
     "bevcli.plots": {
         "scores": "bevcli.workshop.scores.plots:write_plots",

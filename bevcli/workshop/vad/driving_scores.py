@@ -21,6 +21,7 @@ from bevcli.printing import aligned, counted
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes.format import is_nuscenes_root
+from bevcli.workshop.vad import DrivingScoreOptions
 from bevcli.workshop.vad.driving_metrics import (
     THRESHOLDS_M,
     LineScores,
@@ -33,7 +34,6 @@ from bevcli.workshop.vad.driving_metrics import (
 )
 from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
 from bevcli.workshop.vad.plan import Plan, read_plans
-from bevcli.workshop.vad.score_options import DrivingScoreOptions
 
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
 LATE_S = 0.1  # a frame this near counts as one at the time of a step
