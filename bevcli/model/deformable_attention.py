@@ -103,8 +103,10 @@ class DeformableAttention(nn.Module):
         """
         batch, queries, _ = query.shape
         locations, weights = self.sampling_points(query, reference_points, level_shapes)
-        sampled = self.sample(tokens, level_shapes, locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch)
-        return self.output_projection(sampled.unflatten(0, (batch, queries)))
+        samples = locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch
+        sampled = self.sampling(self.values(tokens), level_shapes, *samples)
+        attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
+        return attended
 
     def sampling_points(
         self, query: Tensor, reference_points: Tensor, level_shapes: LevelShapes
@@ -112,18 +114,6 @@ class DeformableAttention(nn.Module):
         """Locations (B, Q, heads, L, P, 2) and weights (B, Q, heads, L, P) of `attend`."""
         offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
         return self.locations(reference_points[:, :, None, None, None], offsets, level_shapes), self.weights(logits)
-
-    def sample(
-        self,
-        tokens: Tensor,
-        level_shapes: LevelShapes,
-        locations: Tensor,
-        weights: Tensor,
-        queries_per_map: Sequence[int],
-    ) -> Tensor:
-        """Projects tokens (G, S, C) to values and samples them; see `GridSampling`. Returns (M, C) float32."""
-        sampled: Tensor = self.sampling(self.values(tokens), level_shapes, locations, weights, queries_per_map)
-        return sampled
 
     def values(self, tokens: Tensor) -> Tensor:
         """The values (G, S, heads, C / heads) of tokens (G, S, C)."""

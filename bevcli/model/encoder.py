@@ -165,7 +165,8 @@ class TemporalSelfAttention(nn.Module):
         locations = locations.movedim(3, 1).flatten(0, 2)
         weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
         queries_per_map = [2 * cells // maps] * (maps * batch)
-        sampled = self.attention.sample(tokens, self.level_shapes, locations, weights, queries_per_map)
+        values = self.attention.values(tokens)
+        sampled = self.attention.sampling(values, self.level_shapes, locations, weights, queries_per_map)
         return self.mean(sampled.unflatten(0, (batch, 2, cells)))
 
     def mean(self, sampled: Tensor) -> Tensor:
@@ -205,7 +206,9 @@ class SpatialCrossAttention(nn.Module):
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.weights(logits)))
         locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
-        return self.attention.sample(tokens, level_shapes, locations, weights, hits.hits_per_camera)
+        values = self.attention.values(tokens)
+        sampled: Tensor = self.attention.sampling(values, level_shapes, locations, weights, hits.hits_per_camera)
+        return sampled
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:
