@@ -45,12 +45,12 @@ OWN: dict[Group, dict[str, str]] = {
         "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
     },
     "bevcli.commands": {
-        "eval": "bevcli.cli.eval:evaluate",
-        "export": "bevcli.cli.export:export",
-        "project-debug": "bevcli.cli.project_debug:project_debug",
+        "eval": "bevcli.cli.commands:evaluate",
+        "export": "bevcli.cli.commands:export",
+        "project-debug": "bevcli.cli.commands:project_debug",
         "run": "bevcli.cli.run:run",
-        "samples": "bevcli.cli.samples:samples",
-        "viz": "bevcli.cli.viz:viz",
+        "samples": "bevcli.cli.commands:samples",
+        "viz": "bevcli.cli.commands:viz",
         "weights": "bevcli.cli.weights:weights_app",
     },
 }

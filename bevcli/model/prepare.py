@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
 from bevcli.model.calibration_embedding import CalibrationEmbedding
-from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
@@ -23,7 +22,6 @@ from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton, in_place_of
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.cuda_layers import AttentionByProducts, FusedBottleneck, MapOnDevice, TokensInOnePass
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.kernels.padded_pillars import PaddedPillars
 from bevcli.model.network import Network
@@ -67,10 +65,14 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     for name, module in network.named_modules():
         if isinstance(module, KeptPaddedPillars):
             module.points_on_cpu, module.sizes = points_on_cpu[name], {}
-        if isinstance(module, FusedBottleneck):
-            module.fuse()
-        if isinstance(module, MapOnDevice):
-            module.config, module.grid = network.config.segmentation, network.config.bev_grid
+    if device.type == "cuda":
+        from bevcli.model.kernels.cuda_layers import FusedBottleneck, MapOnDevice
+
+        for module in network.modules():
+            if isinstance(module, FusedBottleneck):
+                module.fuse()
+            if isinstance(module, MapOnDevice):
+                module.config, module.grid = network.config.segmentation, network.config.bev_grid
     dtype = DTYPES[precision]
     if isinstance(network, Network):
         network.backbone.to(dtype)
@@ -80,6 +82,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     round_attentions(network, dtype, temporal=rounds, queries=rounds or (precision != "fp32" and device.type == "cuda"))
     _check_finite(network)
     if device.type == "cuda":
+        from bevcli.model.cuda_graph import Captured
+
         for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
@@ -104,6 +108,8 @@ def faster_kinds(device: torch.device) -> dict[type[nn.Module], type[nn.Module]]
         CalibrationEmbedding: KeptCalibrationEmbedding,
     }
     if device.type == "cuda":
+        from bevcli.model.kernels.cuda_layers import AttentionByProducts, FusedBottleneck, MapOnDevice, TokensInOnePass
+
         kinds |= {ImageTokens: TokensInOnePass, MaskDecoderLayer: AttentionByProducts, SegmentationHead: MapOnDevice}
         kinds |= {Bottleneck: FusedBottleneck} if torch.version.hip is None else {}  # cuDNN is NVIDIA's
     if has_triton(device):

@@ -1,13 +1,11 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,9 +25,6 @@ from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.writing import whole_file, write_whole
-
-if TYPE_CHECKING:
-    from bevcli.evaluation.submission import SubmissionWriter
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
@@ -73,7 +68,7 @@ class RunFiles:
         self._sequence, self._model, self._options, self._live = sequence, model, options, live
         self._stack = contextlib.ExitStack()
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
-        self._submission: SubmissionWriter | None = None  # of nuScenes drives
+        self._submission: Any = None  # a `SubmissionWriter`, for a drive of nuScenes
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
@@ -83,7 +78,7 @@ class RunFiles:
         if resume is not None:
             self._check_files(resume)
 
-    def __enter__(self) -> RunFiles:
+    def __enter__(self) -> "RunFiles":
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
@@ -108,7 +103,7 @@ class RunFiles:
                 facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
                 self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
             if resume is not None and SUBMISSION in resume.sizes:
-                self._submission = self._open_submission()
+                self._open_submission()
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
@@ -141,7 +136,8 @@ class RunFiles:
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
             self._tracks.write(tracked, self._reference)
         if frame.sample_token is not None:
-            self._submission = self._submission or self._open_submission()
+            if self._submission is None:
+                self._open_submission()
             self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
@@ -192,10 +188,10 @@ class RunFiles:
         self._files[name] = self._stack.enter_context(file)
         return file
 
-    def _open_submission(self) -> SubmissionWriter:
+    def _open_submission(self) -> None:
         from bevcli.evaluation.submission import SubmissionWriter
 
-        return self._open(SUBMISSION, SubmissionWriter)
+        self._submission = self._open(SUBMISSION, SubmissionWriter)
 
     def _check_that_files_exist(self) -> None:
         if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):

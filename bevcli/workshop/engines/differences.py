@@ -10,13 +10,12 @@ from torch import Tensor
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import paired_steps
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.workshop.engines.engine import load_exported
-from bevcli.workshop.engines.export_cache import CENTER, NEAR_M
+from bevcli.workshop.engines.export_cache import CENTER, NEAR_M, paired_steps
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ The files lie in $XDG_CACHE_HOME/bevcli/engines (default ~/.cache/bevcli/engines
 so that several processes may make it at the same time. Files that nobody has used for some months are removed.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -13,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import torch
@@ -24,17 +25,18 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model, Report
-from bevcli.inference.preprocess import Preprocessor, calibration_images
-from bevcli.inference.runner import paired_steps
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence, select_range
 from bevcli.user_folders import user_cache
-from bevcli.workshop.engines.export_onnx import export_onnx, quantize
+from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.exported import ExportedModel
 from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import whole_file, write_whole
@@ -327,3 +329,23 @@ def _cameras_per_cell(frame: PreparedFrame, model: Model) -> int:
     height, width = frame.images.shape[-2:]
     hit = Pillars(model.config.bev_grid).project(frame.image_from_bev.float(), (height, width), everywhere).hit
     return max(int(hit.sum(1).max()), OnnxOptions.cameras_per_cell)
+
+
+def paired_steps(
+    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
+) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
+    """Step two versions of a model on the CPU over the same frames, each with its own history.
+
+    Yields each frame that has an image, and the outputs of both.
+    """
+    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
+    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
+    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
+    with contextlib.ExitStack() as hooks:
+        for runner in runners:
+            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
+            hooks.enter_context(hook)
+        for prepared in frames:
+            if prepared.frame.images:
+                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
+                yield prepared, outputs[runners[0]], outputs[runners[1]]
