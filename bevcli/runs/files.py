@@ -11,7 +11,7 @@ import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import OutputError
-from bevcli.evaluation.box_format import CsvWriter
+from bevcli.evaluation.box_format import CsvWriter, SubmissionWriter
 from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
@@ -68,7 +68,7 @@ class RunFiles:
         self._sequence, self._model, self._options, self._live = sequence, model, options, live
         self._stack = contextlib.ExitStack()
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
-        self._submission: Any = None  # a `SubmissionWriter`, for a drive of nuScenes
+        self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
@@ -103,7 +103,7 @@ class RunFiles:
                 facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
                 self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
             if resume is not None and SUBMISSION in resume.sizes:
-                self._open_submission()
+                self._submission = self._open(SUBMISSION, SubmissionWriter)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
@@ -136,8 +136,7 @@ class RunFiles:
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
             self._tracks.write(tracked, self._reference)
         if frame.sample_token is not None:
-            if self._submission is None:
-                self._open_submission()
+            self._submission = self._submission or self._open(SUBMISSION, SubmissionWriter)
             self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
@@ -187,11 +186,6 @@ class RunFiles:
         file = write(self._out / name, resume_at=resume_at, **how)
         self._files[name] = self._stack.enter_context(file)
         return file
-
-    def _open_submission(self) -> None:
-        from bevcli.evaluation.submission import SubmissionWriter
-
-        self._submission = self._open(SUBMISSION, SubmissionWriter)
 
     def _check_that_files_exist(self) -> None:
         if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
