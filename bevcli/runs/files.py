@@ -13,8 +13,7 @@ import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import OutputError
-from bevcli.evaluation.box_format import CsvWriter
-from bevcli.evaluation.submission import SubmissionWriter
+from bevcli.evaluation.box_format import CsvWriter, SubmissionWriter
 from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
