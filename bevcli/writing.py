@@ -120,9 +120,3 @@ def check_output(path: Path, *inputs: Path) -> None:
     """Raises OutputError where a file to be written is one that the command reads."""
     if path.exists() and any(each.exists() and path.samefile(each) for each in inputs):
         raise OutputError(f"{path}: is the input (expected another file to write)")
-
-
-def check_new(path: Path, *, force: bool) -> None:
-    """Raises OutputError where a file to be written exists and `force` is false."""
-    if path.exists() and not force:
-        raise OutputError(f"{path}: already exists; choose another name, or pass `force=True` to overwrite it")

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, TextIO
 
@@ -16,7 +16,6 @@ from bevcli.printing import duration, one_line, say
 if TYPE_CHECKING:
     import rich.progress
 
-    from bevcli.frame import Sequence
     from bevcli.inference.load import Model
     from bevcli.published import DownloadReport, NamedWeights
     from bevcli.weights.fetch import FetchedWeights
@@ -116,36 +115,6 @@ def _bar(stream: TextIO) -> "rich.progress.Progress":
         console=Console(file=stream),
         redirect_stdout=False,  # a command's results may be piped
     )
-
-
-@contextmanager
-def engine_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Shows the steps of exports to another engine: how many are done, of how many, and what is done now.
-
-    A bar starts with the first step of an export, because there may be none.
-    """
-    once = "once for these weights, number of cameras and image size"
-    bar: Progress | None = None
-    said = ""
-
-    def show(done: int, total: int, what: str) -> None:
-        nonlocal bar, said
-        if bar is None or done < bar.done:
-            shown.close()
-            bar = shown.enter_context(Progress(total, "steps", [f"{what}, {once}"]))
-        elif what != said and done < total:
-            bar.message(f"note: {what}")
-        said = what
-        bar.reach(done)
-
-    with ExitStack() as shown:
-        yield show
-
-
-def in_engine_with_bar(model: "Model", drive: "Sequence", parts: str = "") -> "Model":
-    """The model in the engine that the options choose, see `Model.in_engine`."""
-    with engine_bar() as show:
-        return model.in_engine(drive.rig, drive, parts=parts, report=show)
 
 
 @contextmanager

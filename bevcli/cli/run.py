@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import ExtensionsOf, FormatValues, InputDrive, Steps, as_flags
+from bevcli.cli.bridge import ExtensionsOf, FormatValues, InputDrive, Steps, as_flags, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
@@ -43,7 +43,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
+        from bevcli.cli.progress import Progress, load_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.runs.run_into_folder import run_into_folder
@@ -57,7 +57,7 @@ def run(
     for step in first:
         drive = step(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
-    loaded = in_engine_with_bar(loaded, drive, "`probes`" if recording.probes else "")
+    loaded = loaded.in_engine(drive.rig, drive, parts="`probes`" if recording.probes else "", report=print_note)
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:

@@ -124,9 +124,10 @@ def convert(
     It must fit one of our models.
     """
     from bevcli.checkpoints import convert as convert_file
-    from bevcli.writing import check_new
+    from bevcli.errors import OutputError
 
-    check_new(destination, force=force)
+    if destination.exists() and not force:
+        raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")
     say(_as_text(convert_file(source, destination)))
 
 

@@ -33,11 +33,6 @@ from bevcli.registry import entries, load
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
-Report = Callable[[int, int, str], None]  # steps done, steps in all, what is done
-
-
-def _no_report(done: int, total: int | None, what: str) -> None:
-    pass
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class Model:
         facts: metadata in the weights file.
         file: the exported file that another engine runs; None for PyTorch, and before `in_engine` has made it.
         calibrate_with: drive whose first frames calibrate INT8; None for the drive that is run.
-        engine_note: the differences of that file from PyTorch; "" for other models.
+        engine_note: engine, precision and file of an exported model; "" for other models.
     """
 
     network: TemporalModel
@@ -134,18 +129,23 @@ class Model:
         return hash_of(self.network.state_dict().items())
 
     def in_engine(
-        self, rig: CameraRig, drive: Sequence | None = None, *, parts: str = "", report: Report = _no_report
+        self,
+        rig: CameraRig,
+        drive: Sequence | None = None,
+        *,
+        parts: str = "",
+        report: Callable[[str], None] = lambda note: None,
     ) -> "Model":
         """The model in the engine that it was loaded for; one in PyTorch or an exported one is returned as it is.
 
-        The first call exports the model for the number of cameras and the image size of the rig, calibrates INT8 on the
-        first frames of a drive, and compares the boxes with those in PyTorch. The file is kept in the user's cache.
+        The first call exports the model for the number of cameras and the image size of the rig, and calibrates INT8 on
+        the first frames of a drive. The file is kept in the user's cache.
 
         Args:
             rig: that it is to run on.
-            drive: whose first frames are used; None where there are no frames yet.
+            drive: whose first frames calibrate INT8; None where there are no frames yet.
             parts: what looks into the network, such as "`probes`", which only PyTorch has.
-            report: called before the first step of the work, and after each.
+            report: called with a note before work that takes some time.
 
         Raises:
             BevcliError: `parts` are asked for in another engine, or the engine is not installed.
@@ -191,7 +191,7 @@ def load_model(
     weights: str | Path | None = None,
     options: ModelOptions | None = None,
     *,
-    report: DownloadReport = _no_report,
+    report: DownloadReport = lambda done, total, what: None,
     **changes: Any,
 ) -> Model:
     """Load a model and its weights.
@@ -261,7 +261,7 @@ def weights_file(path_or_name: Path) -> Path:
         return path_or_name
     if name not in known_models():
         named_weights(name)  # raises WeightsError that lists the names
-    return _weights_of(name, ModelOptions(), _no_report)
+    return _weights_of(name, ModelOptions(), lambda done, total, what: None)
 
 
 def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherwise: str = "") -> Path:
@@ -269,10 +269,12 @@ def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherw
 
     otherwise: ends the message of the WeightsError where there are none.
     """
-    bundled, named = bundled_weights(name), all_weights(options.weights_dir).get(name)
-    here = bundled or (None if named is None else named.here)
-    if here is not None:
-        return here
+    bundled = bundled_weights(name)
+    if bundled is not None:
+        return bundled
+    named = all_weights(options.weights_dir).get(name)
+    if named is not None and named.here is not None:
+        return named.here
     if named is None:
         how = "pass `weights=FILE` (the official .pth or a .safetensors)"
     elif named.file is None:

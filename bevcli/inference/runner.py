@@ -22,7 +22,6 @@ from bevcli.inference.tracking import TrackerConfig, TrackerState, track, withou
 from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.network import Network
-from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import read_json
@@ -55,8 +54,6 @@ class StepOptions:
     """Options of a step.
 
     Attributes:
-        precision: of a plain model, by autocast; with "fp32", as for a prepared model, whose parts have precisions of
-            their own, autocast around the runner has no effect.
         temporal: whether history is used.
         ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
@@ -64,7 +61,6 @@ class StepOptions:
         tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
     """
 
-    precision: Precision = "fp32"
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
@@ -107,8 +103,8 @@ class Runner:
             state = self._restarted(state)
         if not frame.images:
             return state, self._prediction(prepared, started_anew, skipped=True)
-        probe, precision = self._probe(), self.options.precision
-        autocast = torch.autocast(self.device.type, DTYPES[precision], enabled=precision != "fp32")
+        probe = self._probe()
+        autocast = torch.autocast(self.device.type, enabled=False)  # the parts of a model have precisions of their own
         with torch.inference_mode(), self.clock:
             with autocast, probe or contextlib.nullcontext():
                 later = self._usable(prepared, upcoming)

@@ -82,14 +82,17 @@ def fetch_weights(
     partial = weights.file.with_name(PARTIAL + weights.file.name)
     with output_errors(weights.file.parent):
         weights.file.parent.mkdir(parents=True, exist_ok=True)
-    url, what = weights.source.url, f"{weights.name}: {weights.source.url}"
-    _download(url, partial, weights.source.bytes, lambda done, total: report(done, total, what))
+    _require_space(partial.parent, (weights.source.bytes or 0) - (partial.stat().st_size if partial.exists() else 0))
+    with output_errors(partial), partial.open("ab") as file:
+        if not lock(file.fileno()):
+            raise WeightsError(f"{partial}: another process is downloading it: wait for it, then try again")
+        _Download(weights, file, report).run()
     try:
         fetched = _check(weights, partial)
     except BevcliError as error:
         _remove(partial)
         reason = str(error).replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
-        raise WeightsError(f"{url}: refused, and deleted: {reason}") from None
+        raise WeightsError(f"{weights.source.url}: refused, and deleted: {reason}") from None
     weights.store_hash(fetched.known)
     os.replace(partial, weights.file)
     _remove(partial)
@@ -140,27 +143,7 @@ class _Failed(Exception):
     """Another attempt may help."""
 
 
-def _download(url: str, path: Path, expected_bytes: int | None, report: Callable[[int, int | None], None]) -> None:
-    """Download a file. What an earlier call left is kept, if the server says that the file is still the same.
-
-    Args:
-        url: http:// or https://. From https, redirects lead to https only.
-        path: where to write. After an error it holds the part that has come, and PATH.json what tells its version.
-        expected_bytes: size of the file, if it is known: a larger one at the server ends the download at once.
-        report: called with the bytes that are there, and with the size of the file or None.
-
-    Raises:
-        WeightsError: the server cannot be reached, refuses, has a file of another size, or broke off too often.
-        OutputError: the disk has too little space, or the file cannot be written.
-    """
-    require_space(path.parent, (expected_bytes or 0) - (path.stat().st_size if path.exists() else 0))
-    with output_errors(path), path.open("ab") as file:
-        if not lock(file.fileno()):
-            raise WeightsError(f"{path}: another process is downloading it: wait for it, then try again")
-        _Download(url, file, expected_bytes, report).run()
-
-
-def require_space(folder: Path, wanted: int) -> None:
+def _require_space(folder: Path, wanted: int) -> None:
     """Raise OutputError where a disk has too little space. wanted: bytes."""
     free = shutil.disk_usage(folder).free - SPARE_BYTES
     if wanted > free:
@@ -171,12 +154,15 @@ def require_space(folder: Path, wanted: int) -> None:
 
 
 class _Download:
-    """A download of several attempts."""
+    """A download of several attempts. From https, redirects lead to https only.
 
-    def __init__(
-        self, url: str, file: BinaryIO, expected_bytes: int | None, report: Callable[[int, int | None], None]
-    ) -> None:
-        self.url, self.file, self.expected_bytes, self.report = url, file, expected_bytes, report
+    The file keeps what has come, also after an error, and a file beside it states its version: the next download goes
+    on from there if the server says that the file is still the same.
+    """
+
+    def __init__(self, weights: NamedWeights, file: BinaryIO, report: DownloadReport) -> None:
+        self.file, self.report, self.name = file, report, weights.name
+        self.url, self.expected_bytes = weights.source.url, weights.source.bytes
         self.done = file.seek(0, os.SEEK_END)  # bytes that have come
         self.total: int | None = None  # of the file, as the server states it
         self._notes = Path(f"{file.name}.json")
@@ -290,22 +276,22 @@ class _Download:
             self._most = self.expected_bytes or MOST_BYTES
             self.total = int(length) if length.isdecimal() and len(length) < 16 else None
             self._limit(self.total or 0)
-            require_space(self._notes.parent, self.total or 0)
+            _require_space(self._notes.parent, self.total or 0)
             if self.total and tag.isprintable() and tag.startswith('"') and len(tag) <= LONGEST_TAG:  # W/…: a weak one
                 self._notes.write_bytes(msgspec.json.encode(_Version(self.url, tag, self.total)))
         else:
             raise self._refused(status)
-        self.report(self.done, self.total)
+        self.report(self.done, self.total, f"{self.name}: {self.url}")
 
     def _write(self, data: bytes) -> None:
         if not self._accepted:
             self._accept()
         self._limit(self.done + len(data))
         if self.total is None:
-            require_space(self._notes.parent, len(data))
+            _require_space(self._notes.parent, len(data))
         self.file.write(data)
         self.done += len(data)
-        self.report(self.done, self.total)
+        self.report(self.done, self.total, f"{self.name}: {self.url}")
 
     def _limit(self, size: int) -> None:
         if size > self._most:

@@ -16,6 +16,7 @@ import torch
 from command_line import MINI_TOML, command
 from file_server import serving
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
@@ -363,8 +364,8 @@ def test_every_name_of_the_package_has_a_model() -> None:
         assert weights.source.url.startswith("https://") or weights.source.page
 
 
-def test_the_readme_lists_the_names_of_the_package() -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text()
+def test_the_page_of_weights_lists_the_names_of_the_package() -> None:
+    text = (Path(__file__).parents[2] / "docs/weights.md").read_text()
     table = text.partition("| name | file | published")[2].partition("\n\n")[0]
     assert re.findall(r"^\| `([\w-]+)` \|", table, re.MULTILINE) == list(all_weights())
 
@@ -394,3 +395,11 @@ def test_broken_hashes_are_told(server, model, tmp_path):
     (tmp_path / "weights/hashes.json").write_text("[1]")
     with pytest.raises(BevcliError, match=r"hashes\.json: broken .*: remove it"):
         fetch_weights(named_weights("own"))
+
+
+def test_convert_overwrites_a_file_only_with_force(tmp_path):
+    target = tmp_path / "weights.safetensors"
+    target.touch()
+    done = command(tmp_path, "weights", "convert", bundled_weights("demo"), target)
+    assert (done.returncode, target.stat().st_size) == (1, 0)
+    assert done.stderr.endswith("already exists; choose another name, or pass --force to overwrite it\n")

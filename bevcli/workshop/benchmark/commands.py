@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from bevcli.cli.bridge import Json, Part, as_flags
+from bevcli.cli.bridge import Json, Part, as_flags, print_note
 from bevcli.errors import BevcliError
 from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions, complete_model
 from bevcli.options import option, options
@@ -57,7 +57,6 @@ def bench(
     The peak throughput is the rate of matrix products and of copying memory, measured in the same run. Nothing else
     should run on the machine at the same time.
     """
-    from bevcli.cli.progress import engine_bar
     from bevcli.config import load_config
     from bevcli.workshop.benchmark.engines import compare_engines
     from bevcli.workshop.benchmark.measure import run_benchmark
@@ -65,8 +64,7 @@ def bench(
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("`engines` compares all of them on the CPU: leave out other options")
-        with engine_bar() as show:
-            table = compare_engines(load_config(options.model), options.frames, show)
+        table = compare_engines(load_config(options.model), options.frames, print_note)
         say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))
         return
     model, against_plain = _model(options, model_options), options.against == "plain"
@@ -76,7 +74,6 @@ def bench(
 
 def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
     """The exported file, or a model with made-up weights in the engine that is asked for."""
-    from bevcli.cli.progress import in_engine_with_bar
     from bevcli.config import load_config
     from bevcli.inference.load import Model, choose_engine, load_model
     from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
@@ -91,4 +88,7 @@ def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
     parts = " and ".join(f"`{name}`" for name in ("against", "profile") if getattr(options, name) is not None)
     if parts:
         model.require_parts(parts)
-    return in_engine_with_bar(model, MadeUpDrive(CALIBRATION_FRAMES)) if model.needs_export else model
+    if model.needs_export:
+        drive = MadeUpDrive(CALIBRATION_FRAMES)
+        model = model.in_engine(drive.rig, drive, report=print_note)
+    return model

@@ -1,6 +1,6 @@
 """`compare_engines`: PyTorch and the engines side by side, alternating in one process."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import chain, product
 from statistics import median
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError
-from bevcli.inference.load import Model, Report, installed_engines
+from bevcli.inference.load import Model, installed_engines
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
 from bevcli.model.config import ModelConfig
@@ -73,7 +73,7 @@ class EngineTable:
         return "\n".join(lines)
 
 
-def compare_engines(config: ModelConfig, frames: int, report: Report) -> EngineTable:
+def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], None]) -> EngineTable:
     """Time a step of PyTorch and of every installed engine on the same frames, in turn, and compare their boxes.
 
     Nothing else should run on the machine.
@@ -81,7 +81,7 @@ def compare_engines(config: ModelConfig, frames: int, report: Report) -> EngineT
     Args:
         config: of the model, which gets made-up weights.
         frames: number of timed frames.
-        report: of the export, see `Model.in_engine`.
+        report: see `Model.in_engine`.
     """
     versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []

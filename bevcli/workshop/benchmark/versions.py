@@ -21,7 +21,7 @@ from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
 from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive
-from bevcli.workshop.engines.export_cache import NEAR_M
+from bevcli.workshop.engines.differences import NEAR_M
 
 QueryResults = tuple[Tensor, Tensor]
 

@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -12,7 +13,7 @@ import torch
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
-from bevcli.inference.load import Model, Report, tracker_of_table
+from bevcli.inference.load import Model, tracker_of_table
 from bevcli.inference.options import ModelOptions
 from bevcli.model.config import ModelConfig
 from bevcli.registry import load
@@ -99,7 +100,7 @@ class Engine(LoadedFile):
         export_form(config, len(config.cameras))
 
     @classmethod
-    def export(cls, model: Model, rig: CameraRig, drive: Sequence | None, report: Report) -> Model:
+    def export(cls, model: Model, rig: CameraRig, drive: Sequence | None, report: Callable[[str], None]) -> Model:
         """A model that is loaded for this engine, as an exported file for a rig, see `Model.in_engine`."""
         return exported_for_rig(model, rig, drive, report, cls.open, cls.deformable_convolution)
 

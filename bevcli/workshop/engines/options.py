@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
+from bevcli.errors import OutputError
 from bevcli.options import option, options
-from bevcli.writing import check_new
 
 
 @options()
@@ -17,7 +17,8 @@ class FileOptions:
     def target(self, default: Path) -> Path:
         """The file to write. Raises OutputError where it exists and `force` is false."""
         target = default if self.out is None else self.out
-        check_new(target, force=self.force)
+        if target.exists() and not self.force:
+            raise OutputError(f"{target}: already exists; choose another name, or pass `force=True` to overwrite it")
         return target
 
 

@@ -35,7 +35,7 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.progress import Progress, in_engine_with_bar, load_with_bar
+    from bevcli.cli.progress import Progress, load_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
     from bevcli.sequences.open import open_sequence, select_range
@@ -58,7 +58,7 @@ def stress(
         drives = [rendered.open(index) for index in range(len(rendered))]
         if source.frames is not None:
             drives = [select_range(drive, source.frames) for drive in drives]
-    loaded = in_engine_with_bar(loaded, drives[0])
+    loaded = loaded.in_engine(drives[0].rig, drives[0], report=print_note)
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [note for drive in drives for note in drive.notes]

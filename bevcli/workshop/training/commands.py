@@ -123,7 +123,7 @@ def validate(
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
-    from bevcli.cli.progress import Progress, in_engine_with_bar
+    from bevcli.cli.progress import Progress
     from bevcli.inference.load import load_model
     from bevcli.workshop.synth.drives import count_frames, scored_drives
     from bevcli.workshop.training.job import rig_for_drives
@@ -134,7 +134,8 @@ def validate(
     drives = scored_drives(drive_options, loaded.config, rig)
     notes = check_scored_drives(drive_options, drives, loaded.config)
     if loaded.needs_export:
-        loaded = in_engine_with_bar(loaded, drives.open(0))
+        drive = drives.open(0)
+        loaded = loaded.in_engine(drive.rig, drive, report=print_note)
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
     runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
     with Progress(count_frames(drives), "frames", notes) as progress:

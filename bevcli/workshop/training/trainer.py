@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
 from bevcli.inference.cpu_settings import trim_memory
-from bevcli.inference.load import choose_precision
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.backbone import Backbone
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
@@ -322,9 +321,11 @@ class Trainer:
 
     def _validate(self) -> Validation:
         job = self.job
-        options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
+        options = StepOptions(temporal=job.config.clips.frames > 1)
         # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
         model = self.averaged_model()
+        if job.device.type == "cuda":
+            model.step = torch.autocast("cuda", torch.bfloat16)(model.step)  # type: ignore[method-assign]
         runner = Runner(model, job.device, options)
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
