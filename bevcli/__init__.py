@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
     from bevcli.inference.load import Model as Model, load_model as load_model
-    from bevcli.inference.run import run as run
-    from bevcli.inference.session import Session as Session
+    from bevcli.inference.run import Session as Session, run as run
     from bevcli.recording.options import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
@@ -56,8 +55,7 @@ _NAMES = {
     "bevcli.geometry.ego_motion": "Kinematics",
     "bevcli.geometry.transforms": "Pose",
     "bevcli.inference.load": "Model load_model",
-    "bevcli.inference.run": "run",
-    "bevcli.inference.session": "Session",
+    "bevcli.inference.run": "Session run",
     "bevcli.recording.options": "RecordingOptions",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",

@@ -79,12 +79,12 @@ def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tenso
 
     model: its name or TOML file. expected: its state dict.
     """
-    found = compare(checkpoint.state, expected)
-    if not found:
+    by_kind = compare(checkpoint.state, expected)
+    if not by_kind:
         return
-    differences = "; ".join(f"{len(keys)} {kind}: {', '.join(keys)}" for kind, keys in found.items())
+    differences = "; ".join(f"{len(keys)} {kind}: {', '.join(keys)}" for kind, keys in by_kind.items())
     if checkpoint.models:
-        first = "; ".join(f"{len(keys)} {kind}, such as {keys[0]}" for kind, keys in found.items())
+        first = "; ".join(f"{len(keys)} {kind}, such as {keys[0]}" for kind, keys in by_kind.items())
         differences = f"it holds weights of {' or '.join(checkpoint.models)}; {first}"
     raise WeightsError(
         f"{checkpoint.path}: does not fit model {model}: {differences}; `bevcli train` starts from whatever fits "
@@ -151,7 +151,7 @@ def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str,
     """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
     kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
     left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
-    prefixes = {found[0] for found in (re.match(PREFIXES, key) for key in kept) if found}
+    prefixes = {match[0] for match in (re.match(PREFIXES, key) for key in kept) if match}
     if len(prefixes) != 1 or "" in prefixes:
         return kept
     (prefix,) = prefixes
@@ -171,7 +171,7 @@ def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict
     "missing": keys that the state dict lacks. "unexpected": keys that the model does not have. "misshapen": lines
     "key: expected (…), found (…)" for tensors of a wrong shape.
     """
-    found = {
+    by_kind = {
         "missing": [key for key in expected if key not in state],
         "unexpected": [key for key in state if key not in expected],
         "misshapen": [
@@ -180,7 +180,7 @@ def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict
             if key in state and tensor.shape != state[key].shape
         ],
     }
-    return {kind: keys for kind, keys in found.items() if keys}
+    return {kind: keys for kind, keys in by_kind.items() if keys}
 
 
 @cache
@@ -242,8 +242,8 @@ def _check_numbers(path: Path, state: Mapping[str, Tensor]) -> None:
                 tensor = tensor.narrow(dimension, 0, 1)
         bad = ~torch.isfinite(tensor.float())
         if bad.any():
-            place = tuple(bad.nonzero()[0].tolist())
+            index = tuple(bad.nonzero()[0].tolist())
             raise WeightsError(
                 f"{path}: tensor {name}: {int(bad.sum())} of {tensor.numel()} numbers are not finite, the first at "
-                f"index {place}: {float(tensor[place])} (expected finite numbers): the file is damaged"
+                f"index {index}: {float(tensor[index])} (expected finite numbers): the file is damaged"
             )

@@ -41,16 +41,16 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.box_formats": {
         "csv": "bevcli.evaluation.box_format:CSV",
         "json": "bevcli.evaluation.box_format:JSON",
-        "nuscenes": "bevcli.evaluation.submission:DETECTION",
-        "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
+        "nuscenes": "bevcli.evaluation.box_format:DETECTION",
+        "nuscenes-tracking": "bevcli.evaluation.box_format:TRACKING",
     },
     "bevcli.commands": {
-        "eval": "bevcli.cli.eval:evaluate",
-        "export": "bevcli.cli.export:export",
-        "project-debug": "bevcli.cli.project_debug:project_debug",
+        "eval": "bevcli.cli.commands:evaluate",
+        "export": "bevcli.cli.commands:export",
+        "project-debug": "bevcli.cli.commands:project_debug",
         "run": "bevcli.cli.run:run",
-        "samples": "bevcli.cli.samples:samples",
-        "viz": "bevcli.cli.viz:viz",
+        "samples": "bevcli.cli.commands:samples",
+        "viz": "bevcli.cli.commands:viz",
         "weights": "bevcli.cli.weights:weights_app",
     },
 }

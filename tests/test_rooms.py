@@ -75,6 +75,12 @@ def test_no_other_room_asks_for_the_kind_of_a_model():
     assert not asked
 
 
+def test_a_model_has_at_most_9_members():
+    """What else is asked of a model is registered by its class, where it is asked."""
+    declared = {*vars(TemporalModel), *TemporalModel.__annotations__, "config"}
+    assert len([name for name in declared if not name.startswith("_")]) <= 9
+
+
 @pytest.mark.parametrize("name", entries("bevcli.models"))
 def test_registry_and_configuration_name_the_same_model(name):
     model: type[TemporalModel] = load("bevcli.models", name)

@@ -107,7 +107,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     later = model.config.later_frames
     if live and later:
         found.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
-    found += model.rig_notes(drive.rig)
+    found += model.training_notes(drive.rig)
     if model.bundled and not drive.facts.rendered:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found

@@ -10,7 +10,6 @@ Metrics; they read no files:
     config              all parameters of the detection score
     detection           boxes of many frames -> AP, mAP, true-positive errors, NDS
     matching            the boxes of many frames as one array, and their greedy matching, the devkit's rule
-    segmentation        IoU of BEV maps
 
 Output:
     box_format          formats that boxes are exported in

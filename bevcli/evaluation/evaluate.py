@@ -4,10 +4,13 @@ Scores become a dict for JSON, with the key names of the nuScenes devkit, and ta
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection import DetectionScores, ScoreTable, evaluate_detections
@@ -21,7 +24,7 @@ from bevcli.evaluation.inputs import (
     without_cycles_in_racks,
 )
 from bevcli.evaluation.scorers import ResultScores, score_results
-from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
+from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
 from bevcli.printing import aligned, counted
@@ -34,6 +37,26 @@ OWN_CLASSES = (
     "numbers are not comparable to nuScenes'"
 )
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
+
+
+@dataclass(frozen=True)
+class SegmentationScores:
+    """The scores of maps: IoU in cells, each summed over all frames.
+
+    Attributes:
+        intersection: by class, cells that have the class in prediction and ground truth, over all maps.
+        union: by class, cells that have it in prediction or ground truth, over all maps.
+        frame_count: number of pairs of maps.
+    """
+
+    intersection: Mapping[str, float]
+    union: Mapping[str, float]
+    frame_count: int
+
+    @property
+    def iou(self) -> dict[str, float]:
+        """By class, 0 to 1; NaN where neither predictions nor ground truth have the class."""
+        return {name: self.intersection[name] / union if union else math.nan for name, union in self.union.items()}
 
 
 @dataclass(frozen=True)
@@ -200,6 +223,42 @@ def _score_maps(
         notes.append(f"map classes on one side only, not scored: {', '.join(unscored)}")
     maps = ((predicted.load(prediction), true.load(truth)) for prediction, truth in indices)
     return evaluate_segmentation(maps, classes), notes
+
+
+def evaluate_segmentation(
+    pairs: Iterable[tuple[BevMap, BevMap]], classes: Iterable[str] = tuple(MAP_CLASSES)
+) -> SegmentationScores:
+    """Score pairs of maps (prediction, ground truth), one pair a frame.
+
+    Classes are compared by name; they may have different bits in the two maps. A prediction with another extent or cell
+    size is sampled at the centres of the ground truth's cells; cells outside its extent are left out.
+    """
+    names = tuple(classes)
+    intersection, union, count = np.zeros(len(names)), np.zeros(len(names)), 0
+    for prediction, truth in pairs:
+        predicted, true = _at_ground_truth_cells(prediction, truth)
+        bits = [np.array([bev_map.classes.get(name, 0) for name in names], np.uint8) for bev_map in (prediction, truth)]
+        predicted_is, true_is = (predicted[:, None] & bits[0]) > 0, (true[:, None] & bits[1]) > 0  # (cells, classes)
+        intersection += (predicted_is & true_is).sum(axis=0)
+        union += (predicted_is | true_is).sum(axis=0)
+        count += 1
+    both, either = (dict(zip(names, counts.tolist(), strict=True)) for counts in (intersection, union))
+    return SegmentationScores(both, either, count)
+
+
+def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both maps' values at the ground truth's cells inside the prediction's extent, each (M,)."""
+    rows, columns = truth.cells.shape
+    (x0, x1), (y0, y1) = truth.x_range_m, truth.y_range_m
+    x = x0 + (np.arange(columns) + 0.5) * (x1 - x0) / columns
+    y = y1 - (np.arange(rows) + 0.5) * (y1 - y0) / rows  # the first row has the largest y
+    (px0, px1), (py0, py1) = prediction.x_range_m, prediction.y_range_m
+    column = np.floor((x - px0) / (px1 - px0) * prediction.cells.shape[1]).astype(int)
+    row = np.floor((py1 - y) / (py1 - py0) * prediction.cells.shape[0]).astype(int)
+    columns_inside = (column >= 0) & (column < prediction.cells.shape[1])
+    rows_inside = (row >= 0) & (row < prediction.cells.shape[0])
+    predicted = prediction.cells[np.ix_(row[rows_inside], column[columns_inside])]
+    return predicted.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()
 
 
 def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> float | None:

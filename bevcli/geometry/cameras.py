@@ -19,6 +19,7 @@ ANGLES = 20_000  # of the table that inverts a fisheye's projection
 REFINEMENTS = 15  # fixed-point steps that invert a lens distortion
 LARGEST_RAY_ERROR = 1e-5  # of a normalised coordinate
 OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
+NOISE_M = 0.05  # standard deviation per level and axis of `camera_pose_noise`
 
 
 @dataclass(frozen=True)
@@ -273,9 +274,6 @@ def _kannala_brandt_directions(bent: Array, coefficients: tuple[float, ...]) -> 
     return np.concatenate([bent * side[..., None], np.cos(angle)[..., None]], axis=-1)
 
 
-TRANSLATION_M = 0.05  # standard deviation per level and axis
-
-
 def camera_pose_noise(level: float, random: np.random.Generator) -> Array:
     """(4, 4) camera_from_noisy_camera, metres.
 
@@ -283,6 +281,6 @@ def camera_pose_noise(level: float, random: np.random.Generator) -> Array:
     of 5 L cm. BEVFormer's paper has the levels 1 to 4.
     """
     rotation_deg = np.sqrt(level) * random.standard_normal(3)
-    translation = TRANSLATION_M * level * random.standard_normal(3)
+    translation = NOISE_M * level * random.standard_normal(3)
     rotation, _ = cv2.Rodrigues(np.radians(rotation_deg))
     return rigid(translation, rotation)

@@ -9,6 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# The ellipsoid of WGS 84.
+EQUATOR_RADIUS_M = 6378137.0
+ECCENTRICITY_SQUARED = 6.69437999014e-3
+EAST_DEG = 90.0
 
 
 @dataclass(frozen=True)
@@ -140,12 +144,6 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
     """The pose at `fraction` (0 to 1) between two poses: translation linear, rotation by slerp."""
     translation = start.translation + fraction * (end.translation - start.translation)
     return Pose(translation, slerp(start.quaternion, end.quaternion, fraction))
-
-
-# The ellipsoid of WGS 84.
-EQUATOR_RADIUS_M = 6378137.0
-ECCENTRICITY_SQUARED = 6.69437999014e-3
-EAST_DEG = 90.0
 
 
 @dataclass(frozen=True)

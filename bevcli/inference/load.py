@@ -23,7 +23,7 @@ from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelO
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.inference.training_rigs import facts_notes, rig_notes
+from bevcli.inference.training_rigs import facts_notes, training_rig_notes
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
@@ -112,11 +112,11 @@ class Model:
         network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
         return replace(self, network=network)
 
-    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
-        """Warnings where the rig lies outside the training distribution; none for random weights."""
+    def training_notes(self, rig: CameraRig) -> tuple[str, ...]:
+        """Warnings where the rig or the model's file differs from the training; none for random weights."""
         if self.untrained:
             return ()
-        return (*facts_notes(self.facts, self.config), *rig_notes(rig, self.config))
+        return (*facts_notes(self.facts, self.config), *training_rig_notes(rig, self.config))
 
     @cached_property
     def config_hash(self) -> str:

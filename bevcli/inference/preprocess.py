@@ -2,7 +2,7 @@
 
 import os
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Frame
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.image_repair import repaired
@@ -21,7 +20,6 @@ from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import PreparedFrame
-from bevcli.printing import counted
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
@@ -197,36 +195,6 @@ def image_from_bev(frame: Frame, camera_name: str) -> Array:
     camera_ego_from_world = inverse(frame.world_from_ego_at[camera_name].matrix)
     ego_from_ego = camera_ego_from_world @ frame.world_from_ego.matrix
     return camera.image_from_camera @ camera.camera_from_ego @ ego_from_ego @ frame.rig.ego_from_bev
-
-
-def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence], frames: int) -> Iterator[np.ndarray]:
-    """Yields (1, N, H, W, 3) float32, the input `images` of an exported file, for frames of these drives.
-
-    Args:
-        config: of the model.
-        cameras: N, the number of cameras of the exported file.
-        drives: whose frames are read; frames without any image are left out.
-        frames: at most so many, evenly spaced over all frames of all drives.
-
-    Raises InputError where a frame cannot be read, a rig has another number of cameras, or no frame has an image.
-    """
-    empty = True
-    places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
-    chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
-    preprocess = Preprocessor(config, pixels=True)
-    for drive, place in (places[index] for index in chosen):
-        prepared = preprocess(drive.load(place))
-        if len(prepared.assignment.cameras) != cameras:
-            found = counted(len(prepared.assignment.cameras), "cameras")
-            raise InputError(f"{drive.name}: has {found} (the file takes {cameras})")
-        if prepared.frame.images:
-            empty = False
-            yield prepared.images.movedim(2, -1).numpy()
-    if empty:
-        names = ", ".join(drive.name for drive in drives)
-        raise InputError(
-            f"{names}: none of the {len(chosen)} frames for the calibration has an image; add their images"
-        )
 
 
 SMALLEST_OVERLAP = 1e-3  # pixels; OpenCV leaves out what overlaps less with the area of a pixel

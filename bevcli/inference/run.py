@@ -1,10 +1,20 @@
-"""The loop over a sequence: `run` yields predictions."""
+"""Run a model: `run` over a drive, a `Session` over frames from memory, such as those of a vehicle or a simulator."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from operator import index
+from typing import Any, Literal
 
-from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.inference.commands import read_commands
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import CameraImage, DriveFacts, Frame, FrameStamp, Prediction, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.ego_motion import Kinematics, RecentPoses
+from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
+from bevcli.inference.runner import RunnerState, one_command, read_commands
 
 
 def run(
@@ -47,3 +57,186 @@ def run(
     runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
     steps = runner.run(sequence, range(len(sequence.stamps)), runner.preprocessor(cameras))
     return ((frame, prediction) for frame, prediction, _ in steps)
+
+
+ColorOrder = Literal["bgr", "rgb"]
+RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
+
+
+class Session:
+    """Steps a model over frames from memory; the BEV map of a frame is the history of the next.
+
+        session = bevcli.Session(model, rig, color_order="rgb")
+        prediction = session.step({"CAM_FRONT": image}, world_from_ego, timestamp_ns)
+
+    The results are those of `run` on the same frames. A `Recording` takes the session in place of a sequence, and
+    `recording.log(session.frame, prediction)` follows it. A session belongs to one thread.
+
+    Attributes:
+        name: of the drive, for titles.
+        rig: the cameras.
+        frame: the newest frame; None before the first one.
+        notes: warnings where the rig lies outside the training distribution.
+        stamps: none, because no frame is known in advance.
+        has_ego_motion: True.
+        facts: the defaults.
+    """
+
+    stamps: tuple[FrameStamp, ...] = ()
+    has_ego_motion = True
+    facts = DriveFacts()
+
+    def __init__(
+        self,
+        model: Model,
+        rig: CameraRig,
+        *,
+        color_order: ColorOrder = "bgr",
+        temporal: bool = True,
+        track: bool = True,
+        cameras: Mapping[str, str] | None = None,
+        command: str | None = None,
+        name: str = "live",
+    ) -> None:
+        """Prepare the model for a rig.
+
+        Args:
+            model: of `load_model`.
+            rig: the cameras; images must have the sizes that it states.
+            color_order: of the images: "bgr", as OpenCV decodes them, or "rgb".
+            temporal: whether the previous BEV map is used.
+            track: whether the boxes get identities over time.
+            cameras: camera of the rig -> camera of the model whose embedding it takes; see `run`.
+            command: of the driver, which chooses one of the planned paths; see `run`. `step` may change it.
+            name: of the drive, for titles.
+
+        Raises InputError for a rig without cameras or with two of one name, an unknown camera in `cameras`, color order
+        or command, and for a model that needs later frames.
+        """
+        if color_order not in ("bgr", "rgb"):
+            raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
+        if not rig.names or len(set(rig.names)) < len(rig.names):
+            raise InputError(f"`rig`: expected cameras with different names (found {', '.join(rig.names) or 'none'})")
+        if temporal and model.config.later_frames:
+            raise InputError(
+                f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
+                "choose another model, or pass `temporal=False`"
+            )
+        model = model.in_engine(rig)
+        self.name, self.rig, self.notes = name, rig, model.training_notes(rig)
+        self.frame: Frame | None = None
+        self._color_order = color_order
+        commands = read_commands(command, model.config)
+        self._runner = model.runner(track=track, temporal=temporal, commands=commands)
+        self._prepare = self._runner.preparation(self._runner.preprocessor(cameras))
+        self._state: RunnerState[Any] = RunnerState()
+        self._poses = RecentPoses()
+        self._drive = 1
+        self._last_ns: int | None = None
+
+    def step(
+        self,
+        images: Mapping[str, NDArray[np.uint8]],
+        world_from_ego: Pose | ArrayLike,
+        timestamp_ns: int,
+        *,
+        world_from_ego_at: Mapping[str, Pose | ArrayLike] | None = None,
+        kinematics: Kinematics | None = None,
+        command: str | None = None,
+    ) -> Prediction:
+        """The prediction for one frame.
+
+        After a gap in time that is longer than the model's `max_gap_s`, the history starts anew:
+        `Prediction.started_anew` says so. A frame without any image has no boxes and keeps the history.
+
+        Args:
+            images: camera -> (H, W, 3) uint8; a missing camera is left out. They must not change during the call, nor
+                before `frame` was used.
+            world_from_ego: the vehicle's pose at the frame's time: a `Pose` or (4, 4), metres, in a world frame that
+                does not move. Ego frame: x forward, y left, z up, origin on the ground under the rear axle.
+            timestamp_ns: the frame's time; later than that of the frame before.
+            world_from_ego_at: camera -> the vehicle's pose when its image was taken. Default: `world_from_ego`.
+            kinematics: acceleration, angular rate and velocity at the frame's time. Default: derived from the poses.
+            command: of the driver, from this frame on. Default: the one before.
+
+        Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid,
+        and a time that is not later than the one before. The session is then as it was before the call.
+        """
+        stamp = self._next_stamp(timestamp_ns)
+        pose = _pose(world_from_ego, "`world_from_ego`")
+        poses = self._poses.with_pose(stamp.timestamp_ns, pose)
+        given = (world_from_ego_at or {}).items()
+        at = {name: _pose(one, f"`world_from_ego_at`: camera {name}") for name, one in given}
+        self._check_cameras(at, "world_from_ego_at")
+        frame = Frame(
+            stamp=stamp,
+            rig=self.rig,
+            images=self._checked(images, stamp.timestamp_ns),
+            world_from_ego=pose,
+            world_from_ego_at=dict.fromkeys(self.rig.names, pose) | at,
+            kinematics=poses.kinematics() if kinematics is None else kinematics,
+            dropped={name: "not given" for name in self.rig.names if name not in images},
+        )
+        if command is not None:
+            commands = one_command(command, self._runner.config)
+            self._runner.options = replace(self._runner.options, commands=commands)
+        self._state, prediction = self._runner.step(self._state, self._prepare(frame))
+        self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
+        return prediction
+
+    def reset(self) -> None:
+        """Forget the history: the next frame begins a new drive, at any time and place. Its number goes on."""
+        self._state, self._poses = RunnerState(), RecentPoses()
+        self._drive, self._last_ns = self._drive + 1, None
+
+    def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
+        time = index(timestamp_ns)
+        if self._last_ns is not None and time <= self._last_ns:
+            raise InputError(
+                f"`timestamp_ns={time}`: is not later than the frame before ({self._last_ns}): pass frames in order, "
+                "or call reset() where a new drive begins"
+            )
+        number = 0 if self.frame is None else self.frame.stamp.index + 1
+        return FrameStamp(number, str(self._drive) if self._drive > 1 else "", time)
+
+    def _checked(self, images: Mapping[str, NDArray[np.uint8]], timestamp_ns: int) -> dict[str, CameraImage]:
+        self._check_cameras(images, "images")
+        for name, pixels in images.items():
+            _check_image(pixels, self.rig[name])
+        turned = images.items() if self._color_order == "bgr" else ((n, p[..., ::-1]) for n, p in images.items())
+        return {name: CameraImage(timestamp_ns, np.ascontiguousarray(pixels)) for name, pixels in turned}
+
+    def _check_cameras(self, given: Mapping[str, object], argument: str) -> None:
+        for name in given:
+            if name not in self.rig.names:
+                raise InputError(f"`{argument}`: camera {name} is not in the rig (it has {', '.join(self.rig.names)})")
+
+
+def _check_image(pixels: NDArray[np.uint8], camera: Camera) -> None:
+    """Raise InputError where pixels are not an image of a camera."""
+    shape, kind = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
+    if shape != (camera.height, camera.width, 3) or kind != np.uint8:
+        found = kind if shape is None else f"{kind} of shape {shape}"
+        raise InputError(
+            f"`images`: camera {camera.name}: expected uint8 of shape ({camera.height}, {camera.width}, 3), as in the "
+            f"rig (found {found})"
+        )
+
+
+def _pose(given: Pose | ArrayLike, argument: str) -> Pose:
+    """A pose from what the caller gave. Raises InputError where it is not rigid."""
+    if isinstance(given, Pose):
+        return given
+    matrix = np.asarray(given, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{argument}: expected a Pose or a matrix (4, 4) (found shape {matrix.shape})")
+    rotation = matrix[:3, :3]
+    is_rigid = (
+        np.isfinite(matrix).all()
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
+        and np.linalg.det(rotation) > 0
+        and np.array_equal(matrix[3], (0, 0, 0, 1))
+    )
+    if not is_rigid:
+        raise InputError(f"{argument}: is not a rigid transform (expected a rotation and a translation, all finite)")
+    return Pose.from_matrix(matrix)

@@ -1,30 +1,35 @@
-"""The temporal run: frame by frame, with the memory that the model keeps, and the tracks of the boxes."""
+"""The temporal run: frame by frame, with the memory of the model, the tracks of the boxes and the driver's commands."""
 
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
 
-from bevcli.frame import BevMap, Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.errors import InputError
+from bevcli.frame import BevMap, Frame, FrameResult, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
-from bevcli.inference.commands import Commands, with_command
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.inference.transfer import image_uploader, origin, read_back
-from bevcli.model.config import ImageConfig
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.parsing.documents import read_json
 
 Memory = TypeVar("Memory")
+# Commands of the driver, such as "straight": each chooses one of the paths that a model plans. Index of a frame and the
+# command from it on, by rising index, until the next one.
+Commands = tuple[tuple[int, str], ...]
 AHEAD_BYTES = 1 << 29  # of network inputs that are prepared ahead of a GPU
 MOST_THREADS = 4  # that prepare frames for a GPU
 
@@ -234,21 +239,43 @@ def frames_ahead(image: ImageConfig, cameras: int, cores: int) -> tuple[int, int
     return max(2, min(threads + 2, affordable)), threads
 
 
-def paired_steps(
-    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
-) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
-    """Step two versions of a model on the CPU over the same frames, each with its own history.
+def with_command(results: tuple[FrameResult, ...], commands: Commands, frame: int) -> tuple[FrameResult, ...]:
+    """The results, plans with the command at a frame, "" for none."""
+    command = next((command for first, command in reversed(commands) if first <= frame), "")
+    return tuple(result.with_command(command) for result in results)
 
-    Yields each frame that has an image, and the outputs of both.
+
+def read_commands(command: str | None, config: ModelConfig) -> Commands:
+    """The commands of the option `command`: one name, or a JSON file {"0": "straight", "40": "left"} by frame index.
+
+    None: no command. Raises InputError for a model that does not plan, an unknown command, or a wrong file.
     """
-    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
-    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
-    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
-    with contextlib.ExitStack() as hooks:
-        for runner in runners:
-            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
-            hooks.enter_context(hook)
-        for prepared in frames:
-            if prepared.frame.images:
-                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
-                yield prepared, outputs[runners[0]], outputs[runners[1]]
+    if command is None:
+        return ()
+    path = Path(command)
+    if path.suffix != ".json":
+        return one_command(command, config)
+    known = _known(command, config)
+    found = read_json(path)
+    if not isinstance(found, dict) or not found:
+        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{known[0]}"}}, by frame index)')
+    for frame, name in found.items():
+        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
+            expected = f"expected {', '.join(known)}, by frame index"
+            raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected})')
+    return tuple(sorted((int(frame), name) for frame, name in found.items()))
+
+
+def one_command(command: str, config: ModelConfig) -> Commands:
+    """A command by its name, for all frames. Raises InputError for a model that does not plan, or another name."""
+    known = _known(command, config)
+    if command not in known:
+        raise InputError(f"`command={command}`: is unknown (expected {', '.join(known)} or a FILE.json)")
+    return ((0, command),)
+
+
+def _known(command: str, config: ModelConfig) -> tuple[str, ...]:
+    known = next((names for kind, names in config.results.items() if kind.takes_command), ())
+    if not known:
+        raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
+    return known

@@ -16,7 +16,7 @@ _FOV_DEG, _HEIGHT_M, _TILT_DEG = 8.0, 0.3, 1.5
 _BEV_TILT_DEG = 4.0  # published weights were trained with nuScenes' LIDAR_TOP, which is tilted by up to 3 degrees
 
 
-def rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
+def training_rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
     """Warnings where a rig lies outside the training distribution, at most two: the cameras, and the bev frame."""
     return (*_cameras_note(rig, config), *_bev_frame_note(rig, config))
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.model.step import ModelOutputs, PreparedFrame
-from bevcli.model.tensors import exchanged, tensors_in
-from bevcli.model.upload import packed, unpacked, upload
+from bevcli.model.upload import exchanged, packed, tensors_in, unpacked, upload
 
 
 def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:

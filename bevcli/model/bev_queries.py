@@ -42,10 +42,10 @@ class BevQueries(nn.Module):
         if not {row_key, column_key, key} <= set(state):
             return dict(state)
         sizes = len(self.row_embedding), len(self.column_embedding)
-        found = len(state[row_key]), len(state[column_key])
-        if found == sizes or len(state[key]) != found[0] * found[1]:
+        file_sizes = len(state[row_key]), len(state[column_key])
+        if file_sizes == sizes or len(state[key]) != file_sizes[0] * file_sizes[1]:
             return dict(state)
-        cells = state[key].float().unflatten(0, found).permute(2, 0, 1)[None]  # (1, C, rows, columns)
+        cells = state[key].float().unflatten(0, file_sizes).permute(2, 0, 1)[None]  # (1, C, rows, columns)
         return {
             **state,
             key: nn.functional.interpolate(cells, sizes, mode="bilinear")[0].flatten(1).T,

@@ -114,8 +114,8 @@ def faded(boxes: BestBoxes, share: float) -> BestBoxes:
     distances = boxes.squared_distances().sqrt()  # (B, better, worse)
     widths = boxes.codes[..., 2].float().exp()[:, :, None]
     lost = share * (distances / (-FADING_WIDTHS * widths)).clamp(min=LEAST_EXPONENT).exp()
-    place = torch.arange(boxes.scores.shape[1], device=lost.device)
-    worse = place[:, None] < place  # `triu` takes as long as all the rest
+    rank = torch.arange(boxes.scores.shape[1], device=lost.device)
+    worse = rank[:, None] < rank  # `triu` takes as long as all the rest
     return boxes.with_scores(boxes.scores * (1 - boxes.of_same_class() * worse * lost).amin(1))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from bevcli.model import upload
-from bevcli.model.tensors import exchanged, tensors_in
+from bevcli.model.upload import exchanged, tensors_in
 
 KEPT_GRAPHS = 8  # of one function: for other numbers and sizes of images, with and without history
 Function = Callable[..., Any]
@@ -47,12 +47,12 @@ class CudaGraph:
     def replay(self, arguments: tuple[Any, ...]) -> Any:
         """The results for other arguments of the same shapes, in new memory."""
         small = []
-        for place, (_, tensor) in enumerate(tensors_in(arguments)):
+        for index, (_, tensor) in enumerate(tensors_in(arguments)):
             if tensor.device.type == "cpu":
                 small.append(tensor)
-            elif tensor is not self._sources[place]:  # hits of a rig stay the same for many frames
-                self._inputs[place].copy_(tensor, non_blocking=True)
-                self._sources[place] = tensor
+            elif tensor is not self._sources[index]:  # hits of a rig stay the same for many frames
+                self._inputs[index].copy_(tensor, non_blocking=True)
+                self._sources[index] = tensor
         if self._uploaded is not None:
             self._uploaded.copy_(upload.pinned(upload.packed(small)), non_blocking=True)
         self._graph.replay()

@@ -159,13 +159,12 @@ class TemporalSelfAttention(nn.Module):
     def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, logits: Tensor) -> Tensor:
         """The attended values (B, Y·X, C) for given offsets and logits of the samples; see `forward`."""
         batch, cells = offsets.shape[:2]
-        maps = bev_maps.shape[1]
+        maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
         locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
         locations = locations.movedim(3, 1).flatten(0, 2)
         weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
         queries_per_map = [2 * cells // maps] * (maps * batch)
-        tokens = bev_maps.flatten(0, 1)
         sampled = self.attention.sample(tokens, self.level_shapes, locations, weights, queries_per_map)
         return self.mean(sampled.unflatten(0, (batch, 2, cells)))
 

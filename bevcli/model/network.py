@@ -17,7 +17,7 @@ from bevcli.model.pillar_projection import Pillars
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
-from bevcli.model.tensors import without_autocast
+from bevcli.model.upload import without_autocast
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera

@@ -42,10 +42,10 @@ def model_parts(config: ModelConfig) -> tuple[ModelPart, ...]:
     named = list(_part_names(model))
     others = dict.fromkeys(key.split(".")[0] for key in left)  # the modules of a model that names no parts
     for name, *modules in [*named, *((module, module) for module in others)]:
-        found = [left.pop(key) for key in tuple(left) if f"{key}.".startswith(tuple(f"{m}." for m in modules))]
-        if found:
-            shapes = tuple(shape for shape in found if len(shape) > 1)
-            parts.append(ModelPart(name, tuple(modules), shapes, sum(map(math.prod, found))))
+        of_part = [left.pop(key) for key in tuple(left) if f"{key}.".startswith(tuple(f"{m}." for m in modules))]
+        if of_part:
+            shapes = tuple(shape for shape in of_part if len(shape) > 1)
+            parts.append(ModelPart(name, tuple(modules), shapes, sum(map(math.prod, of_part))))
     return tuple(parts)
 
 

@@ -1,4 +1,15 @@
-"""Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3)."""
+"""Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3).
+
+      bev frame                                   image of a camera (u, v), 0 to 1
+      z ^   o  Z points above each of               +---------------+
+        |   o  the Y·X cells                        |      x        |   camera sees the cell: a point is inside,
+        |   o    (x, y, z, 1)                       |      x        |   and in front of it (d > 0)
+        +---+---+---> x, y     -------------->      +------x--------+
+            cell                image_from_bev             x            outside: not visible
+                                = (u d, v d, d, 1)
+
+`PillarHits` lists the pairs of a camera and a cell that it sees; only for these attention is computed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,10 +71,10 @@ class PillarHits:
         """
         cell = torch.arange(sum(sizes), device=self.cell.device) % len(self.cameras_per_cell)
         points = self.reference_points.new_full((sum(sizes), *self.reference_points.shape[1:]), OUTSIDE)
-        for found, places in ((self.cell, cell), (self.reference_points, points)):
-            parts = zip(found.split(self.hits_per_camera), places.split(list(sizes)), strict=True)
-            for of_camera, of_places in parts:
-                of_places[: len(of_camera)] = of_camera
+        for unpadded, room in ((self.cell, cell), (self.reference_points, points)):
+            parts = zip(unpadded.split(self.hits_per_camera), room.split(list(sizes)), strict=True)
+            for of_camera, of_room in parts:
+                of_room[: len(of_camera)] = of_camera
         return PillarHits(cell, points, tuple(sizes), self.cameras_per_cell)
 
 
@@ -143,6 +154,6 @@ def _true_positions(mask: Tensor, count: int) -> Tensor:
     """The positions (count,) int64 of the `count` true elements of a mask (K,), as `nonzero` without its wait."""
     order = mask.cumsum(0)  # from 1, at the true elements
     # All false elements write to one more place at the end, which is cut off.
-    place = (order - 1).masked_fill(~mask, count)
-    positions = order.new_empty(count + 1).scatter_(0, place, torch.arange(len(mask), device=mask.device))
+    position = (order - 1).masked_fill(~mask, count)
+    positions = order.new_empty(count + 1).scatter_(0, position, torch.arange(len(mask), device=mask.device))
     return positions[:count]

@@ -15,21 +15,18 @@ from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
 from bevcli.model.calibration_embedding import CalibrationEmbedding
-from bevcli.model.cuda_graph import Captured
 from bevcli.model.decoder import DecoderLayer, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, has_triton, in_place_of
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, in_place_of
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.cuda_layers import AttentionByProducts, FusedBottleneck, MapOnDevice, TokensInOnePass
+from bevcli.model.kernels.last_call import KeptCalibrationEmbedding, KeptPillars
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
-from bevcli.model.kernels.padded_pillars import PaddedPillars
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
-from bevcli.model.resnet import Bottleneck, ResNet
-from bevcli.model.segmentation import MaskDecoderLayer, SegmentationHead
+from bevcli.model.resnet import ResNet
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.registry import for_model
 
@@ -60,17 +57,16 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     network.to(device)
     fold_batch_norms(network, device)
     choose_kernels(network, device)
-    kinds = faster_kinds(device)
+    kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
+    if device.type != "cpu":
+        from bevcli.model.kernels.gpu_layers import finish_gpu_parts, gpu_kinds
+
+        kinds = gpu_kinds(device)
     for name, module in list(network.named_modules()):
         if kind := kinds.get(type(module)):
             network.set_submodule(name, in_place_of(module, kind))
-    for name, module in network.named_modules():
-        if isinstance(module, KeptPaddedPillars):
-            module.points_on_cpu, module.sizes = points_on_cpu[name], {}
-        if isinstance(module, FusedBottleneck):
-            module.fuse()
-        if isinstance(module, MapOnDevice):
-            module.config, module.grid = network.config.segmentation, network.config.bev_grid
+    if device.type != "cpu":
+        finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
     if isinstance(network, Network):
         network.backbone.to(dtype)
@@ -80,6 +76,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     round_attentions(network, dtype, temporal=rounds, queries=rounds or (precision != "fp32" and device.type == "cuda"))
     _check_finite(network)
     if device.type == "cuda":
+        from bevcli.model.cuda_graph import Captured
+
         for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
@@ -90,35 +88,14 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     return network
 
 
-def faster_kinds(device: torch.device) -> dict[type[nn.Module], type[nn.Module]]:
-    """The classes that take the place of plain ones on a device, beside those of `choose_kernels`."""
-    if device.type == "cpu":
-        return {
-            Pillars: KeptPillars,
-            CalibrationEmbedding: KeptCalibrationEmbedding,
-            EfficientNetLite: EfficientNetLiteByImage,
-            ImageTokens: TokensInBlocks,
-        }
-    kinds: dict[type[nn.Module], type[nn.Module]] = {
-        Pillars: KeptPaddedPillars,
-        CalibrationEmbedding: KeptCalibrationEmbedding,
-    }
-    if device.type == "cuda":
-        kinds |= {ImageTokens: TokensInOnePass, MaskDecoderLayer: AttentionByProducts, SegmentationHead: MapOnDevice}
-        kinds |= {Bottleneck: FusedBottleneck} if torch.version.hip is None else {}  # cuDNN is NVIDIA's
-    if has_triton(device):
-        from bevcli.model.kernels.triton_stem import FusedStem  # only where Triton is installed
-
-        kinds |= {ResNet: FusedStem}
-    return kinds
-
-
 def round_attentions(network: nn.Module, dtype: torch.dtype, *, temporal: bool, queries: bool) -> None:
     """Gives attentions, in place, parts that compute in the data type of the images.
 
     Those are the values of the image features, with `temporal` those of the BEV maps, and with `queries` the attention
     of object queries to each other.
     """
+    if dtype == torch.float32:
+        return
     for module in list(network.modules()):
         if isinstance(module, SpatialCrossAttention) or (temporal and isinstance(module, TemporalSelfAttention)):
             projection = module.attention.value_projection
@@ -237,37 +214,10 @@ class TokensInBlocks(ImageTokens):
         return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
 
 
-class LastCall(nn.Module):
-    """Of a part that sees only calibration, poses and sizes: it keeps the result of the last call.
-
-    It computes again only where its arguments are not those of that call. The comparison needs no wait for a GPU where
-    the tensors are on the CPU.
-    """
-
-    _arguments: tuple[Any, ...] = ()
-    _result: Any
-
-    def forward(self, *arguments: Any) -> Any:
-        """As the part's own `forward`."""
-        if not self._arguments or not all(map(_equal, arguments, self._arguments)):
-            self._arguments = tuple(each.clone() if isinstance(each, Tensor) else each for each in arguments)
-            self._result = super().forward(*arguments)
-        return self._result
-
-
-class KeptPillars(LastCall, Pillars):
-    """`Pillars` that find the hits anew where the cameras have moved."""
-
-
-class KeptPaddedPillars(LastCall, PaddedPillars):
-    """`KeptPillars` for a GPU."""
-
-
-class KeptCalibrationEmbedding(LastCall, CalibrationEmbedding):
-    """A `CalibrationEmbedding` that computes anew where the cameras have moved."""
-
-
-def _equal(one: Any, other: Any) -> bool:
-    if not isinstance(one, Tensor):
-        return bool(one == other)
-    return one.shape == other.shape and one.device == other.device and torch.equal(one, other)
+# The classes that take the place of plain ones on a CPU, beside those of `choose_kernels`.
+CPU_KINDS: dict[type[nn.Module], type[nn.Module]] = {
+    Pillars: KeptPillars,
+    CalibrationEmbedding: KeptCalibrationEmbedding,
+    EfficientNetLite: EfficientNetLiteByImage,
+    ImageTokens: TokensInBlocks,
+}

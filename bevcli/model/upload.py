@@ -1,12 +1,13 @@
-"""Copies from the CPU to a device that the CPU does not wait for."""
+"""Copies from the CPU to a device that the CPU does not wait for; the tensors in nested tuples and dataclasses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-
-from bevcli.model.tensors import exchanged, tensors_in
 
 Value = TypeVar("Value")
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -43,30 +44,68 @@ def upload_together(value: Value, device: torch.device) -> Value:
         moved = iter(unpacked(upload(packed(missing), device), missing))
     else:
         moved = iter([tensor.to(device) for tensor in missing])
-    found: Value = exchanged(value, (x if x.device.type == device.type else next(moved) for x in tensors))
-    return found
+    uploaded: Value = exchanged(value, (x if x.device.type == device.type else next(moved) for x in tensors))
+    return uploaded
 
 
 def packed(tensors: Sequence[Tensor]) -> Tensor:
     """The bytes of tensors of one device, which one copy moves."""
-    return torch.cat([tensors[place].reshape(-1).view(torch.uint8) for place in _order(tensors)])
+    return torch.cat([tensors[index].reshape(-1).view(torch.uint8) for index in _order(tensors)])
 
 
 def unpacked(memory: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
     """The tensors in the bytes of `packed`, with the shapes and types of those that were packed."""
     order = _order(like)
-    parts = memory.split([like[place].nbytes for place in order])
-    found = {
-        place: part.view(like[place].dtype).view(like[place].shape) for place, part in zip(order, parts, strict=True)
+    parts = memory.split([like[index].nbytes for index in order])
+    by_index = {
+        index: part.view(like[index].dtype).view(like[index].shape) for index, part in zip(order, parts, strict=True)
     }
-    return [found[place] for place in range(len(like))]
+    return [by_index[index] for index in range(len(like))]
 
 
 def _order(tensors: Sequence[Tensor]) -> list[int]:
     """Those with the longest numbers first, so that each number lies at a multiple of its length."""
-    return sorted(range(len(tensors)), key=lambda place: -tensors[place].itemsize)
+    return sorted(range(len(tensors)), key=lambda index: -tensors[index].itemsize)
 
 
 def pinned(tensor: Tensor) -> Tensor:
     """A copy of a CPU tensor in memory that a GPU reads by itself. Needs a CUDA GPU."""
     return tensor.pin_memory()
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[object]:
+    """Inside, nothing is cast to half precision: it is too coarse for the refinement of boxes."""
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
+
+
+def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from tensors_in(part, name)
+    else:
+        for field in _field_names(value):
+            yield from tensors_in(getattr(value, field), field)
+
+
+def exchanged(value: Any, others: Iterator[Any]) -> Any:
+    """The value with others in the place of its tensors, in the order of `tensors_in`."""
+    if isinstance(value, Tensor):
+        return next(others)
+    if isinstance(value, tuple | list):
+        return type(value)(exchanged(part, others) for part in value)
+    names = _field_names(value)
+    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
+
+
+def _field_names(value: object) -> tuple[str, ...]:
+    """Of a dataclass; () for another value. They are kept: asking a dataclass takes longer than copying a tensor."""
+    kind: Any = type(value)
+    return _fields_of(kind)
+
+
+@cache
+def _fields_of(kind: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()

@@ -33,8 +33,14 @@ JSON_BYTES, TOML_BYTES, YAML_BYTES = 64 * MIB, MIB, MIB // 4
 MOST_VALUES = 200_000  # of a TOML or YAML file
 _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
+_STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+CSV_BYTES = 256 << 20
+NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
+UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
+LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
 
 class _YamlLoader(_SafeLoader):
@@ -66,7 +72,8 @@ def read_json(
 
 def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
     """Parses JSON: at most 64 nested levels, integers of at most 62 bits. Raises InputError, which names `path`."""
-    if _depth_bound(text) > DEEPEST and _exact_depth(text) > DEEPEST:
+    without_strings = _STRING.sub(b"", text) if _depth(text) > DEEPEST else b""
+    if _depth(without_strings) > DEEPEST:
         raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels of lists and objects)")
 
     def integer(digits: str) -> int:
@@ -126,7 +133,11 @@ def read_yaml(path: Path) -> Any:
     """The contents of a YAML file with plain values. Raises InputError."""
     text = re.sub(r"\A%YAML:.*", "", read_text(path, YAML_BYTES))  # OpenCV's header, which is not YAML
     try:
-        _check_yaml_depth(text, path)
+        depth = 0
+        for event in yaml.parse(text, _YamlLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
         document = yaml.load(text, _YamlLoader)
     except yaml.YAMLError as error:
         raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
@@ -160,26 +171,13 @@ def check_values(document: Any, path: str | Path, error: type[BevcliError] = Inp
     raise error(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
 
 
-def _check_yaml_depth(text: str, path: Path) -> None:
-    depth = 0
-    for event in yaml.parse(text, _YamlLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
-
-
-def _depth_bound(text: bytes) -> int:
+def _depth(text: bytes) -> int:
     """The deepest nesting of brackets, those in strings included."""
     brackets = np.frombuffer(text.translate(None, _NO_BRACKETS), dtype=np.uint8)
     if not len(brackets):
         return 0
     opening = (brackets == ord("[")) | (brackets == ord("{"))
     return int(np.cumsum(np.where(opening, 1, -1), dtype=np.int32).max())
-
-
-def _exact_depth(text: bytes) -> int:
-    """The deepest nesting of brackets outside of strings."""
-    return _depth_bound(re.sub(rb'"(?:[^"\\]|\\.)*+"', b"", text, flags=re.DOTALL))
 
 
 @contextmanager
@@ -195,13 +193,6 @@ def without_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-LARGEST_BYTES = 256 << 20
-NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
-UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
-LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
-_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
 
 def cell_of(name: str) -> str:
@@ -268,7 +259,7 @@ def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = 
     Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
     has another number of cells than the header, or there are no rows.
     """
-    text = read_text(path, LARGEST_BYTES).removeprefix("\ufeff")
+    text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
     try:
         reader = csv.reader(io.StringIO(text, newline=""))
         lines = [(reader.line_num, cells) for cells in reader if cells]

@@ -17,6 +17,15 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.printing import valid_text
 
 MIB = 1 << 20
+# RLIMIT_DATA, and not the address space: allocators reserve more than they use.
+LIMIT_MEMORY = """
+def limit_memory():
+    try:
+        import resource
+        resource.setrlimit(resource.RLIMIT_DATA, ({memory}, {memory}))
+    except (ImportError, ValueError, OSError):
+        pass
+"""
 
 
 def is_there(path: Path) -> bool:
@@ -120,17 +129,6 @@ def _from_lz4(data: bytes, largest: int) -> bytes:
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, largest))
     except (RuntimeError, EOFError) as error:
         raise ValueError(str(error)) from None
-
-
-# RLIMIT_DATA, and not the address space: allocators reserve more than they use.
-LIMIT_MEMORY = """
-def limit_memory():
-    try:
-        import resource
-        resource.setrlimit(resource.RLIMIT_DATA, ({memory}, {memory}))
-    except (ImportError, ValueError, OSError):
-        pass
-"""
 
 
 def run_python(

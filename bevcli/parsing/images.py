@@ -2,6 +2,7 @@
 
 import re
 import struct
+from collections.abc import Iterator
 from io import BytesIO
 
 import cv2
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 
 # Markers of a JPEG that state its size (start of frame): all from C0 to CF except DHT, JPG and DAC.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_PIXELS, _END = 0xDA, 0xD9
 _MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")  # those that have a length, and the end
 OTHERS = ("WEBP", "TIFF", "BMP")  # formats that Pillow and OpenCV read
-_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD9)) | {0x01}
 
 
 def media_type_of(encoded: bytes) -> str | None:
@@ -57,25 +58,22 @@ def _other_size(encoded: bytes) -> tuple[int, int] | None:
         return None
 
 
+def _jpeg_markers(encoded: bytes) -> Iterator[tuple[int, int]]:
+    """Each marker of a JPEG that has a length, or is the end, and the offset behind it."""
+    offset = 2
+    while found := _MARKER.search(encoded, offset):
+        yield encoded[found.end() - 1], found.end()
+        offset = found.end() + int.from_bytes(encoded[found.end() : found.end() + 2], "big")
+
+
 def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
-    place = 2
-    while True:
-        place = encoded.find(b"\xff", place)
-        while place >= 0 and encoded[place : place + 1] == b"\xff":  # markers may be padded
-            place += 1
-        if place < 0 or place + 3 > len(encoded):
-            return None
-        marker = encoded[place]
-        place += 1
-        if marker in _FRAMES:
-            if place + 7 > len(encoded):
-                return None
-            height, width = struct.unpack(">HH", encoded[place + 3 : place + 7])
+    for marker, offset in _jpeg_markers(encoded):
+        if marker in _FRAMES and offset + 7 <= len(encoded):
+            height, width = struct.unpack(">HH", encoded[offset + 3 : offset + 7])
             return width, height
-        if marker == 0xDA:  # the pixels begin, and no size was stated
+        if marker in _FRAMES or marker == _PIXELS:
             return None
-        if marker and marker not in _WITHOUT_LENGTH:
-            place += max(2, int.from_bytes(encoded[place : place + 2], "big"))
+    return None
 
 
 def _is_cut_short(encoded: bytes) -> bool:
@@ -84,17 +82,14 @@ def _is_cut_short(encoded: bytes) -> bool:
     Bytes after the end, such as the video of a motion photo, do not matter.
     """
     kind = media_type_of(encoded)
-    place = 2 if kind == "image/jpeg" else 8
-    while kind == "image/jpeg":
-        found = _MARKER.search(encoded, place)
-        if found is None or found[0] == b"\xff\xd9":  # the end of the image, which is not that of its thumbnail
-            return found is None
-        place = found.end() + int.from_bytes(encoded[found.end() : found.end() + 2], "big")
+    if kind == "image/jpeg":
+        return _END not in (marker for marker, _ in _jpeg_markers(encoded))  # a thumbnail's end lies in its segment
     if kind is None:
         return False  # OpenCV refuses those of the other formats
-    while place + 12 <= len(encoded):  # a chunk of a PNG: length, kind, contents, checksum
-        chunk = encoded[place + 4 : place + 8]
-        place += 12 + int.from_bytes(encoded[place : place + 4], "big")
+    offset = 8
+    while offset + 12 <= len(encoded):  # a chunk of a PNG: length, kind, contents, checksum
+        chunk = encoded[offset + 4 : offset + 8]
+        offset += 12 + int.from_bytes(encoded[offset : offset + 4], "big")
         if chunk == b"IEND":
-            return place > len(encoded)
+            return offset > len(encoded)
     return True

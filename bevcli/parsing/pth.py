@@ -40,10 +40,38 @@ _CODES = {name: ord(getattr(pickle, name)) for name in _OPCODES}
 _PICKLE_DAMAGE = (
     pickle.UnpicklingError, EOFError, LookupError, AttributeError, TypeError, ValueError, OverflowError, struct.error
 )  # fmt: skip
+LARGEST_PICKLE = 32 << 20
+LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
+MOST_DIMENSIONS = 16
+MOST_ARGUMENTS = 16  # of a call that is read
+LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
+_OLD_FORMAT = 0x1950A86A20F9469CFC6C  # the first number in a file of the older format
+_DTYPES = {
+    "FloatStorage": torch.float32,
+    "DoubleStorage": torch.float64,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "ByteStorage": torch.uint8,
+    "BoolStorage": torch.bool,
+    "ComplexFloatStorage": torch.complex64,
+    "ComplexDoubleStorage": torch.complex128,
+}
+# Modules whose functions run programs or code. Nothing of a file is ever called, but such a file is an attack.
+_ATTACKS = frozenset(("os", "posix", "nt", "subprocess", "sys", "pty", "runpy", "importlib", "shutil", "socket"))
+_ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__import__", "open", "input"))
+_Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
 
 
 class PickleError(Exception):
     """The pickle is damaged, is beyond a limit, or has an opcode that `torch.save` does not write."""
+
+
+# The exceptions of Python's zip reader for a damaged archive, and of this package for a damaged pickle.
+_DAMAGE = (PickleError, zipfile.BadZipFile, RuntimeError, KeyError, ValueError, OSError, EOFError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -70,15 +98,53 @@ class Placeholder:
         """Leaves out an element of a set."""
 
 
+@dataclass(frozen=True, eq=False)
+class Storage:
+    """A row of `count` numbers, by the pickle. key: its name in the file."""
+
+    key: str
+    dtype: torch.dtype
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class StoredTensor:
+    """A tensor as the pickle describes it, not checked yet. Offset and strides count numbers."""
+
+    storage: Any
+    offset: Any
+    shape: Any
+    strides: Any
+
+
+_MADE: dict[str, Callable[..., Any]] = {
+    "collections.OrderedDict": lambda *_: {},
+    "collections.defaultdict": lambda *_: {},
+    "torch._utils._rebuild_tensor": StoredTensor,
+    "torch._utils._rebuild_tensor_v2": lambda *given: StoredTensor(*given[:4]),
+    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
+    "torch._utils._rebuild_parameter_with_state": lambda tensor, *_: tensor,
+    "torch.Size": lambda sizes=(), *_: sizes,
+}
+
+
 class PickleReader(pickle._Unpickler):
-    """Python's unpickler, with plain objects in place of whatever a file could call."""
+    """Python's unpickler, with plain objects in place of whatever a file could call.
+
+    Attributes:
+        left_out: names of the classes and functions whose objects are left out.
+        storages: by their keys.
+    """
 
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]
 
-    def __init__(self, file: io.BytesIO) -> None:
+    def __init__(self, file: io.BytesIO, path: Path) -> None:
+        """path: of the file, for messages."""
         super().__init__(file, encoding="utf-8", errors="replace")
-        self._file = file
+        self._file, self._path = file, path
+        self.left_out: set[str] = set()
+        self.storages: dict[str, Storage] = {}
 
     def load(self) -> Any:
         """The object in the pickle that starts here in the file. Raises PickleError."""
@@ -94,23 +160,46 @@ class PickleReader(pickle._Unpickler):
         except _PICKLE_DAMAGE as error:
             raise PickleError(f"damaged value ({error})") from None
 
-    def call(self, function: Global, arguments: tuple[Any, ...]) -> Any:
-        """The object for a call of a global."""
-        return Placeholder(function)
-
     def find_class(self, module: str, name: str) -> Global:
         """The name of a class or function: nothing is imported."""
         return Global(module, name)
 
-    def persistent_load(self, pid: Any) -> Any:
-        raise PickleError("a persistent id outside of a PyTorch file")
+    def persistent_load(self, pid: Any) -> Storage:
+        if not (isinstance(pid, tuple) and len(pid) >= 5 and pid[0] == "storage" and isinstance(pid[1], Global)):
+            raise PickleError("a persistent id that is no storage")
+        kind, key, count = pid[1], pid[2], pid[4]
+        if not (isinstance(key, str) and len(key) < 100 and type(count) is int and count >= 0):
+            raise PickleError("a storage without name or size")
+        if len(pid) > 5 and pid[5] is not None:
+            raise PickleError("a storage that is a part of another")
+        dtype = _DTYPES.get(kind.name) if kind.module in ("torch", "torch.cuda", "torch.storage") else None
+        if dtype is None:
+            raise PickleError(f"numbers of the unsupported type {kind}")
+        storage = self.storages.setdefault(key, Storage(key, dtype, count))
+        if (storage.dtype, storage.count) != (dtype, count):
+            raise PickleError(f"two descriptions of the storage {key}")
+        return storage
+
+    def _call(self, function: Global, arguments: tuple[Any, ...]) -> Any:
+        name = str(function)
+        if name in _MADE:
+            return _MADE[name](*arguments[:MOST_ARGUMENTS])
+        root = function.module.split(".")[0]
+        builtin = root in ("builtins", "__builtin__") and function.name in _ATTACKING_BUILTINS
+        if root in _ATTACKS or builtin:
+            raise WeightsError(
+                f"{self._path}: is not safe to read: it calls {name}, which can run programs. "
+                "Nothing in it was run; do not use this file"
+            )
+        self.left_out.add(name)
+        return Placeholder(function)
 
     def _reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
         if isinstance(function, Placeholder):  # a call of what an unknown call returned, such as getattr(…)
             self.stack.append(function)
         elif isinstance(function, Global) and isinstance(arguments, tuple):
-            self.stack.append(self.call(function, arguments))
+            self.stack.append(self._call(function, arguments))
         else:
             raise PickleError("a call of something that is not a function")
 
@@ -161,55 +250,6 @@ def _is_plain(key: Any) -> bool:
     return isinstance(key, str | float | bytes | None)
 
 
-LARGEST_PICKLE = 32 << 20
-LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
-MOST_DIMENSIONS = 16
-MOST_ARGUMENTS = 16  # of a call that is read
-LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
-# The exceptions of Python's zip reader for a damaged archive, and of this package for a damaged pickle.
-_DAMAGE = (PickleError, zipfile.BadZipFile, RuntimeError, KeyError, ValueError, OSError, EOFError, struct.error)
-_OLD_FORMAT = 0x1950A86A20F9469CFC6C  # the first number in a file of the older format
-_DTYPES = {
-    "FloatStorage": torch.float32,
-    "DoubleStorage": torch.float64,
-    "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16,
-    "LongStorage": torch.int64,
-    "IntStorage": torch.int32,
-    "ShortStorage": torch.int16,
-    "CharStorage": torch.int8,
-    "ByteStorage": torch.uint8,
-    "BoolStorage": torch.bool,
-    "ComplexFloatStorage": torch.complex64,
-    "ComplexDoubleStorage": torch.complex128,
-}
-# Modules whose functions run programs or code. Nothing of a file is ever called, but such a file is an attack.
-_ATTACKS = frozenset(("os", "posix", "nt", "subprocess", "sys", "pty", "runpy", "importlib", "shutil", "socket"))
-_ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__import__", "open", "input"))
-
-
-_Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
-
-
-@dataclass(frozen=True, eq=False)
-class Storage:
-    """A row of `count` numbers, by the pickle. key: its name in the file."""
-
-    key: str
-    dtype: torch.dtype
-    count: int
-
-
-@dataclass(frozen=True, eq=False)
-class StoredTensor:
-    """A tensor as the pickle describes it, not checked yet. Offset and strides count numbers."""
-
-    storage: Any
-    offset: Any
-    shape: Any
-    strides: Any
-
-
 @dataclass(frozen=True)
 class PthFile:
     """The contents of a PyTorch file.
@@ -244,57 +284,6 @@ def read_pth(path: Path) -> PthFile:
             return _read_zip(path, file) if start == b"PK\x03\x04" else _read_old(path, file)
         except _DAMAGE as error:
             raise _damaged(path, str(error)) from None
-
-
-_MADE: dict[str, Callable[..., Any]] = {
-    "collections.OrderedDict": lambda *_: {},
-    "collections.defaultdict": lambda *_: {},
-    "torch._utils._rebuild_tensor": StoredTensor,
-    "torch._utils._rebuild_tensor_v2": lambda *given: StoredTensor(*given[:4]),
-    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
-    "torch._utils._rebuild_parameter_with_state": lambda tensor, *_: tensor,
-    "torch.Size": lambda sizes=(), *_: sizes,
-}
-
-
-class _TorchReader(PickleReader):
-    """Makes the objects of a PyTorch file, and keeps the names of those that are left out."""
-
-    def __init__(self, file: io.BytesIO, path: Path) -> None:
-        super().__init__(file)
-        self._path = path
-        self.left_out: set[str] = set()
-        self.storages: dict[str, Storage] = {}
-
-    def call(self, function: Global, arguments: tuple[Any, ...]) -> Any:
-        name = str(function)
-        if name in _MADE:
-            return _MADE[name](*arguments[:MOST_ARGUMENTS])
-        root = function.module.split(".")[0]
-        builtin = root in ("builtins", "__builtin__") and function.name in _ATTACKING_BUILTINS
-        if root in _ATTACKS or builtin:
-            raise WeightsError(
-                f"{self._path}: is not safe to read: it calls {name}, which can run programs. "
-                "Nothing in it was run; do not use this file"
-            )
-        self.left_out.add(name)
-        return super().call(function, arguments)
-
-    def persistent_load(self, pid: Any) -> Storage:
-        if not (isinstance(pid, tuple) and len(pid) >= 5 and pid[0] == "storage" and isinstance(pid[1], Global)):
-            raise PickleError("a persistent id that is no storage")
-        kind, key, count = pid[1], pid[2], pid[4]
-        if not (isinstance(key, str) and len(key) < 100 and type(count) is int and count >= 0):
-            raise PickleError("a storage without name or size")
-        if len(pid) > 5 and pid[5] is not None:
-            raise PickleError("a storage that is a part of another")
-        dtype = _DTYPES.get(kind.name) if kind.module in ("torch", "torch.cuda", "torch.storage") else None
-        if dtype is None:
-            raise PickleError(f"numbers of the unsupported type {kind}")
-        storage = self.storages.setdefault(key, Storage(key, dtype, count))
-        if (storage.dtype, storage.count) != (dtype, count):
-            raise PickleError(f"two descriptions of the storage {key}")
-        return storage
 
 
 class _Tensors:
@@ -362,7 +351,7 @@ def _read_zip(path: Path, file: BinaryIO) -> PthFile:
             if order.decode("ascii", "replace") != sys.byteorder:
                 raise PickleError(f"its numbers have the byte order {order!r}")
         data = _entry(archive, f"{folder}/data.pkl", None, LARGEST_PICKLE)
-    reader = _TorchReader(io.BytesIO(data), path)
+    reader = PickleReader(io.BytesIO(data), path)
     contents = reader.load()
 
     @contextlib.contextmanager
@@ -390,14 +379,14 @@ def _entry(archive: zipfile.ZipFile, name: str, expected: int | None, largest: i
 def _read_old(path: Path, file: BinaryIO) -> PthFile:
     """magic number, protocol, system facts, contents and storage keys as pickles, then the storages."""
     start = io.BytesIO(file.read(LARGEST_PICKLE))
-    if PickleReader(start).load() != _OLD_FORMAT:
+    if PickleReader(start, path).load() != _OLD_FORMAT:
         raise PickleError("another kind of file")
-    PickleReader(start).load()
-    facts = PickleReader(start).load()
+    PickleReader(start, path).load()
+    facts = PickleReader(start, path).load()
     if isinstance(facts, dict) and facts.get("little_endian", True) != (sys.byteorder == "little"):
         raise PickleError("its numbers have another byte order")
-    reader = _TorchReader(start, path)
-    contents, keys = reader.load(), PickleReader(start).load()
+    reader = PickleReader(start, path)
+    contents, keys = reader.load(), PickleReader(start, path).load()
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise PickleError("the list of its storages is damaged")
     file.seek(start.tell())

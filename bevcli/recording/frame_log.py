@@ -219,7 +219,13 @@ class FrameLog:
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
             self._log_bev_images(self._bev_images.push((frame.stamp, prediction), features))
             self._at(frame.stamp)
-        self._log_attention(prediction, cameras)
+        if (attention := prediction.attention) is None:
+            return
+        log_bev.log_history(self._stream, attention.history_weight, prediction.grid)
+        log_bev.log_probes(self._stream, attention.probes, prediction.ego_from_bev, prediction.grid)
+        for posed in cameras if attention.probes else ():
+            samples = [p.cameras[posed.name] for p in attention.probes if posed.name in p.cameras]
+            log_cameras.log_samples(self._stream, posed, samples)
 
     def _log_bev_images(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
         for (stamp, prediction), image in ready:
@@ -235,13 +241,3 @@ class FrameLog:
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)
-
-    def _log_attention(self, prediction: Prediction, cameras: PosedCameras) -> None:
-        attention = prediction.attention
-        if attention is None:
-            return
-        log_bev.log_history(self._stream, attention.history_weight, prediction.grid)
-        log_bev.log_probes(self._stream, attention.probes, prediction.ego_from_bev, prediction.grid)
-        for posed in cameras if attention.probes else ():
-            samples = [p.cameras[posed.name] for p in attention.probes if posed.name in p.cameras]
-            log_cameras.log_samples(self._stream, posed, samples)

@@ -263,11 +263,12 @@ class TrackHistory:
     shown: list[str] = field(default_factory=list)
 
     def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
-        """Adds the boxes of a frame, in the recording's world; forgets what is too old."""
+        """Adds the boxes of a frame, in the recording's world, with instances; forgets what is too old."""
         if stamp.scene != self.scene:
             self.times_ns, self.positions = {}, {}
         self.scene = stamp.scene
-        for name, foot in zip(track_names(boxes), _feet(boxes), strict=True):
+        assert boxes.instances is not None
+        for name, foot in zip(boxes.instances.tolist(), _feet(boxes), strict=True):
             if name:
                 self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
                 self.positions.setdefault(name, []).append(foot)
@@ -276,13 +277,6 @@ class TrackHistory:
             self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
             if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
                 del self.times_ns[name], self.positions[name]
-
-
-def track_names(boxes: Boxes3D) -> list[str]:
-    """The identity of each box's track, "" for a box without one."""
-    if boxes.instances is None:
-        return [""] * len(boxes)
-    return [str(instance) for instance in boxes.instances]
 
 
 def log_tracks(
@@ -302,10 +296,14 @@ def log_tracks(
     # Anew in each scene: the times of a scene may lie before those of the one before.
     styled = history.shown if stamp.scene == history.scene else []
     history.add(boxes, stamp)
-    ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, classes)
+    feet, colors = _feet(boxes), box_colors(boxes, classes)
+    steps = np.column_stack([np.nan_to_num(boxes.velocities), np.zeros(len(boxes))]) * AHEAD_S
+    ahead = np.stack([feet, feet + steps], axis=1)  # (N, 2, 3) to where each will be a second later
+    bottoms = boxes.corners()[:, :4] + [0, 0, ABOVE_GROUND_M]
+    outlines = np.concatenate([bottoms, bottoms[:, :1]], axis=1)  # (N, 5, 3) closed
     shown: set[str] = set()
     drawn, flat_colors = [], []
-    for i, name in enumerate(track_names(boxes)):
+    for i, name in enumerate(boxes.instances.tolist()):
         if not name:
             continue
         entity = entities.track(str(boxes.classes[i]), name)
@@ -335,16 +333,3 @@ def _feet(boxes: Boxes3D) -> Array:
     """(N, 3) the points on the ground below the centres."""
     heights = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2 + ABOVE_GROUND_M
     return np.column_stack([boxes.centers[:, :2], heights])
-
-
-def _ahead(boxes: Boxes3D) -> Array:
-    """(N, 2, 3) from the place on the ground to the one a second later."""
-    feet = _feet(boxes)
-    steps = np.column_stack([np.nan_to_num(boxes.velocities), np.zeros(len(boxes))]) * AHEAD_S
-    return np.stack([feet, feet + steps], axis=1)
-
-
-def _footprints(boxes: Boxes3D) -> Array:
-    """(N, 5, 3) the closed outlines on the ground."""
-    bottoms = boxes.corners()[:, :4] + [0, 0, ABOVE_GROUND_M]
-    return np.concatenate([bottoms, bottoms[:, :1]], axis=1)

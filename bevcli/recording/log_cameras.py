@@ -49,16 +49,11 @@ class ImageLines:
     owners: NDArray[np.int64]
 
 
-def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> ImageLines:
-    """The edges and the front diagonals of boxes in a camera's image, cut to the part inside the image.
-
-    camera_from_boxes: (4, 4) from the boxes' frame to the camera frame at the image's time.
-    """
-    return lines_in_images(boxes, [camera], [camera_from_boxes])[0]
-
-
 def lines_in_images(boxes: Boxes3D, cameras: Sequence[Camera], cameras_from_boxes: Sequence[Array]) -> list[ImageLines]:
-    """As `lines_in_image`, in the image of each of C cameras."""
+    """The edges and the front diagonals of boxes in the images of C cameras, cut to the parts inside the images.
+
+    cameras_from_boxes: (4, 4) each, from the boxes' frame to the camera frame at the image's time.
+    """
     corners = boxes.corners()
     of_cameras = np.stack([apply(camera_from_boxes, corners) for camera_from_boxes in cameras_from_boxes])
     camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1))
@@ -154,32 +149,23 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
 
     Returns the centres of the labels (L, 2), pixels, and the boxes (L,) that they belong to.
     """
+    boxes, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
+    lows = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
+    highs = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
+    rectangles = zip(boxes.tolist(), lows, highs, strict=True)
     taken: list[tuple[float, float, float, float]] = []
     centers, owners = [], []
-    for owner, low, high in _by_height(lines):
+    for owner, low, high in sorted(rectangles, key=lambda item: item[1][1] - item[2][1]):
         if high[1] - low[1] < LOWEST_LABELLED * height:
             break
         half = len(texts[owner]) * LETTER_WIDTH * width / 2
         middle = float(np.clip((low[0] + high[0]) / 2, half, width - half))
-        area = (middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1])
-        if not any(_overlap(area, other) for other in taken):
-            taken.append(area)
+        left, top, right, bottom = middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1]
+        if not any(left < other[2] and other[0] < right and top < other[3] and other[1] < bottom for other in taken):
+            taken.append((left, top, right, bottom))
             centers.append((middle, low[1] - LETTER_HEIGHT * height / 2))
             owners.append(owner)
     return np.array(centers).reshape(-1, 2), np.array(owners, dtype=np.int64)
-
-
-def _by_height(lines: ImageLines) -> list[tuple[int, Array, Array]]:
-    """Each box in the image with its bounding rectangle's corners (2,), (2,), the highest rectangle first."""
-    owners, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
-    low = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
-    high = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
-    around = list(zip(owners.tolist(), low, high, strict=True))
-    return sorted(around, key=lambda item: item[1][1] - item[2][1])
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 @dataclass(frozen=True)
@@ -259,19 +245,19 @@ class CameraImages:
     def log(self, camera: str, image: CameraImage | None) -> None:
         """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
         if image is not None:
-            written = self._video_image(camera, image) if self._as_video else _encoded(image)
-            self._stream.log(entities.image(camera), written)
+            if not self._as_video:
+                self._stream.log(entities.image(camera), _encoded(image))
+                return
+            if camera not in self._encoders:
+                height, width = image.pixels_bgr.shape[:2]
+                self._encoders[camera] = Av1Encoder(width, height)
+            data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
+            sample = rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
+            self._stream.log(entities.image(camera), sample)
             return
         self._stream.log(entities.image(camera), rr.Clear(recursive=False))
         if camera in self._encoders:
             self._encoders.pop(camera).close()
-
-    def _video_image(self, camera: str, image: CameraImage) -> rr.VideoStream:
-        if camera not in self._encoders:
-            height, width = image.pixels_bgr.shape[:2]
-            self._encoders[camera] = Av1Encoder(width, height)
-        data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
-        return rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
 
     def close(self) -> None:
         """Ends all video streams."""

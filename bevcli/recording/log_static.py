@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bevcli._version import __version__
 from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
@@ -146,8 +146,19 @@ def log_scene(
     infos = [rr.AnnotationInfo(id=i + 1, label=n, color=color) for i, (n, color) in enumerate(classes.items())]
     stream.log("/", rr.AnnotationContext([rr.AnnotationInfo(id=0, label="other"), *infos]), static=True)
     for camera in rig.cameras:
-        _log_pinhole(stream, camera)
-    _log_vehicle(stream, rig, default_vehicle() if vehicle is None else vehicle)
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.intrinsics,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=FRUSTUM_LENGTH_M,
+            color=[*EGO_COLOR, 160],
+            line_width=0.01,
+        )
+        stream.log(entities.camera(camera.name), pinhole, static=True)
+    vehicle = default_vehicle() if vehicle is None else vehicle
+    log_mesh(stream, entities.VEHICLE, vehicle.mesh)
+    strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
+    stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
     _log_rings(stream, rig, grid)
 
 
@@ -210,24 +221,6 @@ def log_pillars(
     colors, points = np.tile(of_pillar, (len(pillars), 1)), apply(ego_from_bev, pillars).reshape(-1, 3)
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
     return pillars.reshape(-1, 3), packed(colors)
-
-
-def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
-    pinhole = rr.Pinhole(
-        image_from_camera=camera.intrinsics,
-        resolution=[camera.width, camera.height],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=FRUSTUM_LENGTH_M,
-        color=[*EGO_COLOR, 160],
-        line_width=0.01,
-    )
-    stream.log(entities.camera(camera.name), pinhole, static=True)
-
-
-def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig, vehicle: VehicleMesh) -> None:
-    log_mesh(stream, entities.VEHICLE, vehicle.mesh)
-    strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
-    stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
 
 
 def log_mesh(stream: rr.RecordingStream, entity: str, mesh: Mesh) -> None:

@@ -80,26 +80,26 @@ def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
 
 
 def default_vehicle() -> VehicleMesh:
-    """A plain car with a cabin and four wheels."""
-    body = _box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62)
-    wheels = [_wheel() + (x, y, 0.34) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)]
-    return _joined([(body, EGO_COLOR), (_cabin(), GLASS), *((wheel, RUBBER) for wheel in wheels)])
+    """A plain car with a cabin and four wheels, in flat shading: each corner of each triangle is a vertex of its own.
 
-
-# The parts of the default car are triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside. They
-# are made with NumPy, because trimesh would take half a second to load at the start of every run.
-
-
-def _cabin() -> Array:
+    It is made with NumPy, because trimesh would take half a second to load at the start of every run.
+    """
     cabin = _box(2.5, 1.66, 0.6)
     cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
-    return cabin + (1.0, 0, 1.28)
-
-
-def _wheel(radius: float = 0.34, width: float = 0.24, sections: int = 20) -> Array:
-    turns = np.arange(sections) / sections * 2 * np.pi
-    standing = _prism(radius * np.stack([np.cos(turns), np.sin(turns)], -1), width)
-    return standing[..., [1, 2, 0]]
+    turns = np.arange(20) / 20 * 2 * np.pi
+    wheel = _prism(0.34 * np.stack([np.cos(turns), np.sin(turns)], -1), 0.24)[..., [1, 2, 0]]
+    parts = [
+        (_box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62), EGO_COLOR),
+        (cabin + (1.0, 0, 1.28), GLASS),
+        *((wheel + (x, y, 0.34), RUBBER) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)),
+    ]
+    triangles = np.concatenate([part for part, _ in parts])
+    normals = _normals(triangles)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
+    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
 
 
 def _box(length: float, width: float, height: float) -> Array:
@@ -108,7 +108,10 @@ def _box(length: float, width: float, height: float) -> Array:
 
 
 def _prism(outline: Array, height: float) -> Array:
-    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2."""
+    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2.
+
+    Returns triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside.
+    """
     low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
     low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
     sides = [(low, low_next, high_next), (low, high_next, high)]
@@ -120,17 +123,6 @@ def _prism(outline: Array, height: float) -> Array:
 
 def _normals(triangles: Array) -> Array:
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-
-
-def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
-    """Flat shading: each corner of each triangle is a vertex of its own."""
-    triangles = np.concatenate([part for part, _ in parts])
-    normals = _normals(triangles)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
-    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
-    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
 
 
 def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:

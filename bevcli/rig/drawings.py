@@ -125,15 +125,10 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
     return canvas
 
 
-def draw_lines(canvas: Pixels, lines: list[Array], color: Color, thickness: int) -> None:
-    """Draw lines (P, 2) in pixels on an image (H, W, 3), in place."""
-    points = [np.round(line * 16).astype(np.int32) for line in lines]
-    cv2.polylines(canvas, points, False, color, thickness, cv2.LINE_AA, 4)
-
-
 def _blend_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
-    layer = canvas.copy()
-    draw_lines(layer, lines, color, thickness)
+    """Draw lines (P, 2) in pixels on an image (H, W, 3), in place."""
+    layer, points = canvas.copy(), [np.round(line * 16).astype(np.int32) for line in lines]
+    cv2.polylines(layer, points, False, color, thickness, cv2.LINE_AA, 4)
     cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
 
 
@@ -166,10 +161,7 @@ CAR_LENGTH_M, CAR_WIDTH_M, AXLE_TO_TAIL_M = 4.6, 1.8, 1.0
 
 
 def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
-    """Write the PNG. Raises OutputError.
-
-    images: by camera, (H, W, 3) BGR; a camera without an image is drawn on a dark background.
-    """
+    """Write the PNG. images: by camera, (H, W, 3) BGR; others are drawn on a dark background. Raises OutputError."""
     front, left, right, back = _cameras_by_side(rig)
     columns = max(len(front), len(back), 3)
     ahead, behind = (max(map(_camera_height, row), default=0.0) for row in (front, back))

@@ -327,10 +327,7 @@ def _defect(
 
 
 def _explains(mistake: Mistake, camera: Camera, *, by_name: bool = True) -> bool:
-    """True if undoing the mistake gives a plausible, level pose that fits the camera's name.
-
-    by_name: whether it has to fit the name.
-    """
+    """True if undoing the mistake gives a plausible, level pose that fits the name, or with by_name=False any name."""
     undone = replace(camera, ego_from_camera=mistake.undo(camera.ego_from_camera))
     mounting, named = mounting_of(undone.ego_from_camera), direction_of_name(camera.name)
     level = abs(mounting.pitch_deg) <= LEVEL_DEG[0] and abs(mounting.roll_deg) <= LEVEL_DEG[1]

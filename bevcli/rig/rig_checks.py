@@ -80,10 +80,7 @@ _ANGLES = np.radians(np.arange(0.25, 89.5, 0.25))
 
 
 def check_lenses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
-    """At most one error a camera: from the lens model, the image size, the field of view, or the matrix, in this order.
-
-    Cameras without an error may get warnings.
-    """
+    """At most one error a camera: of the lens model, image size, field of view or matrix; or else warnings."""
     findings: list[Finding] = []
     for camera in cameras:
         possible = (_distortion(camera), _resolution(camera), _field_of_view(camera), _center_or_skew(camera))

@@ -135,10 +135,7 @@ def measures_of(cameras: Sequence[Camera], coverage: Coverage) -> tuple[Measure,
 
 
 def check_measures(measures: Sequence[Measure]) -> tuple[Finding, ...]:
-    """A warning for every property that is far from nuScenes'.
-
-    Cells that no camera sees are left out: `check_coverage` reports them.
-    """
+    """A warning for every property that is far from nuScenes', but for unseen cells: `check_coverage` reports them."""
     far = [measure for measure in measures if not measure.is_near and measure.code != "cells-seen"]
     return tuple(
         Finding(m.code, "warning", None, f"{m.name}: far from nuScenes'", m.value, m.reference, ADVICE) for m in far

@@ -1,5 +1,7 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 from collections.abc import Callable, Mapping
@@ -11,8 +13,7 @@ import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import OutputError
-from bevcli.evaluation.box_format import CsvWriter
-from bevcli.evaluation.submission import SubmissionWriter
+from bevcli.evaluation.box_format import CsvWriter, SubmissionWriter
 from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
@@ -69,7 +70,7 @@ class RunFiles:
         self._sequence, self._model, self._options, self._live = sequence, model, options, live
         self._stack = contextlib.ExitStack()
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
-        self._submission: SubmissionWriter | None = None
+        self._submission: SubmissionWriter | None = None  # of nuScenes drives
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
@@ -79,7 +80,7 @@ class RunFiles:
         if resume is not None:
             self._check_files(resume)
 
-    def __enter__(self) -> "RunFiles":
+    def __enter__(self) -> RunFiles:
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
@@ -104,7 +105,7 @@ class RunFiles:
                 facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
                 self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
             if resume is not None and SUBMISSION in resume.sizes:
-                self._submission = self._open(SUBMISSION, SubmissionWriter)
+                self._submission = self._open_submission()
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
@@ -137,7 +138,7 @@ class RunFiles:
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
             self._tracks.write(tracked, self._reference)
         if frame.sample_token is not None:
-            self._submission = self._submission or self._open(SUBMISSION, SubmissionWriter)
+            self._submission = self._submission or self._open_submission()
             self._submission.write(boxes)
         ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
         for kind, writer in self._results.items():
@@ -187,6 +188,9 @@ class RunFiles:
         file = write(self._out / name, resume_at=resume_at, **how)
         self._files[name] = self._stack.enter_context(file)
         return file
+
+    def _open_submission(self) -> SubmissionWriter:
+        return self._open(SUBMISSION, SubmissionWriter)
 
     def _check_that_files_exist(self) -> None:
         if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):

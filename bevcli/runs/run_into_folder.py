@@ -8,9 +8,8 @@ from typing import Any
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import WriteBehind
-from bevcli.inference.commands import read_commands
 from bevcli.inference.load import Model
-from bevcli.inference.runner import RunnerState
+from bevcli.inference.runner import RunnerState, read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.sequence_checks import CheckedDrive

@@ -24,7 +24,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.load import Model, hash_of
 from bevcli.inference.runner import Memory, RunnerState
-from bevcli.model.tensors import tensors_in
+from bevcli.model.upload import tensors_in
 from bevcli.parsing.files import read_bytes
 from bevcli.runs.files import FilesState, RunFiles
 from bevcli.runs.folder import RunFolder

@@ -131,11 +131,11 @@ class RunSummary:
         if prediction.started_anew:
             counts.started_anew.append((index, str(prediction.started_anew)))
 
-    def _rig_notes(self) -> list[str]:
+    def _input_notes(self) -> list[str]:
         missing = Counter(camera for _, camera, _ in self.counts.dropped)
         flat = [name for name, count in self.counts.flat.items() if count == self.frames - missing[name]]
         notes = [f"all images of {name} are nearly black or white: are they 12 bits in 16?" for name in flat]
-        return [*self.input_errors, *self._model.rig_notes(self._sequence.rig), *notes]
+        return [*self.input_errors, *self._model.training_notes(self._sequence.rig), *notes]
 
     @property
     def frames(self) -> int:
@@ -174,7 +174,7 @@ class RunSummary:
             "skipped_frames": counts.skipped,
             "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
             "started_anew": _rows(counts.started_anew, "frame", "reason"),
-            "notes": [*self._sequence.notes, *self._rig_notes()],
+            "notes": [*self._sequence.notes, *self._input_notes()],
             "files": [str(path) for path in self.files],
         }
 
@@ -206,7 +206,7 @@ class RunSummary:
             rows.append(("failed", f"{counted(len(counts.not_finite), 'frames')}: NaN or infinity, first in {where}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
-        rows += [("rig", note) for note in self._rig_notes()]
+        rows += [("rig", note) for note in self._input_notes()]
         rows += [("written", str(path)) for path in self.files]
         return "\n".join(f"{name:<8} {text}" for name, text in rows)
 

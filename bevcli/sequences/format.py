@@ -75,16 +75,16 @@ def _loaded() -> tuple[tuple[Format, ...], tuple[BevcliError, ...]]:
 
 def option_classes() -> list[type[FormatOptions]]:
     """The dataclasses of the formats' own options."""
-    return [one.options for one in formats()]
+    return [form.options for form in formats()]
 
 
 def format_of(path: Path) -> Format:
     """The format of a path. Raises InputError if it is missing, or is no drive, or has two formats."""
     known, broken = _loaded()
-    known = tuple(sorted(known, key=lambda one: one.precedence))  # in messages, the most general one comes first
+    known = tuple(sorted(known, key=lambda form: form.precedence))  # in messages, the most general one comes first
     if not path.exists():
-        raise InputError(f"{path}: is missing (expected {_either([one.name for one in known])})")
-    matching = [one for one in known if one.recognises(path)]
+        raise InputError(f"{path}: is missing (expected {_either([form.name for form in known])})")
+    matching = [form for form in known if form.recognises(path)]
     if not matching:
         drives = list(drives_in(path))
         if drives:
@@ -94,10 +94,10 @@ def format_of(path: Path) -> Format:
                 "`bevcli batch`"
             )
         kind = "is a file, and not" if path.is_file() else "is not"
-        expected = _either([f"{one.name} (expected {one.expected})" for one in known])
+        expected = _either([f"{form.name} (expected {form.expected})" for form in known])
         raise InputError("; ".join([f"{path}: {kind} {expected}", *map(str, broken)]))
-    highest = max(one.precedence for one in matching)
-    first, *others = [one for one in matching if one.precedence == highest]
+    highest = max(form.precedence for form in matching)
+    first, *others = [form for form in matching if form.precedence == highest]
     if others:
         raise InputError(f"{path}: is {first.name} and {others[0].name}: keep the files of one format there")
     return first
@@ -121,7 +121,7 @@ def true_results(form: str, folder: Path, **facts: Any) -> tuple[TrueResult, ...
 
 def is_drive(path: Path) -> bool:
     """True for a path that a format recognises."""
-    return any(one.recognises(path) for one in formats())
+    return any(form.recognises(path) for form in formats())
 
 
 def drives_in(root: Path) -> dict[str, Path]:
@@ -142,7 +142,7 @@ def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator
         if path.name.startswith("."):
             continue
         with suppress(OSError):  # a folder that this user may not read holds no drive of theirs
-            if any(one.recognises(path) for one in known):
+            if any(form.recognises(path) for form in known):
                 yield path
             elif depth > 1:
                 yield from _drives_below(path, known, depth - 1)
@@ -161,14 +161,14 @@ def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: st
     where: start of a message. Raises InputError for an option that only other formats have; TypeError for one that no
     format has, or BevcliError if a format cannot be imported that may have it.
     """
-    own = {name for one in chosen for name in defaults(one.options)}
+    own = {name for form in chosen for name in defaults(form.options)}
     for name in (name for name in values if name not in own):
         known, broken = _loaded()
-        having = [one for one in known if name in defaults(one.options)]
+        having = [form for form in known if name in defaults(form.options)]
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0].options)[name]:
-            raise InputError(f"{where}: `{name}` is for {_either([one.name for one in having])}: remove it")
+            raise InputError(f"{where}: `{name}` is for {_either([form.name for form in having])}: remove it")
 
 
 def _either(names: list[str]) -> str:

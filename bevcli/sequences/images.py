@@ -24,15 +24,21 @@ from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.waiting import result_within
 
-# Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
-# H.265, VP9 and AV1.
+# Where the beginning of a file shows its container: offset and bytes. The last row is that of streams in bags.
 CONTAINERS = (
     (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
-    (0, b"\x1a\x45\xdf\xa3"),
-    (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
+    (0, b"\x1a\x45\xdf\xa3"), (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"),
 )  # fmt: skip
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
+DECODING_THREADS = 6
+READING_TIMEOUT_S = 120.0
+LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
+# The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
+DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 class VideoReader:
@@ -77,7 +83,7 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     with open_regular(path, missing="is missing") as file:
         start = file.read(12)
     # FFmpeg recognises playlists too, which could lead it to other files and to servers.
-    if not any(start[place:].startswith(magic) for place, magic in CONTAINERS):
+    if not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
     try:
         with plain_name(path) as name:
@@ -112,16 +118,6 @@ def count_and_rate(path: Path) -> tuple[int, float]:
     if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
         raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
     return int(count), rate
-
-
-DECODING_THREADS = 6
-READING_TIMEOUT_S = 120.0
-LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
-# The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
-DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -232,7 +228,6 @@ class ImageReader:
         return image
 
     def _check_place(self, source: ImageSource) -> None:
-        """Raises InputError for an image that lies outside of the sequence, also behind a link."""
         if self._inside is None:
             return
         try:

@@ -17,6 +17,11 @@ from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.format import drives_in, format_of, is_drive, own_options
 from bevcli.sequences.options import SequenceOptions
 
+# A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
+SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+SHORTEST_PERIODS_NS = 3_000_000, 5_000_000  # between frames: a shorter one has a wrong unit; the right unit gives more
+LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
+
 
 def open_sequence(path: str | Path, options: SequenceOptions | None = None, **changes: Any) -> Sequence:
     """Open a drive.
@@ -70,12 +75,6 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
 def _drive_of(root: Path, name: str) -> Path | None:
     """A drive of a folder of drives by its name; None where the path is a drive itself, or holds none of this name."""
     return None if not root.is_dir() or is_drive(root) else drives_in(root).get(name)
-
-
-# A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
-SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
-SHORTEST_PERIODS_NS = 3_000_000, 5_000_000  # between frames: a shorter one has a wrong unit; the right unit gives more
-LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
 class Selection(DerivedSequence):

@@ -36,11 +36,15 @@ MAP_COLORS = {
     "drivable_road": (201, 206, 216), "lane_boundary": (242, 169, 0), "pedestrian_crossing": (95, 163, 211),
     "vehicle": (228, 87, 46),
 }  # fmt: skip
-CAN_BUS = (  # name, unit, how many of the 18 numbers, colour
-    ("position change x, y, z (world)", "m", 3, ORANGE), ("quaternion w, x, y, z", "", 4, "#7b3ff2"),
-    ("acceleration x, y, z", "m/s²", 3, BLUE), ("rotation rate x, y, z", "rad/s", 3, "#b7791f"),
-    ("velocity x, y, z", "m/s", 3, GREEN), ("heading", "rad", 1, "#c2185b"), ("heading change", "°", 1, "#0f766e"),
-)  # fmt: skip
+CAN_BUS = (  # names, unit, colour
+    ([f"position change {axis}" for axis in "xyz"], "m", ORANGE),
+    ([f"quaternion {part}" for part in "wxyz"], "", "#7b3ff2"),
+    ([f"acceleration {axis}" for axis in "xyz"], "m/s²", BLUE),
+    ([f"rotation rate {axis}" for axis in "xyz"], "rad/s", "#b7791f"),
+    ([f"velocity {axis}" for axis in "xyz"], "m/s", GREEN),
+    (["heading"], "rad", "#c2185b"),
+    (["heading change"], "°", "#0f766e"),
+)
 SCORE = 0.3  # boxes below this are not drawn
 VISIBILITY = 0.2  # true boxes below this are not drawn
 PARTS = ("neck", "pillars", "bev_queries", "encoder", "decoder", "segmentation_head")
@@ -185,13 +189,6 @@ def mark_cell(axes: Axes, trace: Trace) -> None:
         axes.add_patch(Rectangle(trace.center - side / 2, *side, fc="none", ec=color, lw=width, zorder=9))
 
 
-def table(axes: Axes, top: float, bottom: float) -> Any:
-    """`axes.text` for the cells of a table. Columns are 0 to 10."""
-    axes.set(xlim=(0, 10), ylim=(bottom, top))
-    axes.axis("off")
-    return lambda x, y, text, **look: axes.text(x, y, text, **{"fontsize": 12, "color": INK, "va": "center", **look})
-
-
 def colors_of(maps: Iterable[NDArray[Any]]) -> list[NDArray[np.uint8]]:
     """Maps (Y, X, C) -> images (Y, X, 3): three principal components of all of them. White where a map is zero."""
     maps = list(maps)
@@ -296,9 +293,6 @@ def bev_queries(trace: Trace) -> Figure:
     x, y = trace.center
     panels[0].axhspan(y - size_y / 2, y + size_y / 2, color=BLUE, alpha=0.28, zorder=2)
     panels[0].axvspan(x - size_x / 2, x + size_x / 2, color=ORANGE, alpha=0.28, zorder=2)
-    for place, text, color in (((20, y), f"row {trace.row}", BLUE), ((x, -29), f"column {trace.column}", ORANGE)):
-        label = panels[0].text(*place, text, color=color, ha="center", va="center", fontsize=11, fontweight="bold")
-        label.set(bbox={"fc": "white", "ec": "none", "pad": 2}, zorder=12)
     show(panels[1], trace, colors_of([trace.as_map(trace.network.bev_queries.embedding)])[0])
     position = similarity(trace.as_map(trace.network.bev_queries.position()), trace)
     image = show(panels[2], trace, position, cmap="RdBu_r", vmin=-1, vmax=1)
@@ -309,38 +303,26 @@ def bev_queries(trace: Trace) -> Figure:
 
 
 def can_bus(trace: Trace) -> Figure:
-    subtitle = (
-        "Left: the numbers of the can-bus embedding, bars scaled by group. Right: shift and rotation of the history."
-    )
+    moved, turned, now = trace.shift * trace.extent_m, float(trace.can_bus[17]), vehicle(trace)
+    subtitle = f"Shift {moved[0]:+.2f} m in x, {moved[1]:+.2f} m in y; rotation {turned:+.2f}° (counter-clockwise)."
     figure = titled(7.9, "Ego-motion: the 18 can-bus numbers, the shift and the rotation", subtitle)
-    spec = figure.add_gridspec(1, 2, width_ratios=(1.25, 1), wspace=0.06, left=0.015, bottom=0.075)
-    axes = figure.add_subplot(spec[0])
-    write, row = table(axes, -0.6, 18.1), 0
-    for name, unit, count, color in CAN_BUS:
-        group = trace.can_bus[row : row + count]
-        write(0.75, row + (count - 1) / 2, name)
-        for value in group:
-            write(6.1, row, f"{value + 0.0:.3f}", ha="right", family="monospace")
-            write(6.25, row, unit, fontsize=11, color=GREY)
-            width = 1.25 * value / max(np.abs(group).max(), 1e-9)
-            axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=color, ec="none", alpha=0.85))
-            row += 1
-    axes, moved, turned = figure.add_subplot(spec[1]), trace.shift * trace.extent_m, float(trace.can_bus[17])
-    now = vehicle(trace)
+    spec = figure.add_gridspec(1, 2, width_ratios=(1.25, 1), wspace=0.06, left=0.16, bottom=0.075)
+    axes, row, labels = figure.add_subplot(spec[0]), 0, list[str]()
+    for names, unit, color in CAN_BUS:
+        group = trace.can_bus[row : row + len(names)]
+        axes.barh(range(row, row + len(names)), group / max(np.abs(group).max(), 1e-9), color=color, height=0.6)
+        labels += [f"{name}  {value + 0:.3f} {unit}" for name, value in zip(names, group, strict=True)]
+        row += len(names)
+    axes.set_yticks(range(row), labels, fontsize=11)
+    axes.set(xlim=(-1.1, 1.1), ylim=(row, -1), xticks=[0])
+    axes = figure.add_subplot(spec[1])
     before = now @ rotation_about_z(np.radians(-turned))[:2, :2].T - moved
     axes.add_patch(Polygon(before, fc="none", ec=GREY, lw=1.8, ls="--", zorder=5))
     axes.add_patch(Polygon(now, fc="#fde3dc", ec=ORANGE, lw=2.2, zorder=4))
-    arrow = {"arrowstyle": "-|>", "color": BLUE, "lw": 2.6, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", (0, 0), xytext=tuple(-moved), arrowprops=arrow, zorder=6)
+    axes.annotate("", (0, 0), tuple(-moved), arrowprops={"arrowstyle": "-|>", "color": BLUE, "lw": 2.6}, zorder=6)
     reach, (x, y) = max(5.0, float(np.abs(moved).max()) + 3.5), -moved / 2
     axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xlabel="x, m (bev frame)")
     axes.set_title("Vehicle: previous frame dashed, current frame solid", fontsize=13, color=INK, loc="left", pad=7)
-    axes.text(
-        x - 0.95 * reach,
-        y - 0.95 * reach,
-        f"shift ({moved[0]:+.2f}, {moved[1]:+.2f}) m, rotation {turned:+.2f}°",
-        fontsize=12,
-    )
     return figure
 
 
@@ -383,7 +365,7 @@ def spatial_attention(trace: Trace) -> Figure:
         inside = ((samples[name].pixels >= 0) & (samples[name].pixels < size)).all(-1)
         pixels, weights = samples[name].pixels[inside], samples[name].weights[inside]
         center = np.average(pixels, axis=0, weights=weights)
-        window = size * np.clip(2.2 * np.quantile(np.abs(pixels - center) / size, 0.8, axis=0).max(), 0.15, 0.42)
+        window = 0.4 * size
         left, top = np.clip(center - window / 2, 0, size - window)
         own, visible = in_image(trace, name, trace.grid.pillars()[trace.row, trace.column])
         for column, (title, scale) in enumerate(((name, 30), ("enlarged", 160))):
@@ -513,7 +495,6 @@ def box_code(trace: Trace) -> Figure:
     subtitle = f"Query {query}, class {name}: code and box after each decoder layer. Cross: the first reference point."
     figure = titled(6.1, "Box code: ten numbers per object query", subtitle)
     spec = figure.add_gridspec(1, 2, width_ratios=(1.75, 1), wspace=0.09, left=0.015, bottom=0.085)
-    write = table(figure.add_subplot(spec[0]), -1.5, 11.3)
     (length, width, height), last = found.sizes_lwh[-1], code[-1]
     meanings = {
         "cx": f"centre at x = {last[0]:.1f} m", "cy": f"centre at y = {last[1]:.1f} m",
@@ -523,16 +504,14 @@ def box_code(trace: Trace) -> Figure:
         "vx": f"velocity in x {last[8]:+.2f} m/s", "vy": f"velocity in y {last[9]:+.2f} m/s",
         "score": f"sigmoid of the logit of class {name}",
     }  # fmt: skip
-    shown = sorted({0, len(code) // 2, len(code) - 1})
-    columns = [(2.3 + 1.35 * place, layer) for place, layer in enumerate(shown)]
-    for x, layer in columns:
-        write(x, -1.0, f"layer {layer + 1}", ha="right", color=GREY)
-    for row, (title, meaning) in enumerate(meanings.items()):
-        write(0.15, row, title, fontweight="bold")
-        write(columns[-1][0] + 0.45, row, meaning)
-        for x, layer in columns:
-            value = scores[layer, query, label] if title == "score" else code[layer, row]
-            write(x, row, f"{value:+.2f}", ha="right", family="monospace", color=ORANGE if layer == shown[-1] else INK)
+    values = np.column_stack([code, found.scores]).T  # (11, L)
+    rows = [[*(f"{value:+.2f}" for value in row), text] for row, text in zip(values, meanings.values(), strict=True)]
+    heads = [*(f"layer {layer + 1}" for layer in range(len(code))), "meaning of the last layer"]
+    axes = figure.add_subplot(spec[0])
+    axes.axis("off")
+    look: dict[str, Any] = {"cellLoc": "left", "edges": "horizontal", "bbox": (0.1, 0, 0.9, 1)}
+    cells = axes.table(rows, rowLabels=list(meanings), colLabels=heads, colWidths=[0.14] * len(code) + [0.5], **look)
+    cells.set_fontsize(12)
     axes = bev_axes(figure.add_subplot(spec[1]), trace, "Box after each layer")
     truth(axes, trace)
     boxes(axes, found[:-1], BLUE, width=1.4, style=":")

@@ -99,7 +99,7 @@ def test_lens_distortion_is_respected(street, lens, zoom):
 
 def test_no_point_is_matched_twice(result, matched):
     [found] = matched
-    points = np.column_stack([found.group, found.pixels_a.astype(int)])
+    points = np.column_stack([found.group, found.rays_a])
     assert len(np.unique(points, axis=0)) == len(points) > 1000
 
 

@@ -270,8 +270,8 @@ def test_a_command_of_another_package_appears(tmp_path):
     assert program("greet", "--to", "nobody").stderr == "error: pass another --to\n"
 
 
-def test_a_command_imports_no_other_command():
+def test_a_command_imports_no_other_file_of_commands():
     code = "import sys, bevcli.cli.main as m; m.app(['samples', '--help'], standalone_mode=False); print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
-    assert "bevcli.cli.samples" in loaded
+    assert "bevcli.cli.commands" in loaded
     assert "bevcli.cli.run" not in loaded

@@ -26,7 +26,7 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
-from bevcli.inference.preprocess import Preprocessor, calibration_images
+from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
@@ -35,7 +35,7 @@ from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_form import pixels_of
-from bevcli.workshop.engines.export_onnx import export_onnx, quantize
+from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs, step_of_file

@@ -17,7 +17,6 @@ from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import Model, load_model
-from bevcli.inference.preprocess import calibration_images
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.model.config import ImageConfig
 from bevcli.model.temporal_model import build_model
@@ -25,7 +24,7 @@ from bevcli.registry import entries
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.engines.differences import FrameDifference, check_exported
-from bevcli.workshop.engines.export_onnx import export_onnx, quantize
+from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original

@@ -17,8 +17,7 @@ import torch
 from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.load import Model, installed_engines, load_model
-from bevcli.inference.run import run
-from bevcli.inference.session import Session
+from bevcli.inference.run import Session, run
 from bevcli.sequences.open import select_range
 from bevcli.workshop.engines import export_cache as module
 from bevcli.workshop.engines.engine import OnnxRuntimeEngine, OpenVinoEngine, load_exported

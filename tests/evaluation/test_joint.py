@@ -8,8 +8,7 @@ from random_boxes import as_predictions, random_truth
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.evaluate import FrameScores
-from bevcli.evaluation.segmentation import evaluate_segmentation
+from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.runs.state import load_state, save_state

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bevcli.evaluation.segmentation import evaluate_segmentation
+from bevcli.evaluation.evaluate import evaluate_segmentation
 from bevcli.frame import BevMap
 
 RANGES = ((-2.0, 2.0), (-2.0, 2.0))

@@ -94,7 +94,7 @@ def _recording(folder: Path) -> None:
     from bevcli.viewer.recording_reader import summarise
 
     with open_recording(folder / "recording.rrd") as file:
-        summarise(folder / "recording.rrd", file).text()
+        summarise(folder / "recording.rrd", file)
 
 
 def _state(folder: Path) -> None:

@@ -64,7 +64,7 @@ def _read(path: Path) -> list[dict]:
     with open_recording(path) as file:
         try:
             write_boxes(read_recording(file), out)
-            summarise(path, file).text()
+            summarise(path, file)
         finally:
             frame_rate(file)
             images = CameraImages()

@@ -7,9 +7,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from random import Random
 
-from bevcli.weights import download
+from bevcli.weights import fetch
 
-MOST_REQUESTS = download.ATTEMPTS + download.LEAST_SHARE + 1
+MOST_REQUESTS = fetch.ATTEMPTS + fetch.LEAST_SHARE + 1
 
 
 def server_behaviour(seeds: Path, case: Path, random: Random) -> None:
@@ -20,13 +20,13 @@ def server_behaviour(seeds: Path, case: Path, random: Random) -> None:
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-    download.PAUSE_S, download.STALL_S = 0.0, 1
+    fetch.PAUSE_S, fetch.STALL_S = 0.0, 1
     try:
         for _ in range(2):  # the second command goes on with what the first one has left
             asked.clear()
             try:
                 url = f"http://127.0.0.1:{server.server_port}/w.pth"
-                download.download(url, case / "w", None, lambda done, total: None)
+                fetch._download(url, case / "w", None, lambda done, total: None)
             finally:
                 assert len(asked) <= MOST_REQUESTS, f"{len(asked)} requests"
             assert (case / "w").read_bytes() in versions.values()

@@ -17,7 +17,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev, level_rig
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
-from bevcli.inference.training_rigs import facts_notes, rig_notes, weights_facts
+from bevcli.inference.training_rigs import facts_notes, training_rig_notes, weights_facts
 from bevcli.model.config import BevFrameConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.synth.rig import nuscenes_like_rig
@@ -36,26 +36,26 @@ def with_bev_frame(ego_from_bev: Array) -> CameraRig:
 
 
 def test_the_rig_of_the_training_needs_no_note():
-    assert rig_notes(nuscenes_like_rig(), load_config("demo")) == ()
+    assert training_rig_notes(nuscenes_like_rig(), load_config("demo")) == ()
 
 
 def test_unlike_cameras_are_told_on_one_line_with_the_cost():
     rig = nuscenes_like_rig()
     higher = [replace(c, ego_from_camera=rigid((0, 0, 2.0)) @ c.ego_from_camera) for c in rig.cameras]
-    (note,) = rig_notes(CameraRig(tuple(higher), rig.ego_from_bev), load_config("demo"))
+    (note,) = training_rig_notes(CameraRig(tuple(higher), rig.ego_from_bev), load_config("demo"))
     assert "camera heights 3.5 to 3.6 m (0.8 to 2.8 m)" in note
     assert "; measured: mAP" in note
     assert "\n" not in note
     three = [replace(make_camera(f"C{k}", 120.0 * k), name=f"C{k}") for k in range(3)]
-    (note,) = rig_notes(CameraRig(tuple(three), rig.ego_from_bev), load_config("demo"))
+    (note,) = training_rig_notes(CameraRig(tuple(three), rig.ego_from_bev), load_config("demo"))
     assert "3 cameras (4 to 8)" in note
 
 
 def test_a_tilted_bev_frame_is_told_by_what_the_weights_expect():
-    (note,) = rig_notes(with_bev_frame(tilted(2.7)), load_config("demo"))
+    (note,) = training_rig_notes(with_bev_frame(tilted(2.7)), load_config("demo"))
     assert "tilted by 2.7° and 1.84 m high, but the weights expect a level one at 1.84 m" in note
-    assert rig_notes(with_bev_frame(tilted(2.7)), load_config("tiny")) == ()
-    (note,) = rig_notes(with_bev_frame(tilted(5)), load_config("tiny"))
+    assert training_rig_notes(with_bev_frame(tilted(2.7)), load_config("tiny")) == ()
+    (note,) = training_rig_notes(with_bev_frame(tilted(5)), load_config("tiny"))
     assert "boxes 30 m away may be 2.6 m too high or too low" in note
 
 

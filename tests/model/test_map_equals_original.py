@@ -22,8 +22,7 @@ from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.official_keys import from_official
-from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.workshop.uniad.map_merging import merge_map, thing_scores
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map, thing_scores
 
 KEPT = np.load(original.DATA / "golden_uniad_map.npz")
 FRAME = 5

@@ -10,8 +10,7 @@ import torch
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.workshop.uniad.map_encoder import FlatListAttention, sine_position
-from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.workshop.uniad.map_merging import merge_map, thing_scores
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map, thing_scores
 
 SMALL = MapHeadConfig(
     thing_queries=7,

@@ -11,12 +11,13 @@ import torch
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.model.decoder import ObjectQueries
-from bevcli.workshop.uniad.memory_bank import Memories, MemoryBank
-from bevcli.workshop.uniad.query_interaction import QueryInteraction
 from bevcli.workshop.uniad.track_queries import (
     EGO,
     NO_TRACK,
     FrameMotion,
+    Memories,
+    MemoryBank,
+    QueryInteraction,
     TrackQueries,
     TrackQueryConfig,
     expected_centers,

@@ -20,7 +20,7 @@ from uniad_rule import rule_bev
 
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.workshop.uniad.map_merging import merge_map
+from bevcli.workshop.uniad.map_head import merge_map
 from bevcli.workshop.uniad.track_queries import FrameMotion, TrackQueries
 from bevcli.workshop.uniad.uniad import UniAD, UniADOutputs, decode_tracks
 

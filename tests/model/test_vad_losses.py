@@ -10,15 +10,17 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.step import FrameTruth
 from bevcli.workshop.vad.config import LossWeights
+from bevcli.workshop.vad.frame_truth import FrameTruth
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
-from bevcli.workshop.vad.line_loss import LineTargets, line_losses, line_targets
 from bevcli.workshop.vad.losses import (
+    LineTargets,
     boundary_loss,
     collision_loss,
     crosses,
     direction_loss,
+    line_losses,
+    line_targets,
     motion_losses,
     path_losses,
 )

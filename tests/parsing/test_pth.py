@@ -273,10 +273,10 @@ def test_a_key_that_takes_for_ever_to_hash_is_left_out() -> None:
 
     # t = (t, t), sixty times: its hash needs 2**60 steps.
     nested = b"".join(b"q\x00h\x00\x86" for _ in range(60))
-    assert PickleReader(io.BytesIO(b"\x80\x02})" + nested + b"K\x01s.")).load() == {}
+    assert PickleReader(io.BytesIO(b"\x80\x02})" + nested + b"K\x01s."), Path("a.pth")).load() == {}
     # Multiples of 2**61 - 1 have the same hash.
     long = b"\x8a\x0a" + (5 * (2**61 - 1)).to_bytes(10, "little")
-    assert PickleReader(io.BytesIO(b"\x80\x02}" + long + b"K\x01s.")).load() == {}
+    assert PickleReader(io.BytesIO(b"\x80\x02}" + long + b"K\x01s."), Path("a.pth")).load() == {}
 
 
 def test_tuples_that_repeat_each_other_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -63,8 +63,9 @@ class StoppingConfig(ModelConfig):
 
 
 class Stopping(BEVFormer):
-    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
-        return (StopLine(10.0),)
+    def decode(self, outputs: ModelOutputs) -> Iterator[Any]:
+        yield from super().decode(outputs)
+        yield StopLine(10.0)
 
 
 @pytest.fixture

@@ -15,10 +15,9 @@ from memory_drive import MemorySequence
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.inference.commands import read_commands, with_command
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
-from bevcli.inference.session import Session
+from bevcli.inference.run import Session, run
+from bevcli.inference.runner import read_commands, with_command
 from bevcli.model.config import ModelConfig
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions

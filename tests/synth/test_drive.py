@@ -41,7 +41,7 @@ def _projected(corners_world, camera, world_from_ego):
 
 
 def test_projected_box_contains_the_objects_pixels(drive: RenderedDrive, frame: RenderedFrame):
-    states = drive.states(9)
+    states = [state for _, state in drive._actors(9)]
     rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
     checked = 0
     for name, view in frame.views.items():
@@ -62,7 +62,7 @@ def test_projected_box_contains_the_objects_pixels(drive: RenderedDrive, frame: 
 
 def test_visibility_agrees_with_rendering_each_object_alone(drive: RenderedDrive, frame: RenderedFrame):
     """The visibility is the number of pixels seen over the number of pixels of the object drawn alone by OpenCV."""
-    states = drive.states(9)
+    states = [state for _, state in drive._actors(9)]
     rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
     checked = 0
     for k, state in enumerate(states):
@@ -208,7 +208,7 @@ def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, f
     lens = Distortion("brown_conrady", (-0.25, 0.08, 0.001, -0.0005))
     rig = CameraRig(tuple(replace(c, distortion=lens) for c in drive.rig.cameras), drive.rig.ego_from_bev)
     bent = with_rig(drive, rig)
-    view, states = bent.frame(9).views["CAM_BACK"], bent.states(9)
+    view, states = bent.frame(9).views["CAM_BACK"], [state for _, state in bent._actors(9)]
     camera, checked = rig["CAM_BACK"], 0
     for index in np.unique(view.objects[view.objects >= 0]):
         row = np.nonzero(frame.boxes.instances == states[index].body.instance)[0]
@@ -251,7 +251,7 @@ def test_vehicles_do_not_drive_through_each_other(assets: Assets):
     for seed in range(300, 306):
         drive = RenderedDrive(seed, frames=20, assets=assets)
         for index in range(0, 20, 3):
-            states = [s for s in drive.states(index) if s.body.instance.startswith("moving")]
+            states = [s for s in [state for _, state in drive._actors(index)] if s.body.instance.startswith("moving")]
             for i, one in enumerate(states):
                 for other in states[i + 1 :]:
                     if one.body.instance.split("-")[1] == other.body.instance.split("-")[1]:

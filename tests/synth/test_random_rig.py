@@ -101,7 +101,7 @@ def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedD
     camera, boxes = drive.rig["CAM_FRONT_LEFT"], rendered.boxes
     view = rendered.views["CAM_FRONT_LEFT"]
     # Pixels of an object lie around its projected centre at the time of the image.
-    states = drive.states(1)
+    states = [state for _, state in drive._actors(1)]
     pose = rendered.world_from_ego_at["CAM_FRONT_LEFT"]
     compared = 0
     for index, state in enumerate(states):

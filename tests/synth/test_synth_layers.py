@@ -13,7 +13,7 @@ ORDER = (
     *("mesh", "vehicles", "people", "street_objects", "catalog"),
     *("city", "looks", "ground", "traffic", "roadside", "scenery", "simulation"),
     *("rig", "shading_kernels", "renderer"),
-    *("drive", "drives", "command", "demo_command"),
+    *("drive", "drives", "commands"),
 )
 
 

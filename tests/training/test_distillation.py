@@ -1,4 +1,4 @@
-"""Distillation: a model learns the BEV maps of a teacher, which sees clips without augmentation."""
+"""Distillation: a model learns the BEV maps of a teacher, which sees clips without augmentation, or its features."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bevcli.errors import ConfigError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import build_network
-from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.files import save_weights
 from bevcli.workshop.training.frame_losses import DistillationLossConfig, Teacher
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob
@@ -61,24 +61,31 @@ def test_a_teacher_gives_the_maps_of_its_weights(model: BEVFormer, weights: Path
     batch, torch_device = clips(PLAIN), torch.device("cpu")
     torch.manual_seed(1)
     other = BEVFormer(CONFIG)
-    taught = list(Teacher(other, DistillationLossConfig(1.0, str(weights)), torch_device).bev_maps(batch))
+    lessons = list(Teacher(other, DistillationLossConfig(1.0, 0.0, str(weights)), torch_device).lessons(batch))
+    assert len(lessons) == 2
+    taught = [lesson.bev for lesson in lessons]
     expected = [outputs.bev for outputs in forward_clip(model, batch, learn_all=True, freeze_batch_norm=True)]
     for one, two in zip(taught, expected, strict=True):
         torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-4)
 
 
 def test_a_model_learns_from_a_teacher(weights: Path, tmp_path: Path) -> None:
+    losses = learned(DistillationLossConfig(weight=100.0, teacher=str(weights)), NOISE, tmp_path, "distillation")
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def learned(loss: DistillationLossConfig, augmentation: AugmentationConfig, out: Path, name: str) -> list[float]:
+    """The loss of that name after each step of a training."""
     settings = TrainingConfig(
-        steps=8, held_out=0, evaluate_every=8, clips=ClipConfig(2, 2, 0.0, "all"), augmentation=NOISE,
-        distillation_loss=DistillationLossConfig(100.0, str(weights)),
+        steps=8, held_out=0, evaluate_every=8, clips=ClipConfig(2, 2, 0.0, "all"), augmentation=augmentation,
+        distillation_loss=loss,
     )  # fmt: skip
     settings = replace(settings, optimizer=replace(settings.optimizer, learning_rate=1e-3, warm_up_steps=1))
     torch.manual_seed(1)
     drives = PaintedDrives(2, all_labelled=True)
-    Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, tmp_path, torch.device("cpu"))).run()
-    with (tmp_path / "loss.csv").open() as file:
-        losses = [float(row["distillation"]) for row in csv.DictReader(file)]
-    assert losses[-1] < 0.8 * losses[0]
+    Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, out, torch.device("cpu"))).run()
+    with (out / "loss.csv").open() as file:
+        return [float(row[name]) for row in csv.DictReader(file)]
 
 
 def test_missing_weights_of_a_teacher_are_said(model: BEVFormer) -> None:
@@ -95,7 +102,7 @@ def other_teacher(tmp_path_factory: pytest.TempPathFactory) -> DistillationLossC
     (folder / "other.toml").write_text(toml_of(as_table(config)))
     torch.manual_seed(5)
     save_weights(folder / "other.safetensors", BEVFormer(config), torch.float32)
-    return DistillationLossConfig(1.0, str(folder / "other.safetensors"), str(folder / "other.toml"))
+    return DistillationLossConfig(0.0, 1.0, str(folder / "other.safetensors"), str(folder / "other.toml"))
 
 
 def test_a_teacher_of_another_normalisation_sees_the_same_images(
@@ -103,28 +110,37 @@ def test_a_teacher_of_another_normalisation_sees_the_same_images(
 ) -> None:
     teacher, batch = Teacher(model, other_teacher, torch.device("cpu")), clips(NOISE)
     own = load_config(other_teacher.model)
-    mean, std = (torch.tensor(x)[:, None, None] for x in (CONFIG.image.mean, CONFIG.image.std))
-    own_mean, own_std = (torch.tensor(x)[:, None, None] for x in (own.image.mean, own.image.std))
-    inputs = []
-    for shown in batch.inputs:
-        pixels = (shown.images * std + mean).flip(-3)
-        images = (pixels - own_mean) / own_std
-        images[..., 72:, :] = 0  # padding
-        inputs.append(replace(shown, images=images))
-    network = build_network(own)
-    load_weights(Path(other_teacher.teacher), network)
-    outputs = forward_clip(network, replace(batch, inputs=tuple(inputs)), learn_all=True, freeze_batch_norm=True)
-    for one, two in zip(teacher.bev_maps(batch), outputs, strict=True):
-        torch.testing.assert_close(one, two.bev, atol=1e-4, rtol=1e-3)
+    with torch.no_grad():
+        for lesson, inputs in zip(teacher.lessons(batch), batch.inputs, strict=True):
+            assert lesson.bev is None
+            mean, std = (torch.tensor(x)[:, None, None] for x in (CONFIG.image.mean, CONFIG.image.std))
+            pixels = (inputs.images * std + mean).flip(-3)
+            own_mean, own_std = (torch.tensor(x)[:, None, None] for x in (own.image.mean, own.image.std))
+            images = (pixels - own_mean) / own_std
+            images[..., 72:, :] = 0  # padding
+            network = build_network(own).eval()
+            load_weights(Path(other_teacher.teacher), network)
+            expected = network.neck(network.backbone(images.flatten(0, 1)))
+            for one, two in zip(lesson.features, expected, strict=True):
+                torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-3)
+
+
+def test_a_model_learns_the_features_of_a_teacher(other_teacher: DistillationLossConfig, tmp_path: Path) -> None:
+    augmentation = replace(NOISE, randomisation=RandomisationConfig(convolution=0.5, contrast=0.5))
+    losses = learned(replace(other_teacher, feature_weight=100.0), augmentation, tmp_path, "features")
+    assert losses[-1] < 0.8 * losses[0]
+    assert 50 < losses[0] < 300  # relative to the variance of the teacher's features
 
 
 def test_a_teacher_with_other_maps_is_refused(model: BEVFormer, other_teacher: DistillationLossConfig) -> None:
-    finer = BEVFormer(replace(CONFIG, bev_grid=replace(CONFIG.bev_grid, rows=24, columns=24)))
-    with pytest.raises(ConfigError, match=r"cannot teach painted: it has 12 x 12 .* \(expected 24 x 24 BEV cells"):
+    finer = BEVFormer(replace(CONFIG, backbone=replace(CONFIG.backbone, output_stages=(2,))))
+    with pytest.raises(
+        ConfigError, match=r"cannot teach painted: it has .* 6 x 8 cells, .* \(expected .* 12 x 16 cells"
+    ):
         Teacher(finer, other_teacher, torch.device("cpu"))
 
 
-@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"weight": 1.0}])
+@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"weight": 1.0}, {"feature_weight": 1.0}])
 def test_a_weight_needs_a_teacher(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="teacher must name weights"):
         DistillationLossConfig(**wrong)

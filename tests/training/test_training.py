@@ -23,13 +23,13 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
+from bevcli.workshop.training.commands import _run
 from bevcli.workshop.training.files import LearningCurve, load_checkpoint, save_checkpoint
 from bevcli.workshop.training.frame_losses import DenseLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.train_command import _run
 from bevcli.workshop.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
 
 SHORT = TrainingConfig(

@@ -44,7 +44,7 @@ def by_entity(chunk):
 def test_chunks_in_any_order_are_the_same_frames(recording, tmp_path, order):
     other = written(tmp_path / "other.rrd", order(list(RrdReader(recording).stream())))
     assert table(other, tmp_path) == table(recording, tmp_path)
-    assert summarise(other).boxes == {"car": 3, "pedestrian": 3}
+    assert "boxes     6\n          3 car\n          3 pedestrian\n" in summarise(other)
 
 
 def test_a_cut_frame_never_has_boxes_or_poses_of_another(recording, tmp_path):

@@ -19,7 +19,6 @@ from bevcli.evaluation.box_format import COLUMNS
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer import video
-from bevcli.viewer.recording_reader import summarise
 from bevcli.viewer.video import write_video
 
 
@@ -37,16 +36,10 @@ def viz(*arguments) -> str:
 
 def test_the_summary_counts_frames_boxes_and_bytes(drive):
     _, path = drive
-    summary = summarise(path)
-    assert (len(summary.timestamps_ns), summary.title, summary.untrained) == (3, "memory · tiny", False)
-    assert summary.boxes == {"car": 3, "pedestrian": 3}
-    assert summary.timestamps_ns[-1] - summary.timestamps_ns[0] == 10**9
-    assert summary.file_bytes == path.stat().st_size
-    images = sum(size for entity, size in summary.bytes_by_entity.items() if entity.endswith("/picture"))
-    assert images > 0.5 * sum(summary.bytes_by_entity.values())
     text = viz(path, "--summary")
-    assert "frames    3, 1.00 s from 2001-09-09 01:46:40" in text
-    assert "3 pedestrian" in text
+    assert text.startswith(f"{path}: memory · tiny\n  frames    3, 1.00 s from 2001-09-09 01:46:40")
+    assert f"  size      {path.stat().st_size / 1e6:.1f} MB\n  boxes     6\n          3 car\n          3 ped" in text
+    assert text.count("/picture") == 6
 
 
 def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer_v2.bev_fusion import BevFusion, BevFusionConfig
 from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, fill_window, frames_at, kept
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
@@ -18,10 +18,29 @@ from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES, Network
 from bevcli.model.official_keys import OfficialNames
 from bevcli.model.pillar_projection import PillarHits
+from bevcli.model.resnet import BasicBlock
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.upload import on_device, upload
 
 NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
+
+
+@dataclass(frozen=True)
+class BevFusionConfig:
+    """The fusion of the window's BEV maps.
+
+    Attributes:
+        blocks: number of residual blocks.
+        width: channels of the blocks. Where the concatenated maps have another number of channels, the first block's
+            shortcut is a convolution.
+    """
+
+    blocks: int = 3
+    width: int = 512
+
+    def __post_init__(self) -> None:
+        if min(self.blocks, self.width) < 1:
+            raise ValueError("blocks and width must be positive")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,3 +175,22 @@ class BEVFormerV2(Network):
             bev_query = self.bev_queries.embedding.expand(batch, -1, -1)
             maps.append(self.encoder(bev_query, position, image_features, hits))
         return self.detect(maps[-1] if self.fusion is None else self.fusion([maps[index] for index in sources]))
+
+
+class BevFusion(nn.Module):
+    """Temporal fusion of the window (section 3.4): maps concatenated, residual blocks, linear layer and layer norm."""
+
+    def __init__(self, config: BevFusionConfig, frames: int, channels: int, bev_shape: tuple[int, int]) -> None:
+        """Random weights. frames: number of BEV maps. bev_shape: their rows and columns."""
+        super().__init__()
+        self.bev_shape = bev_shape
+        inputs = [frames * channels] + (config.blocks - 1) * [config.width]
+        self.blocks = nn.Sequential(*(BasicBlock(size, config.width) for size in inputs))
+        self.projection = nn.Linear(config.width, channels)
+        self.norm = nn.LayerNorm(channels)
+
+    def forward(self, maps: Sequence[Tensor]) -> Tensor:
+        """maps: (B, Y·X, C) of each frame, in the order of the window -> the fused map (B, Y·X, C)."""
+        cells = torch.cat(list(maps), dim=-1).unflatten(1, self.bev_shape)  # (B, Y, X, frames · C)
+        fused = self.blocks(cells.permute(0, 3, 1, 2))  # (B, width, Y, X)
+        return self.norm(self.projection(fused.permute(0, 2, 3, 1).flatten(1, 2)))

@@ -1,4 +1,15 @@
-"""The window of a BEVFormerV2: the frames that a step sees, and the image features that are kept for the next steps."""
+r"""The window of a BEVFormerV2: the frames that a step sees, and the image features that are kept for the next steps.
+
+A window [-2, -1, 0] at frame 1, the second of its scene; frame -1 does not exist:
+
+    images           (none)     frame 0      frame 1        each passes the backbone once
+    image features   (none)     kept         new            `FeatureWindow` keeps frame 0 and 1 for frame 2
+                                  |            |            `seen_from`: frame 0's cameras in frame 1's bev frame
+    BEV encoder                   |            |            the same weights, grid of frame 1, no history
+    BEV map          frame 0's  frame 0's    frame 1's      `fill_window`: that of the nearest frame towards 0
+                        \_________|____________/
+                               BevFusion                    -> the BEV map of frame 1
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,10 +96,10 @@ class FeatureWindow:
 
 
 def frames_at(
-    frames: Sequence[FrameFeatures], places: Sequence[int], current: PreparedFrame
+    frames: Sequence[FrameFeatures], indices: Sequence[int], current: PreparedFrame
 ) -> list[WindowFrame | None]:
-    """The frames at these places, seen from the current one; None where there is no frame."""
-    return [frames[place].seen_from(current) if 0 <= place < len(frames) else None for place in places]
+    """The frames at these indices, seen from the current one; None where there is no frame."""
+    return [frames[index].seen_from(current) if 0 <= index < len(frames) else None for index in indices]
 
 
 def kept(frames: Sequence[FrameFeatures], current: int, past_frames: int) -> FeatureWindow:
@@ -107,9 +118,9 @@ def fill_window(frames: Sequence[int], exists: Sequence[bool]) -> list[int]:
     """
     current = list(frames).index(0)
     sources = list(range(len(frames)))
-    for place in (*range(current - 1, -1, -1), *range(current + 1, len(frames))):
-        if not exists[place]:
-            sources[place] = sources[place + (1 if place < current else -1)]
+    for index in (*range(current - 1, -1, -1), *range(current + 1, len(frames))):
+        if not exists[index]:
+            sources[index] = sources[index + (1 if index < current else -1)]
     return sources
 
 

@@ -160,7 +160,7 @@ def sample_hits(values, level_shapes, points, offsets, logits, query, prediction
     for hit in range(begin, end):
         for head in range(heads):
             moved = flat_offsets[query[hit], head, prediction[hit]]
-            found = flat_logits[query[hit], head, prediction[hit]]
+            predicted = flat_logits[query[hit], head, prediction[hit]]
             for first in range(0, samples, heights):
                 for height in range(heights):
                     read, sample = first + height, head * samples + first + height
@@ -168,7 +168,7 @@ def sample_hits(values, level_shapes, points, offsets, logits, query, prediction
                     y = points[hit, height, 1] + moved[read, 1] / maps[1, sample]
                     places[0, sample] = x * maps[0, sample] - half
                     places[1, sample] = y * maps[1, sample] - half
-                    weights[sample] = found[read]
+                    weights[sample] = predicted[read]
         softmax_of_groups(weights, samples, powers)
         _find_corners(places, weights, maps, cells, shares)
         _sum_heads(values, map_of_hit[hit], cells, shares, samples, out, hit)
@@ -316,11 +316,11 @@ def max_of_windows(values, out, begin, end):  # type: ignore[no-untyped-def]
     for row in range(begin, end):
         image, y = row // rows, 2 * (row % rows)
         for column in range(columns):
-            x, found = 2 * column, out[image, y // 2, column]
+            x, largest = 2 * column, out[image, y // 2, column]
             for c in range(channels):
-                found[c] = 0
+                largest[c] = 0
             for v in range(max(y - 1, 0), min(y + 2, height)):
                 for u in range(max(x - 1, 0), min(x + 2, width)):
                     read = values[image, v, u]
                     for c in range(channels):
-                        found[c] = max(found[c], read[c])
+                        largest[c] = max(largest[c], read[c])

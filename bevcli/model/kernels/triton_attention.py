@@ -14,7 +14,6 @@ from torch import Tensor
 
 from bevcli.model.deformable_attention import GridSampling, LevelShapes
 from bevcli.model.kernels.by_hits import Hits
-from bevcli.model.kernels.triton_bilinear import corner_of
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
@@ -322,3 +321,17 @@ def _cells(y, x, height, width):  # type: ignore[no-untyped-def]
     # Locations more than a cell outside the map contribute nothing; the clamp keeps them within an int32.
     y, x = y * height - 0.5, x * width - 0.5
     return tl.minimum(tl.maximum(y, -2.0), height + 1.0), tl.minimum(tl.maximum(x, -2.0), width + 1.0)
+
+
+@triton.jit
+def corner_of(first_cell, y, x, exists, height, width, corner: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Index of a cell (corner 0 to 3) around positions y, x, its shares of rows and columns, whether it exists.
+
+    Positions are float32 in cells, 0 at the centre of the first, at most 2 cells outside a map whose first cell has the
+    index first_cell. A cell exists where the position does and the cell lies in the map.
+    """
+    row = tl.floor(y) + corner // 2
+    column = tl.floor(x) + corner % 2
+    inside = exists & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    cell = first_cell + (row.to(tl.int32) * width + column.to(tl.int32))
+    return cell, 1.0 - tl.abs(y - row), 1.0 - tl.abs(x - column), inside

@@ -15,7 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.kernels.triton_bilinear import corner_of
+from bevcli.model.kernels.triton_attention import corner_of
 
 # Positions, channels and taps that a program takes at a time.
 COLUMN_TILES = {"BLOCK": 8, "BLOCK_CHANNELS": 128, "TAPS": 9}

@@ -17,6 +17,7 @@ from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import (
     LONGEST_VALUE,
+    Mistake,
     Report,
     parse_numbers,
     parse_transform,
@@ -69,21 +70,31 @@ def read_rig_and_facts(path: Path) -> tuple[CameraRig, DriveFacts]:
 
 def draft_calibration(path: Path) -> RigDraft:
     """The rig in calibration.json and all mistakes in the file. Raises InputError only if it is not a JSON object."""
-    document = _load_object(path)
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        if len(set(keys)) < len(keys):
+            twice = next(key for number, key in enumerate(keys) if key in keys[:number])
+            raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
+        return dict(pairs)
+
+    missing = "the file is missing (expected a calibration)"
+    document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=unique)
+    if not isinstance(document, dict):
+        raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')
     report = Report()
     if "format" not in document:
         report.missing("format", FORMAT)
     elif document["format"] != FORMAT:
         report.error("wrong-format", "format", "is not supported", expected=FORMAT, found=document["format"])
-    cameras = _parse_cameras(document, report)
+    cameras = report.read(_parse_cameras, document) or ()
     given = "ego_from_bev" in document
-    ego_from_bev = parse_transform(document, "ego_from_bev", report) if given else None
-    if ego_from_bev is None:
-        ego_from_bev = default_ego_from_bev()
+    stated = report.read(parse_transform, document, "ego_from_bev") if given else None
+    ego_from_bev = default_ego_from_bev() if stated is None else stated
     rendered = document.get("rendered", False)
     if not isinstance(rendered, bool):
         report.error("wrong-shape", "rendered", "is not true or false", expected="true or false", found=rendered)
-    facts = DriveFacts(rendered is True, _parse_geo_origin(document, report))
+    facts = DriveFacts(rendered is True, report.read(_parse_geo_origin, document))
     return RigDraft(CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given), tuple(report.findings), facts)
 
 
@@ -103,54 +114,35 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts
     write_whole(path, f"{_lines(document)}\n".encode(), regular=regular)
 
 
-def _load_object(path: Path) -> dict[str, Any]:
-    missing = "the file is missing (expected a calibration)"
-    document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=lambda pairs: _unique(pairs, path))
-    if not isinstance(document, dict):
-        raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')
-    return document
-
-
-def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
-    unique = dict(pairs)
-    if len(unique) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for place, key in enumerate(keys) if key in keys[:place])
-        raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
-    return unique
-
-
 def _parse_cameras(document: Mapping[str, Any], report: Report) -> tuple[Camera, ...]:
-    value = document.get("cameras")
+    value, expected = document.get("cameras"), "an object with one entry per camera"
     if value is None:
-        report.missing("cameras", "an object with one entry per camera")
-        return ()
+        raise report.missing("cameras", expected)
     if not isinstance(value, dict) or not value:
-        message = "contains no camera"
-        report.error("wrong-shape", "cameras", message, expected="an object with one entry per camera", found=value)
-        return ()
-    parsed = (parse_camera(name, entry, report.about(name)) for name, entry in value.items())
-    return tuple(camera for camera in parsed if camera is not None)
+        raise report.error("wrong-shape", "cameras", "contains no camera", expected=expected, found=value)
+    cameras = (report.about(name).read(parse_camera, name, entry) for name, entry in value.items())
+    return tuple(camera for camera in cameras if camera is not None)
 
 
 def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin | None:
     value = document.get("geo_origin")
     if value is None:
         return None
-    expected = '{"latitude": 48.137, "longitude": 11.575, "heading_deg": 90}'
     if not isinstance(value, dict):
-        report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
-        return None
+        expected = '{"latitude": 48.137, "longitude": 11.575, "heading_deg": 90}'
+        raise report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
     within, stated = report.within("geo_origin"), {"heading_deg": EAST_DEG, **value}
-    numbers: list[float] = []
-    for name, limit in ORIGIN_LIMITS.items():
-        number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), within)
-        if number is not None and abs(number[0]) > limit:
-            wanted = f"degrees, -{limit:g} to {limit:g}"
-            within.error("wrong-size", name, "is out of range", expected=wanted, found=quoted(stated[name]))
-        elif number is not None:
-            numbers.append(float(number[0]))
-    return GeoOrigin(*numbers) if len(numbers) == len(ORIGIN_LIMITS) else None
+    numbers = [within.read(_parse_degrees, stated, name, limit) for name, limit in ORIGIN_LIMITS.items()]
+    degrees = [number for number in numbers if number is not None]
+    return GeoOrigin(*degrees) if len(degrees) == len(ORIGIN_LIMITS) else None
+
+
+def _parse_degrees(stated: Mapping[str, Any], name: str, limit: float, report: Report) -> float:
+    number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), report)[0]
+    if abs(number) > limit:
+        expected = f"degrees, -{limit:g} to {limit:g}"
+        raise report.error("wrong-size", name, "is out of range", expected=expected, found=quoted(stated[name]))
+    return float(number)
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -175,23 +167,23 @@ def _lines(value: Any, indent: str = "") -> str:
     return "{\n" + ",\n".join(entries) + f"\n{indent}}}"
 
 
-def parse_camera(name: str, value: object, report: Report) -> Camera | None:
-    """The camera, or None if a field is invalid. All fields are read, so that all mistakes are reported."""
+def parse_camera(name: str, value: object, report: Report) -> Camera:
+    """A camera of a calibration. All fields are read, so that all mistakes are reported. Raises Mistake."""
     if not is_file_name(name):
         expected = "up to 100 letters, digits and signs, no slash"
-        report.error("camera-name", one_line(name, LONGEST_VALUE), "is not the name of a camera", expected=expected)
-        return None
+        name = one_line(name, LONGEST_VALUE)
+        raise report.error("camera-name", name, "is not the name of a camera", expected=expected)
     if not isinstance(value, dict):
-        report.error("wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=value)
-        return None
-    width, height = _parse_size(value, "width", report), _parse_size(value, "height", report)
-    intrinsics = parse_intrinsics(value, report)
-    ego_from_camera = parse_transform(value, "ego_from_camera", report)
-    distortion = parse_distortion(value, report)
+        expected = "an object with " + ", ".join(KEYS)
+        raise report.error("wrong-shape", name, "is not a camera", expected=expected, found=value)
+    width, height = report.read(_parse_size, value, "width"), report.read(_parse_size, value, "height")
+    intrinsics = report.read(_parse_intrinsics, value)
+    ego_from_camera = report.read(parse_transform, value, "ego_from_camera")
+    distortion = report.read(_parse_distortion, value)
     if width is None or height is None or intrinsics is None or ego_from_camera is None:
-        return None
-    is_plausible = _are_plausible(intrinsics, width, height, report)
-    return Camera(name, width, height, intrinsics, ego_from_camera, distortion) if is_plausible else None
+        raise Mistake
+    _check_plausible(intrinsics, width, height, report)
+    return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
 def checked_camera(camera: Camera, where: Path | str) -> Camera:
@@ -204,81 +196,66 @@ def is_file_name(name: str) -> bool:
     return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
 
 
-def parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
-    """(3, 3) image_from_camera in pixels, upper triangular and not singular; None if invalid."""
+def _parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array:
+    """(3, 3) image_from_camera in pixels, upper triangular and not singular."""
     matrix = parse_numbers(camera, "intrinsics", (3, 3), report)
-    if matrix is None:
-        return None
     if not np.allclose(matrix[2], [0, 0, 1], atol=1e-9) or abs(matrix[1, 0]) > 1e-9:
-        expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
-        advice = "write it row by row and scale it so that the last number is 1"
-        report.error(
+        raise report.error(
             "intrinsics-form", "intrinsics", "is not a camera matrix",
-            expected=expected, found=matrix.tolist(), advice=advice,
+            expected="[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]", found=matrix.tolist(),
+            advice="write it row by row and scale it so that the last number is 1",
         )  # fmt: skip
-        return None
     fx, fy = matrix[0, 0], matrix[1, 1]
     if min(fx, fy) <= 0:
-        found = f"fx {fx:g}, fy {fy:g}"
-        message = "is singular or mirrors the image"
-        report.error("intrinsics-singular", "intrinsics", message, expected="fx > 0 and fy > 0", found=found)
-        return None
+        message, found = "is singular or mirrors the image", f"fx {fx:g}, fy {fy:g}"
+        raise report.error("intrinsics-singular", "intrinsics", message, expected="fx > 0 and fy > 0", found=found)
     return matrix
 
 
-def parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | None:
-    """The lens distortion. None for a pinhole camera ("none", or no "distortion") and for an invalid one."""
+def _parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | None:
+    """The lens distortion. None for a pinhole camera ("none", or no "distortion")."""
     value = camera.get("distortion")
     if value is None:
         return None
     models = ("none", *COEFFICIENT_COUNTS)
     model = value.get("model") if isinstance(value, dict) else None
     if model not in models:
-        found = value if model is None else model
-        report.error(
-            "distortion-model", "distortion", "has an unknown model", expected=" or ".join(models), found=found
-        )
-        return None
+        expected, found = " or ".join(models), value if model is None else model
+        raise report.error("distortion-model", "distortion", "has an unknown model", expected=expected, found=found)
     given = value.get("coefficients", [])
     count = len(given) if isinstance(given, list) else 0
     counts = COEFFICIENT_COUNTS.get(model, (0,))
     if count not in counts:
-        expected, found = f"{' or '.join(map(str, counts))} for {model}", f"{count}"
-        message = "has the wrong number of coefficients"
-        report.error("distortion-coefficients", "distortion", message, expected=expected, found=found)
-        return None
+        expected, message = f"{' or '.join(map(str, counts))} for {model}", "has the wrong number of coefficients"
+        raise report.error("distortion-coefficients", "distortion", message, expected=expected, found=f"{count}")
     if model == "none":
         return None
     coefficients = parse_numbers(value, "coefficients", (count,), report.within("distortion"))
-    return None if coefficients is None else Distortion(model, tuple(map(float, coefficients)))
+    return Distortion(model, tuple(map(float, coefficients)))
 
 
-def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int | None:
+def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int:
     value = camera.get(name)
     if value is None:
-        report.missing(name, "the image size in pixels")
-        return None
+        raise report.missing(name, "the image size in pixels")
     if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= LARGEST_SIZE:
         expected = f"a positive integer, at most {LARGEST_SIZE}"
-        report.error("wrong-size", name, "is not an image size", expected=expected, found=quoted(value))
-        return None
+        raise report.error("wrong-size", name, "is not an image size", expected=expected, found=quoted(value))
     return value
 
 
-def _are_plausible(intrinsics: Array, width: int, height: int, report: Report) -> bool:
-    """True if focal length and principal point are plausible in pixels of an image of this size."""
+def _check_plausible(intrinsics: Array, width: int, height: int, report: Report) -> None:
+    """Check focal length and principal point against the size of the image."""
     low, high = FOCAL_RANGE
     for axis, (letter, size) in enumerate((("x", width), ("y", height))):
         focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
         if not low * size <= focal <= high * size:
-            expected, found = f"{low * size:g} to {high * size:g} px for a size of {size}", f"f{letter} {focal:g}"
-            advice = "give it in pixels, not in millimetres"
-            message = "has an implausible focal length"
-            report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found, advice=advice)
-            return False
+            raise report.error(
+                "intrinsics-absurd", "intrinsics", "has an implausible focal length",
+                expected=f"{low * size:g} to {high * size:g} px for a size of {size}", found=f"f{letter} {focal:g}",
+                advice="give it in pixels, not in millimetres",
+            )  # fmt: skip
         if not -2 * size <= center <= 3 * size:
             expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
             message = "has its principal point far outside the image"
-            report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
-            return False
-    return True
+            raise report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)

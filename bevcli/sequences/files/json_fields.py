@@ -1,6 +1,7 @@
 """Reads numbers from JSON and collects mistakes as findings: `run` stops at the first, `project-debug` shows all."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -16,6 +17,10 @@ LARGEST_NUMBER = 1e12
 LONGEST_VALUE = 60  # characters of a value in a message
 TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1, and of R Rᵀ from the identity
 _Value = TypeVar("_Value")
+
+
+class Mistake(Exception):
+    """A value that cannot be used. What is wrong with it stands in a report."""
 
 
 @dataclass(frozen=True)
@@ -42,46 +47,52 @@ class Report:
 
     def error(
         self, code: str, name: str, message: str, *, expected: str = "", found: object = "", advice: str = ""
-    ) -> None:
-        """Add an error about the field `name`. `message` continues a sentence that begins with the name."""
+    ) -> Mistake:
+        """Add an error about the field `name`. `message` continues a sentence that begins with the name.
+
+        Returns the exception to raise where the value of the field cannot be used.
+        """
         text = f'"{self.prefix}{name}" {message}'
         self.findings.append(
             Finding(code, "error", self.camera, text, one_line(found, LONGEST_VALUE), expected, advice)
         )
+        return Mistake()
 
-    def missing(self, name: str, expected: str) -> None:
+    def missing(self, name: str, expected: str) -> Mistake:
         """Add an error for a missing key."""
-        self.error("missing-key", name, "is missing", expected=expected)
+        return self.error("missing-key", name, "is missing", expected=expected)
+
+    def read(self, parse: Callable[..., _Value], *arguments: Any) -> _Value | None:
+        """The value that `parse(*arguments, self)` reads; None for one that cannot be used."""
+        with suppress(Mistake):
+            return parse(*arguments, self)
+        return None
 
 
-def require(
-    parse: Callable[..., _Value | None], *arguments: Any, where: Path | str, camera: str | None = None
-) -> _Value:
+def require(parse: Callable[..., _Value], *arguments: Any, where: Path | str, camera: str | None = None) -> _Value:
     """The value that `parse(*arguments, report)` reads. Raises InputError with the first finding, after `where`."""
     report = Report(camera)
-    value = parse(*arguments, report)
+    value = report.read(parse, *arguments)
     for finding in report.findings:
         raise InputError(f"{where}: {finding.line}")
     assert value is not None
     return value
 
 
-def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
-    """The array of finite numbers with this shape under the key `name`; None, with a finding, if it is invalid."""
+def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array:
+    """The array of finite numbers with this shape under the key `name`. Raises Mistake."""
     expected = "x".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]} numbers"
     value = owner.get(name)
     if value is None:
-        report.missing(name, expected)
-        return None
+        raise report.missing(name, expected)
     array = array_of_numbers(value)
     if array is None or array.shape != shape:
         message = "is not an array of numbers" if array is None else "has the wrong shape"
         found = quoted(value) if array is None else "x".join(map(str, array.shape)) or value
-        report.error("wrong-shape", name, message, expected=expected, found=found)
-        return None
+        raise report.error("wrong-shape", name, message, expected=expected, found=found)
     if not (np.abs(array) < LARGEST_NUMBER).all():
-        report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
-        return None
+        expected = "finite numbers below 1e12"
+        raise report.error("not-finite", name, "contains NaN or infinity", expected=expected, found=value)
     return array
 
 
@@ -94,24 +105,24 @@ def array_of_numbers(value: object) -> Array | None:
     return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else None
 
 
-def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array | None:
+def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array:
     """(4, 4) of {"translation": [x, y, z], "rotation_wxyz": [w, x, y, z] or "rotation": 3x3}, metres.
 
-    An invalid rotation is reported and replaced by the nearest valid one. None if that is not possible.
+    An invalid rotation is reported and replaced by the nearest valid one. Raises Mistake if that is not possible.
 
     owner: the JSON object that holds the transform under the key `name`.
     """
     value = owner.get(name)
     expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
     if value is None:
-        report.missing(name, expected)
-        return None
+        raise report.missing(name, expected)
     if not isinstance(value, dict):
-        report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
-        return None
+        raise report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
     inside = report.within(name)
-    translation, rotation = parse_numbers(value, "translation", (3,), inside), _parse_rotation(value, inside)
-    return None if translation is None or rotation is None else rigid(translation, rotation)
+    translation, rotation = inside.read(parse_numbers, value, "translation", (3,)), inside.read(_parse_rotation, value)
+    if translation is None or rotation is None:
+        raise Mistake
+    return rigid(translation, rotation)
 
 
 def transform_to_json(a_from_b: Array) -> dict[str, Any]:
@@ -136,39 +147,39 @@ def pose_to_json(pose: Pose) -> dict[str, list[float]]:
     return {"translation": pose.translation.tolist(), "rotation_wxyz": pose.quaternion.tolist()}
 
 
-def _parse_rotation(pose: Mapping[str, Any], report: Report) -> Array | None:
+def _parse_rotation(pose: Mapping[str, Any], report: Report) -> Array:
     if "rotation" not in pose:
-        quaternion = parse_numbers(pose, "rotation_wxyz", (4,), report)
-        return None if quaternion is None else _rotation_of(quaternion, report)
+        return _rotation_of(parse_numbers(pose, "rotation_wxyz", (4,), report), report)
     if "rotation_wxyz" in pose:
-        report.error("rotation-twice", "rotation", 'is given in addition to "rotation_wxyz"', expected="one of them")
-        return None
-    matrix = parse_numbers(pose, "rotation", (3, 3), report)
-    return None if matrix is None else _checked(matrix, report)
+        message = 'is given in addition to "rotation_wxyz"'
+        raise report.error("rotation-twice", "rotation", message, expected="one of them")
+    return _nearest_rotation(parse_numbers(pose, "rotation", (3, 3), report), report)
 
 
-def _rotation_of(quaternion: Array, report: Report) -> Array | None:
+def _rotation_of(quaternion: Array, report: Report) -> Array:
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > TOLERANCE:
-        report.error(
+        mistake = report.error(
             "quaternion-norm", "rotation_wxyz", "is not a rotation: its norm is not 1",
             expected="1 ± 0.001", found=f"{norm:.6g}",
             advice="check for missing or rounded digits; the order is w, x, y, z",
         )  # fmt: skip
-    return rotation_from_quaternion(quaternion) if norm > TOLERANCE else None
+        if norm <= TOLERANCE:
+            raise mistake
+    return rotation_from_quaternion(quaternion)
 
 
-def _checked(matrix: Array, report: Report) -> Array | None:
-    """The matrix (3, 3), or the nearest rotation if it is not a rotation; None if it is singular."""
+def _nearest_rotation(matrix: Array, report: Report) -> Array:
+    """The matrix (3, 3), or the nearest rotation if it is not a rotation. Raises Mistake if it is singular."""
     deviation = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if deviation > TOLERANCE:
-        report.error(
+        mistake = report.error(
             "rotation-not-orthonormal", "rotation", "is not orthonormal",
             expected="R Rᵀ = identity within 0.001", found=f"off by {deviation:.3g}",
             advice="check for rounded digits, a scale factor, or another matrix in its place",
         )  # fmt: skip
     elif np.linalg.det(matrix) < 0:
-        report.error(
+        mistake = report.error(
             "rotation-left-handed", "rotation", "is left-handed", expected="determinant 1", found="determinant -1",
             advice="an axis is mirrored; camera: x right, y down, z forward; ego: x forward, y left, z up",
         )  # fmt: skip
@@ -176,6 +187,6 @@ def _checked(matrix: Array, report: Report) -> Array | None:
         return matrix
     left, singular_values, right = np.linalg.svd(matrix)
     if singular_values[-1] < TOLERANCE:
-        return None
+        raise mistake
     nearest: Array = left @ right
     return nearest if np.linalg.det(nearest) > 0 else nearest * [-1.0, 1.0, 1.0]

@@ -67,30 +67,18 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent or
     other classes.
     """
-    if not (folder / LEGEND).exists():
-        legend = {
-            "format": FORMAT,
-            "x_range_m": bev_map.x_range_m,
-            "y_range_m": bev_map.y_range_m,
-            "classes": {str(bit): name for name, bit in bev_map.classes.items()},
-        }
-        write_whole(folder / LEGEND, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
-    _check_legend(open_maps(folder), bev_map)
+    legend = {
+        "format": FORMAT,
+        "x_range_m": list(bev_map.x_range_m),
+        "y_range_m": list(bev_map.y_range_m),
+        "classes": {str(bit): name for name, bit in bev_map.classes.items()},
+    }
+    path = folder / LEGEND
+    if not path.exists():
+        write_whole(path, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
+    elif (stated := read_json(path)) != legend:
+        raise InputError(f"{path}: states {stated!r:.300}, but the new map has {legend}: write it to another folder")
     write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes(), regular=True)
-
-
-def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:
-    """Raises InputError where a new map does not fit the maps in a folder."""
-    if (folder.x_range_m, folder.y_range_m) != (tuple(bev_map.x_range_m), tuple(bev_map.y_range_m)):
-        raise InputError(
-            f"{folder.path / LEGEND}: states x {folder.x_range_m}, y {folder.y_range_m}, but the new map has "
-            f"x {bev_map.x_range_m}, y {bev_map.y_range_m}: write it to another folder"
-        )
-    if dict(folder.classes) != dict(bev_map.classes):
-        raise InputError(
-            f"{folder.path / LEGEND}: states the classes {', '.join(folder.classes)}, but the new map has "
-            f"{', '.join(bev_map.classes)}: write it to another folder"
-        )
 
 
 def map_path(folder: Path, frame: int) -> Path:

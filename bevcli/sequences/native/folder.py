@@ -40,11 +40,15 @@ from bevcli.sequences.images import (
     read_frame,
     rotation_notes,
 )
-from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
+from bevcli.sequences.native.tables import read_ego_motion, read_frames_table
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
+FILE_NAME = "timing.toml"
+# A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
+SMALLEST_TIMESTAMP = 10**13
+ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
 
 
 class FolderSequence(ListedSequence):
@@ -66,7 +70,12 @@ class FolderSequence(ListedSequence):
         rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
             rig, facts = read_rig_and_facts(path / CALIBRATION)
-        entries, notes = _read_entries(path, rig)
+        table = path / "frames.csv"
+        notes: tuple[str, ...] = ()
+        if is_there(table):
+            entries = read_frames_table(table, rig.names)
+        else:
+            entries, notes = find_frames(path, rig.names)
         if not common.allow_outside:
             _check_paths(path, entries)
         file = own.ego_motion_file or path / "ego_motion.csv"
@@ -125,16 +134,6 @@ class FolderSequence(ListedSequence):
         return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
 
 
-def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
-    """The frames of frames.csv, or else those that are found, with a note."""
-    table = path / "frames.csv"
-    if is_there(table):
-        return read_frames_table(table, rig.names), ()
-    entries, note = find_frames(path, rig.names)
-    check_times(entries)
-    return entries, (note,)
-
-
 def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
     """Raise InputError for a path that leads out of the folder. Links are followed when the image is read."""
     for entry in entries:
@@ -162,7 +161,6 @@ def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple
 
 
 def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...], advice: str) -> None:
-    """Raise InputError for a frame or an image at whose time the pose is not known."""
     first, last = motion.first_ns, motion.last_ns
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
@@ -175,10 +173,7 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
                 )
 
 
-FILE_NAME = "timing.toml"
-# A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
-SMALLEST_TIMESTAMP = 10**13
-ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
+Found = tuple[tuple[FrameEntry, ...], tuple[str, ...]]  # frames, and a note
 
 
 @dataclass(frozen=True)
@@ -255,7 +250,7 @@ def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
     return float(value)
 
 
-def find_frames(folder: Path, cameras: tuple[str, ...]) -> tuple[tuple[FrameEntry, ...], str]:
+def find_frames(folder: Path, cameras: tuple[str, ...]) -> Found:
     """The frames in `images/CAMERA/*` or `videos/CAMERA.*`, and a note that tells the user how they were found.
 
     Raises InputError if there is neither, or if the cameras' images do not have the same names.
@@ -271,7 +266,7 @@ def find_frames(folder: Path, cameras: tuple[str, ...]) -> tuple[tuple[FrameEntr
     )
 
 
-def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> Found:
     images = {name: _numbered(folder / "images" / name) for name in timings}
     numbers = _common_numbers(folder, images)
     are_times = numbers[0] >= SMALLEST_TIMESTAMP
@@ -287,11 +282,10 @@ def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> 
         entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
     how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
     where = "" if are_times or common.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
-    return tuple(entries), f"frames.csv is missing: found {counted(len(numbers), 'frames')}, {how}{where}"
+    return tuple(entries), (f"frames.csv is missing: found {counted(len(numbers), 'frames')}, {how}{where}",)
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The images of a folder by the number in their name."""
     if not folder.is_dir():
         raise InputError(f"{folder}: the folder is missing (the calibration has the camera {folder.name})")
     found: dict[int, Path] = {}
@@ -321,7 +315,7 @@ def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> l
     return everywhere
 
 
-def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> Found:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     videos = {name: _video_of(folder / "videos", name, timing) for name, timing in timings.items()}
     name, leading = min(videos.items(), key=lambda item: item[1].rate_hz)  # the first of cameras with equal rates
@@ -339,7 +333,7 @@ def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> tuple[tuple[Fra
     has_timing = is_there(folder / FILE_NAME)
     stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
     note = f"frames.csv is missing: found {counted(len(entries), 'frames')} from {name}, {leading.rate_hz:g} per second"
-    return tuple(entries), f"{note}, {stated}"
+    return tuple(entries), (f"{note}, {stated}",)
 
 
 def _video_of(folder: Path, camera: str, timing: Timing) -> CameraVideo:

@@ -2,12 +2,11 @@
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -41,14 +40,17 @@ def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, .
                 f"{path}: camera {name}: its column is missing (expected, because the calibration has the camera): "
                 f'add a column "{name}" (cells may be empty), or remove the camera from the calibration'
             )
-    entries = tuple(_entry(row, cameras, path.parent) for row in rows)
-    _check_numbers(rows, entries)
-    check_times(entries)
-    return entries
-
-
-def check_times(entries: Iterable[FrameEntry]) -> None:
-    """Raise InputError unless times increase within each scene, a run of frames with the same scene name."""
+    lines: dict[int, int] = {}  # of frames, by index
+    entries = []
+    for row in rows:
+        stamp = FrameStamp(row.integer("frame"), row.cells.get("scene", ""), row.integer("timestamp_ns"))
+        if stamp.index < 0 or stamp.index in lines:
+            found = f"is also on line {lines[stamp.index]}" if stamp.index in lines else "is negative"
+            raise row.error("frame", f"{stamp.index} {found} (expected a unique integer, 0 or more)")
+        lines[stamp.index] = row.line
+        sources = {name: _source(row, name, stamp.timestamp_ns) for name in cameras if row.cells[name]}
+        dropped = {name: NO_IMAGE for name in cameras if not row.cells[name]}
+        entries.append(FrameEntry(stamp, sources, dropped, f"{path}: line {row.line}"))
     for earlier, entry in pairwise(entries):
         before, stamp = earlier.stamp, entry.stamp
         if before.scene == stamp.scene and stamp.timestamp_ns <= before.timestamp_ns:
@@ -56,32 +58,16 @@ def check_times(entries: Iterable[FrameEntry]) -> None:
                 f"{entry.origin}: timestamp_ns {stamp.timestamp_ns} is not later than the previous frame's "
                 f"({before.timestamp_ns}): sort the frames by time, or give them different scenes"
             )
+    return tuple(entries)
 
 
-def _entry(row: CsvRow, cameras: Sequence[str], folder: Path) -> FrameEntry:
-    stamp = FrameStamp(row.integer("frame"), row.cells.get("scene", ""), row.integer("timestamp_ns"))
-    sources = {name: _source(row, name, folder, stamp.timestamp_ns) for name in cameras if row.cells[name]}
-    dropped = {name: NO_IMAGE for name in cameras if not row.cells[name]}
-    return FrameEntry(stamp, sources, dropped, f"{row.path}: line {row.line}")
-
-
-def _source(row: CsvRow, camera: str, folder: Path, frame_ns: int) -> ImageSource:
+def _source(row: CsvRow, camera: str, frame_ns: int) -> ImageSource:
     time_column = f"{camera}.timestamp_ns"
     timestamp_ns = row.integer(time_column) if row.cells.get(time_column) else frame_ns
     video = VIDEO_CELL.fullmatch(row.cells[camera])
     if video:
-        return ImageSource(folder / video["path"], timestamp_ns, int(video["index"]))
-    return ImageSource(folder / row.cells[camera], timestamp_ns)
-
-
-def _check_numbers(rows: Sequence[CsvRow], entries: Sequence[FrameEntry]) -> None:
-    seen: dict[int, int] = {}
-    for row, entry in zip(rows, entries, strict=True):
-        number = entry.stamp.index
-        if number < 0 or number in seen:
-            found = f"is also on line {seen[number]}" if number in seen else "is negative"
-            raise row.error("frame", f"{number} {found} (expected a unique integer, 0 or more)")
-        seen[number] = row.line
+        return ImageSource(row.path.parent / video["path"], timestamp_ns, int(video["index"]))
+    return ImageSource(row.path.parent / row.cells[camera], timestamp_ns)
 
 
 def read_ego_motion(path: Path) -> EgoMotion:
@@ -91,9 +77,19 @@ def read_ego_motion(path: Path) -> EgoMotion:
     """
     required = ("timestamp_ns", *TRANSLATION, *QUATERNION)
     rows = read_csv(path, required, (*ACCELERATION, *ANGULAR_RATE, *VELOCITY))
-    times = _times(rows)
-    translations = _columns(rows, TRANSLATION)
-    quaternions = np.stack([_quaternion(row) for row in rows])
+    stamps: list[int] = []
+    normed: list[Array] = []  # with the stored sign
+    for row in rows:
+        time, quaternion = row.integer("timestamp_ns"), np.array([row.number(name) for name in QUATERNION])
+        if stamps and time <= stamps[-1]:
+            raise row.error("timestamp_ns", f"{time} is not later than the previous row ({stamps[-1]}): sort the rows")
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1) > NORM_TOLERANCE:
+            message = f"the quaternion's norm is {norm:.6g} (expected 1): check its digits and their order"
+            raise row.error("qw..qz", message)
+        stamps.append(time)
+        normed.append(quaternion / norm)
+    times, translations, quaternions = np.array(stamps, dtype=np.int64), _columns(rows, TRANSLATION), np.stack(normed)
     derived = derive_kinematics(times, translations, quaternions)
     stated = [_group(rows, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
     kinematics = [from_poses if own is None else own for own, from_poses in zip(stated, derived, strict=True)]
@@ -111,14 +107,6 @@ def write_ego_motion(path: Path, motion: EgoMotion) -> None:
             writer.writerow([int(time), *(repr(float(value)) for value in row)])
 
 
-def _times(rows: Sequence[CsvRow]) -> NDArray[np.int64]:
-    times = [row.integer("timestamp_ns") for row in rows]
-    for row, (earlier, time) in zip(rows[1:], pairwise(times), strict=True):
-        if time <= earlier:
-            raise row.error("timestamp_ns", f"{time} is not later than the previous row ({earlier}): sort the rows")
-    return np.array(times, dtype=np.int64)
-
-
 def _columns(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array:
     return np.array([[row.number(name) for name in names] for row in rows])
 
@@ -132,12 +120,3 @@ def _group(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array | None:
             "add the others, or remove all to derive them from the poses"
         )
     return _columns(rows, names) if there else None
-
-
-def _quaternion(row: CsvRow) -> Array:
-    """(4,) w, x, y, z with the stored sign, normalised to a norm of exactly 1."""
-    quaternion = np.array([row.number(name) for name in QUATERNION])
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise row.error("qw..qz", f"the quaternion's norm is {norm:.6g} (expected 1): check its digits and their order")
-    return quaternion / norm

@@ -32,6 +32,20 @@ CLASS_OF_CATEGORY = {
     "vehicle.truck": "truck",
 }
 BICYCLE_RACK = "static_object.bicycle_rack"
+# Scene numbers of the official splits, as published on nuscenes.org. All other scenes are in train and mini_train.
+VAL = (
+    "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 775 "
+    "777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
+)
+TEST = (
+    "77-91 111-119 140 142-148 265-266 279-282 307-314 333-343 481-498 547-551 601-604 606-624 827-831 833-842 "
+    "844-846 932-933 935-943 1026-1043"
+)
+MINI_VAL = "103 916"
+SPLITS = ("train", "val", "test", "mini_train", "mini_val")
+LEADING_CAMERA = "CAM_FRONT"
+# The cameras run at 12 Hz, triggered by the lidar's rotation. An image further away belongs to another rotation.
+NEAR_US = 60_000
 
 
 @dataclass(frozen=True)
@@ -214,22 +228,6 @@ class NuScenesIndex:
             visibilities=np.array(a.visibilities[rows]),
             num_points=np.array(a.num_points[rows]),
         )
-
-
-# Scene numbers of the official splits, as published on nuscenes.org. All other scenes are in train and mini_train.
-VAL = (
-    "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 775 "
-    "777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
-)
-TEST = (
-    "77-91 111-119 140 142-148 265-266 279-282 307-314 333-343 481-498 547-551 601-604 606-624 827-831 833-842 "
-    "844-846 932-933 935-943 1026-1043"
-)
-MINI_VAL = "103 916"
-SPLITS = ("train", "val", "test", "mini_train", "mini_val")
-LEADING_CAMERA = "CAM_FRONT"
-# The cameras run at 12 Hz, triggered by the lidar's rotation. An image further away belongs to another rotation.
-NEAR_US = 60_000
 
 
 def tables_of(root: Path, version: str | None) -> Path:

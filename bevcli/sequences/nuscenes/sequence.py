@@ -101,7 +101,6 @@ class TableSequence(Sequence):
         self.notes = (*((note,) if note else ()), *bev_frame_notes(self.rig, str(tables)), *self._table_notes())
 
     def _table_notes(self) -> Iterator[str]:
-        """What the tables lack."""
         samples = self.index.samples
         spans = [self.index.scenes.first_sample[scene : scene + 2] for scene in self.scenes]
         lidars = np.concatenate([samples.lidars[slice(*span)] for span in spans])

@@ -47,6 +47,10 @@ SHORTEST_QUATERNION = 1e-3
 # The text between two rows. Rows of large tables contain no objects and no free text, so it occurs nowhere else.
 BETWEEN_ROWS = re.compile(rb"}\s*,\s*{")
 TAIL_BYTES = 1 << 14  # the end of a batch in which its last complete row ends; no row is longer
+Columns = dict[str, NDArray]  # the columns of a table by name, as many rows each
+CACHE_FORMAT = 2  # version of the cached arrays; increase it when the index changes
+SMALLEST_BYTES = 64 << 20  # smaller tables are not cached, because reading them takes a second or two
+FINGERPRINT = "fingerprint.json"
 
 
 @dataclass(frozen=True)
@@ -170,9 +174,6 @@ def _parse(path: Path, text: bytes) -> Rows:
     if not isinstance(rows, list) or not all(type(row) is dict for row in rows):
         raise InputError(f"{path}: expected a list of rows (a nuScenes table)")
     return Rows(path, rows)
-
-
-Columns = dict[str, NDArray]  # the columns of a table by name, as many rows each
 
 
 def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
@@ -398,11 +399,6 @@ def _columns(rows: Rows, names: _Names) -> Columns:
     }
 
 
-FORMAT = 2  # version of the cached arrays; increase it when the index changes
-SMALLEST_BYTES = 64 << 20  # smaller tables are not cached, because reading them takes a second or two
-FINGERPRINT = "fingerprint.json"
-
-
 def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex, str]:
     """The index of a folder with tables, from the cache if it is up to date, and a note for the user or ""."""
     if sum(path.stat().st_size for path in tables.glob("*.json")) < SMALLEST_BYTES:
@@ -410,7 +406,7 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
     name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
     folder = user_cache() / "nuscenes" / f"{tables.name}-{name}"
     facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
-    fingerprint = json.dumps({"format": FORMAT, "tables": facts})
+    fingerprint = json.dumps({"format": CACHE_FORMAT, "tables": facts})
     with suppress(OSError, ValueError, EOFError):  # there is no cache, or it is damaged
         if (folder / FINGERPRINT).read_text() == fingerprint:
             return _load(folder), ""

@@ -7,9 +7,8 @@ import numpy as np
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import DetectionScores
-from bevcli.evaluation.evaluate import FrameScores
+from bevcli.evaluation.evaluate import FrameScores, SegmentationScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, with_all_columns
-from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.geometry.boxes import Boxes3D
 
 

@@ -78,10 +78,6 @@ class Unknowns:
         """(C, 7) rotation, position and delay of each camera."""
         return x[: OF_CAMERA * self.cameras].reshape(self.cameras, OF_CAMERA)
 
-    def ego_from_camera(self, x: Array) -> Array:
-        """(C, 4, 4), metres."""
-        return moved(self.stated, self.of_camera(x))
-
 
 def moved(ego_from_camera: Array, change: Array) -> Array:
     """Poses (C, 4, 4) with a change (C, 6 or 7): rotation in the camera frame, radians; position in ego, metres."""

@@ -45,8 +45,6 @@ class PointMatches(EpipolarResiduals):
     """M matches of all pairs."""
 
     same: NDArray[np.bool_]  # (M,) whether both images are of the same camera
-    pixels_a: Array  # (M, 2) in the reduced image of the first frame
-    pixels_b: Array  # (M, 2) in that of the second frame
 
 
 def match_points(views: Views) -> PointMatches:
@@ -60,17 +58,13 @@ def match_points(views: Views) -> PointMatches:
             cameras = views.rig.cameras[first], views.rig.cameras[second]
             return _matched(features[a, first], features[b, second], *cameras)
 
-        pixels = list(threads.map(matched, groups))
-    counts = [len(a) for a, _ in pixels]
-    pixels_a, pixels_b = (np.concatenate(side) for side in zip(*pixels, strict=True))
+        rays = list(threads.map(matched, groups))
+    counts = [len(a) for a, _ in rays]
+    rays_a, rays_b = (np.concatenate(side) for side in zip(*rays, strict=True))
     _, first, second = (np.repeat(column, counts) for column in np.array(groups).T)
-    rays_a, rays_b = np.zeros((len(first), 3)), np.zeros((len(first), 3))
-    for index, camera in enumerate(views.rig.cameras):
-        rays_a[first == index] = camera.rays(pixels_a[first == index])
-        rays_b[second == index] = camera.rays(pixels_b[second == index])
     group = np.repeat(np.arange(len(counts)), counts)
     focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[first]
-    return PointMatches(group, rays_a, rays_b, focal, first == second, pixels_a, pixels_b)
+    return PointMatches(group, rays_a, rays_b, focal, first == second)
 
 
 def _features(view: View) -> _Features:
@@ -82,16 +76,16 @@ def _features(view: View) -> _Features:
 
 
 def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple[Array, Array]:
-    """Pixels (m, 2) and (m, 2) of the matches; those within one camera fit one rigid motion."""
-    nothing = np.zeros((0, 2)), np.zeros((0, 2))
+    """Rays (m, 3) and (m, 3) of the matches; those within one camera fit one rigid motion."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 3))
     if min(len(a[0]), len(b[0])) < FEWEST:
         return nothing
     nearest, quality, other = _nearest(a[1], b[1])
     kept = quality < RATIO**2 * other
     if kept.sum() < FEWEST:
         return nothing
-    pixels_a, pixels_b, quality = a[0][kept], b[0][nearest[kept]], quality[kept]
-    rays_a, rays_b = first.rays(pixels_a), second.rays(pixels_b)
+    pixels_a, quality = a[0][kept], quality[kept]
+    rays_a, rays_b = first.rays(pixels_a), second.rays(b[0][nearest[kept]])
     with np.errstate(invalid="ignore"):
         good = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
     if first is second:
@@ -100,7 +94,7 @@ def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple
     # SIFT gives a point with several orientations several times.
     chosen = chosen[np.sort(np.unique(pixels_a[chosen].astype(int), axis=0, return_index=True)[1])]
     chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
-    return pixels_a[chosen], pixels_b[chosen]
+    return rays_a[chosen], rays_b[chosen]
 
 
 def _nearest(

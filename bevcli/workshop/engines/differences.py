@@ -1,8 +1,10 @@
 """`check_exported`: runs a drive through an exported file and through our model, and compares what they compute."""
 
-from collections.abc import Iterator, Mapping
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,10 +12,10 @@ from torch import Tensor
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import paired_steps
+from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
-from bevcli.model.step import ModelOutputs
+from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.workshop.engines.engine import load_exported
 
@@ -69,6 +71,26 @@ def check_exported(
     frames = (preprocess(sequence.load(index)) for index in range(len(sequence.stamps)))
     for prepared, ours, theirs in paired_steps(network, exported, frames):
         yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
+
+
+def paired_steps(
+    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
+) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
+    """Step two versions of a model on the CPU over the same frames, each with its own history.
+
+    Yields each frame that has an image, and the outputs of both.
+    """
+    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
+    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
+    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
+    with contextlib.ExitStack() as hooks:
+        for runner in runners:
+            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
+            hooks.enter_context(hook)
+        for prepared in frames:
+            if prepared.frame.images:
+                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
+                yield prepared, outputs[runners[0]], outputs[runners[1]]
 
 
 def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:

@@ -23,7 +23,7 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor, calibration_images
+from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.step import PreparedFrame
@@ -31,7 +31,7 @@ from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence, select_range
 from bevcli.user_folders import user_cache
-from bevcli.workshop.engines.export_onnx import export_onnx, quantize
+from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.export_step import DeformableConvolution
 from bevcli.workshop.engines.exported import ExportedModel
 from bevcli.workshop.engines.options import OnnxOptions

@@ -73,12 +73,12 @@ class ExportForm:
         """
         raise NotImplementedError
 
-    def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> ModelOutputs:
-        """The outputs as the model's own decoders take them. found: all outputs of the file by name."""
+    def model_outputs(self, outputs: ModelOutputs, by_name: Mapping[str, Tensor]) -> ModelOutputs:
+        """The outputs as the model's own decoders take them. by_name: all outputs of the file by name."""
         return outputs
 
-    def memory(self, prepared: PreparedFrame, memory: Any, found: Mapping[str, Tensor]) -> Any:
-        """The memory after a frame. memory: before it. found: the file's outputs by name."""
+    def memory(self, prepared: PreparedFrame, memory: Any, by_name: Mapping[str, Tensor]) -> Any:
+        """The memory after a frame. memory: before it. by_name: the file's outputs by name."""
         raise NotImplementedError
 
 
@@ -217,8 +217,8 @@ class RecurrentForm(ExportForm):
         inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
-    def memory(self, prepared: PreparedFrame, memory: BevHistory | None, found: Mapping[str, Tensor]) -> BevHistory:
-        return BevHistory(found["bev"], prepared.frame.world_from_ego)
+    def memory(self, prepared: PreparedFrame, memory: BevHistory | None, by_name: Mapping[str, Tensor]) -> BevHistory:
+        return BevHistory(by_name["bev"], prepared.frame.world_from_ego)
 
 
 def _history_ports(config: ModelConfig) -> Iterator[Port]:

@@ -11,7 +11,7 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,11 +22,14 @@ import torch
 
 from bevcli._version import __version__
 from bevcli.config import as_table, config_of_table
-from bevcli.errors import BevcliError, WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.frame import Sequence
+from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
+from bevcli.printing import counted
 from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
 from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import check_output, whole_file
@@ -343,3 +346,33 @@ def check_size(file: Path) -> None:
     size = file.stat().st_size
     if size > LARGEST_BYTES:
         raise ValueError(f"it has {size} bytes (expected at most {LARGEST_BYTES})")
+
+
+def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence], frames: int) -> Iterator[np.ndarray]:
+    """Yields (1, N, H, W, 3) float32, the input `images` of an exported file, for frames of these drives.
+
+    Args:
+        config: of the model.
+        cameras: N, the number of cameras of the exported file.
+        drives: whose frames are read; frames without any image are left out.
+        frames: at most so many, evenly spaced over all frames of all drives.
+
+    Raises InputError where a frame cannot be read, a rig has another number of cameras, or no frame has an image.
+    """
+    empty = True
+    places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
+    chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
+    preprocess = Preprocessor(config, pixels=True)
+    for drive, place in (places[index] for index in chosen):
+        prepared = preprocess(drive.load(place))
+        if len(prepared.assignment.cameras) != cameras:
+            found = counted(len(prepared.assignment.cameras), "cameras")
+            raise InputError(f"{drive.name}: has {found} (the file takes {cameras})")
+        if prepared.frame.images:
+            empty = False
+            yield prepared.images.movedim(2, -1).numpy()
+    if empty:
+        names = ", ".join(drive.name for drive in drives)
+        raise InputError(
+            f"{names}: none of the {len(chosen)} frames for the calibration has an image; add their images"
+        )

@@ -60,8 +60,8 @@ class ExportedStep(nn.Module):
         hit = projection.hit[0].float()  # (N, Y·X)
         cells = hit.shape[1]
         filled, camera = hit.t().topk(self.slots, dim=1)
-        place = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
-        points = projection.reference_points[0].flatten(0, 1).index_select(0, place.flatten())
+        index = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
+        points = projection.reference_points[0].flatten(0, 1).index_select(0, index.flatten())
         count = hit.sum(0)
         return SlottedHits(
             camera=camera,
@@ -73,11 +73,11 @@ class ExportedStep(nn.Module):
 
     def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
         """The outputs in the order of `ExportForm.outputs`. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
-        found: ModelOutputs = self.network.detect(bev)
-        logits, codes, segmentation = found.class_logits[-1], found.box_codes[-1], found.segmentation
+        outputs: ModelOutputs = self.network.detect(bev)
+        logits, codes, segmentation = outputs.class_logits[-1], outputs.box_codes[-1], outputs.segmentation
         masks = () if segmentation is None else (segmentation.mask_logits[-1], segmentation.class_logits[-1])
         boxes = decode_boxes(logits, codes, self.config) if self.decode else ()
-        return (bev, logits, codes, most_cameras, *masks, *found.further.values(), *boxes)
+        return (bev, logits, codes, most_cameras, *masks, *outputs.further.values(), *boxes)
 
 
 class RecurrentStep(ExportedStep):
@@ -185,8 +185,8 @@ class SlottedSpatialCrossAttention(nn.Module):
             sampled = F.grid_sample(tall, grid.transpose(0, 1).flatten(2, 3), align_corners=False)
             weight = weights[:, :, None, level] * hits.filled[:, None, :, None]  # (Y·X, heads, K, P)
             summed = summed + (sampled * weight.transpose(0, 1).flatten(2)[:, None]).sum(-1)  # (heads, D, Y·X)
-        found = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
-        return self.attention.output_projection(found / hits.cameras_per_cell)[None]
+        attended = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
+        return self.attention.output_projection(attended / hits.cameras_per_cell)[None]
 
 
 def tall_map(values: Tensor, height: int, width: int) -> Tensor:

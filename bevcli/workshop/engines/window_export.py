@@ -37,7 +37,7 @@ class WindowStep(ExportedStep):
         network = self.network
         image_features = self.image_features(images, camera_index)
         tokens = [*([] if previous_features is None else previous_features), image_features.tokens]
-        hits = [self.hits(image_from_bev[:, place], has_image[:, place]) for place in range(len(tokens))]
+        hits = [self.hits(image_from_bev[:, index], has_image[:, index]) for index in range(len(tokens))]
         maps = [
             network.encoder(
                 bev_query=network.bev_queries.embedding[None],
@@ -47,8 +47,8 @@ class WindowStep(ExportedStep):
             )
             for frame_tokens, frame_hits in zip(tokens, hits, strict=True)
         ]
-        for place in reversed(range(len(maps) - 1)):
-            maps[place] = torch.where(has_image[:, place].any(), maps[place], maps[place + 1])
+        for index in reversed(range(len(maps) - 1)):
+            maps[index] = torch.where(has_image[:, index].any(), maps[index], maps[index + 1])
         bev = maps[0] if network.fusion is None else network.fusion(maps)
         most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
         outputs = self.outputs(bev, most_cameras)
@@ -104,14 +104,14 @@ class WindowForm(ExportForm):
         """See `ExportForm`. Of a frame that does not exist no camera has an image."""
         past = self._past(prepared, memory)
         current = model_inputs([prepared], [None], self.config)
-        places = [len(past) + offset for offset in self.frames[:-1]]
+        indices = [len(past) + offset for offset in self.frames[:-1]]
         absent = WindowFrame(
             FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),
             torch.zeros_like(current.image_from_bev),
             torch.zeros_like(current.has_image),
             current.image_size,
         )
-        earlier = [one or absent for one in frames_at(past, places, prepared)]
+        earlier = [one or absent for one in frames_at(past, indices, prepared)]
         feed = camera_feed(current) | {
             "image_from_bev": torch.stack([*(one.image_from_bev for one in earlier), current.image_from_bev], dim=1),
             "has_image": torch.stack([*(one.has_image for one in earlier), current.has_image], dim=1),
@@ -121,12 +121,12 @@ class WindowForm(ExportForm):
         return feed
 
     def memory(
-        self, prepared: PreparedFrame, memory: FeatureWindow | None, found: Mapping[str, Tensor]
+        self, prepared: PreparedFrame, memory: FeatureWindow | None, by_name: Mapping[str, Tensor]
     ) -> FeatureWindow:
         past = self._past(prepared, memory)
-        if "image_features" not in found:
+        if "image_features" not in by_name:
             return kept(past, len(past), -self.frames[0])
-        features = FeatureMaps(found["image_features"], self.config.level_shapes)
+        features = FeatureMaps(by_name["image_features"], self.config.level_shapes)
         return kept([*past, FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
 
     def _past(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> list[FrameFeatures]:

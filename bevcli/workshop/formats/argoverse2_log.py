@@ -148,7 +148,6 @@ def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
 
 
 def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
-    """The cameras of a log's calibration folder. Raises InputError."""
     path, poses_path = folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"
     table = FeatherTable(path, ("sensor_name", *LENS, "width_px", "height_px"))
     lenses = dict(zip(table.texts("sensor_name"), table.numbers(LENS), strict=True))
@@ -186,7 +185,6 @@ def _image_times(folder: Path) -> Times:
 
 
 def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options, names: ClassNames) -> dict[int, Boxes3D]:
-    """The boxes in the city frame by time in ns. Raises InputError."""
     columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
     table = FeatherTable(path, columns)
     translations, quaternions = table.poses()
@@ -211,7 +209,6 @@ def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options, nam
 def _entries(
     path: Path, rig: CameraRig, images: Mapping[str, Times], annotated: Times
 ) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
-    """The frames that have an image, and notes. Raises InputError if there are none."""
     leading = next((times for times in images.values() if len(times)), None)
     if leading is None:
         raise InputError(
@@ -231,7 +228,6 @@ def _entries(
 
 
 def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
-    """The image of each camera that is nearest to a time in ns."""
     found = {}
     for name, times in images.items():
         nearest = int(times[np.abs(times - time).argmin()]) if len(times) else None

@@ -65,7 +65,6 @@ def _labels_of(frames: Iterable[tuple[Moment, list[Cuboid]]], *notes: str, lists
 
 
 def _starts_with(path: Path, ending: str, word: bytes) -> bool:
-    """True for a file with an ending such as ".json" and a word in its first 4 KiB."""
     if path.suffix.lower() != ending or not path.is_file():
         return False
     with path.open("rb") as file:

@@ -56,7 +56,7 @@ class Record:
         value = self._member(name)
         if not isinstance(value, list):
             raise InputError(f'{self.where}: "{name}": expected a list, found {type(value).__name__}')
-        return [Record(one, f"{self.where}: {name}[{place}]") for place, one in enumerate(value)]
+        return [Record(member, f"{self.where}: {name}[{index}]") for index, member in enumerate(value)]
 
     def text(self, name: str) -> str:
         """A member that is a text of at most 400 characters. Raises InputError."""
@@ -68,7 +68,7 @@ class Record:
     def texts(self, name: str) -> list[str]:
         """A member that is a list of texts. Raises InputError."""
         value = self._member(name)
-        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
             raise InputError(f'{self.where}: "{name}": expected a list of texts')
         return value
 
@@ -155,7 +155,6 @@ class Calibration:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    """A file of the folder calibration. Raises InputError."""
     record = read_record(path)
     names, lenses, poses = record.texts("names"), record.records("intrinsics"), record.records("extrinsics")
     if not len(names) == len(set(names)) == len(lenses) == len(poses):
@@ -228,7 +227,6 @@ def _read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
 
 
 def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibration) -> tuple[Datum, ...]:
-    """The images and point clouds of a sample. Raises InputError for one that is missing."""
     found = []
     for key in sample.texts("datum_keys"):
         if key not in data:
@@ -245,7 +243,6 @@ def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibra
 
 
 def _datum(record: Record, time_ns: int) -> Datum | None:
-    """The image or point cloud of a record; None for radar and other data."""
     contents = record.record("datum")
     kind = next((name for name in ("image", "point_cloud") if name in contents.value), None)
     if kind is None:
@@ -298,7 +295,6 @@ def _entry(path: Path, index: int, sample: Sample, rig: CameraRig, file_of: File
 
 
 def _file(path: Path, record: Record, member: str, *, allow_outside: bool) -> Path:
-    """The file that a member names. Raises InputError if it leads out of the scene."""
     name = record.text(member)
     file = path / PurePosixPath(name)
     if not allow_outside and leads_out(file, path):
@@ -334,14 +330,12 @@ def _scene_file(path: Path) -> Path:
 
 
 def _read_ontology(folder: Path, scene: Record, class_map: Mapping[str, str]) -> dict[int, str]:
-    """The class of each `class_id` of 3D boxes. Raises InputError. folder: of the scene."""
     names = ClassNames.of_format(CLASS_OF_CATEGORY, class_map)
     items = read_record(folder / "ontology" / f"{scene.record('ontologies').text(BOXES_3D)}.json").records("items")
     return {item.integer("id", 0): names[item.text("name")] for item in items}
 
 
 def _read_boxes(path: Path, world_from_sensor: Array, classes: Mapping[int, str]) -> Boxes3D:
-    """The boxes of a sensor in the world frame, without velocities. Raises InputError."""
     records = read_record(path).records("annotations")
     if not records:
         return Boxes3D.empty()

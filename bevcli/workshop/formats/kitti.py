@@ -69,7 +69,6 @@ def _tracking_file(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Place and words of each line that is not blank."""
     for number, line in enumerate(read_text(path, LARGEST_BYTES).splitlines(), 1):
         if words := line.split():
             yield f"{path}: line {number}", words

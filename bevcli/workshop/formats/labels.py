@@ -76,12 +76,12 @@ class LabelFormat:
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     """The labels of a file of any known format. rig: of the drive. Raises InputError."""
     known: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
-    found = next((one for one in known if one.recognises(path)), None)
+    found = next((form for form in known if form.recognises(path)), None)
     if found is None:
-        raise InputError(f"{path}: is no file of labels (expected {' or '.join(one.name for one in known)})")
+        raise InputError(f"{path}: is no file of labels (expected {' or '.join(form.name for form in known)})")
     labels = found.read(path, rig, options)
-    frames = tuple(replace(each, boxes=each.boxes.possible()) for each in labels.frames)
-    left_out = sum(len(each.boxes) for each in labels.frames) - sum(len(each.boxes) for each in frames)
+    frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
+    left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
     return replace(labels, frames=frames, notes=(*labels.notes, *note))
 
@@ -159,16 +159,16 @@ def _in_world(sequence: Sequence, labels: Labels, path: Path) -> dict[int, Boxes
     times = np.array([stamp.timestamp_ns for stamp in sequence.stamps], dtype=np.int64)
     places = {stamp.index: place for place, stamp in enumerate(sequence.stamps)}
     found: dict[int, Boxes3D] = {}
-    for each in labels.frames:
-        place = _place(each, times, places)
+    for labelled in labels.frames:
+        place = _place(labelled, times, places)
         if place is None:
             raise InputError(
-                f"{path}: {_words(each)} is not in the drive (expected indices {min(places)} to {max(places)}, times "
-                f"{times.min()} to {times.max()} ns): are these the labels of this drive?"
+                f"{path}: {_words(labelled)} is not in the drive (expected indices {min(places)} to {max(places)}, "
+                f"times {times.min()} to {times.max()} ns): are these the labels of this drive?"
             )
         if place in found:
-            raise InputError(f"{path}: {_words(each)}: its frame of the drive has labels already")
-        boxes = each.boxes
+            raise InputError(f"{path}: {_words(labelled)}: its frame of the drive has labels already")
+        boxes = labelled.boxes
         if labels.frame_of_reference != "world" and len(boxes):
             frame = sequence.ground_truth_frame(place)
             boxes = boxes.transformed(frame.rig.ego_from_bev) if labels.frame_of_reference == "bev" else boxes
@@ -193,13 +193,13 @@ def _with_velocities(sequence: Sequence, boxes: dict[int, Boxes3D]) -> tuple[dic
     return filled, ("velocities follow from the tracks",)
 
 
-def _place(each: LabelledFrame, times: np.ndarray, places: Mapping[int, int]) -> int | None:
-    if each.timestamp_ns is None:
-        return None if each.index is None else places.get(each.index)
-    nearest = int(np.abs(times - each.timestamp_ns).argmin())
-    return nearest if abs(int(times[nearest]) - each.timestamp_ns) <= NEAREST_NS else None
+def _place(labelled: LabelledFrame, times: np.ndarray, places: Mapping[int, int]) -> int | None:
+    if labelled.timestamp_ns is None:
+        return None if labelled.index is None else places.get(labelled.index)
+    nearest = int(np.abs(times - labelled.timestamp_ns).argmin())
+    return nearest if abs(int(times[nearest]) - labelled.timestamp_ns) <= NEAREST_NS else None
 
 
-def _words(each: LabelledFrame) -> str:
-    time = "" if each.timestamp_ns is None else f" at {each.timestamp_ns} ns"
-    return f"the frame{'' if each.index is None else f' {each.index}'}{time}"
+def _words(labelled: LabelledFrame) -> str:
+    time = "" if labelled.timestamp_ns is None else f" at {labelled.timestamp_ns} ns"
+    return f"the frame{'' if labelled.index is None else f' {labelled.index}'}{time}"

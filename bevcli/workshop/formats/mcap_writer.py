@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
-import cv2
 import numpy as np
 
 from bevcli.errors import BevcliError, InputError, OutputError
@@ -18,7 +17,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording.colors import GROUND_TRUTH_COLOR, OTHER_COLOR, class_colors
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.sequences.options import WriteOptions
-from bevcli.workshop.formats.output import OutputFormat
+from bevcli.workshop.formats.output import OutputFormat, image_file
 from bevcli.writing import check_output, whole_file
 
 # The fields of foxglove_msgs as they stand in a CDR message; POSE, COLOR and POINTS are short for their types.
@@ -51,6 +50,11 @@ SHORT = {
     **{name: f"foxglove_msgs/{name}" for name in FOXGLOVE},
 }
 NAME, ARRAY, SEQUENCE = 2, 3, 4  # kinds of fields in rosbags
+Fields = dict[str, Any]  # of a message of ROS 2 or Foxglove
+WORLD, EGO, BEV = "map", "base_link", "bev"
+FONT_M = 0.6
+DELETE_ALL = 1  # SceneEntityDeletion.type
+LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # number of Brown-Conrady coefficients
 
 
 class Messages:
@@ -100,14 +104,6 @@ def _long(field: str) -> str:
 
 def _full(kind: str) -> str:
     return kind.replace("/", "/msg/")
-
-
-Fields = dict[str, Any]  # of a message of ROS 2 or Foxglove
-WORLD, EGO, BEV = "map", "base_link", "bev"
-FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
-FONT_M = 0.6
-DELETE_ALL = 1  # SceneEntityDeletion.type
-LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # number of Brown-Conrady coefficients
 
 
 class McapWriter:
@@ -187,11 +183,8 @@ class McapWriter:
             self._add("/odom", "nav_msgs/Odometry", time_ns, fields)
 
     def _write_image(self, frame: Frame, name: str, image: CameraImage) -> None:
-        time_ns, encoded, kind = image.timestamp_ns, image.encoded, FORMATS.get(image.media_type or "")
-        if encoded is None or kind is None:
-            encoded, kind = cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), "png"
-        head = header(time_ns, _optical(name))
-        fields = {"header": head, "format": kind, "data": encoded}
+        time_ns, (content, form) = image.timestamp_ns, image_file(image)
+        fields = {"header": header(time_ns, _optical(name)), "format": form, "data": content}
         self._add(f"/{name}/image/compressed", "sensor_msgs/CompressedImage", time_ns, fields)
         info = camera_info(time_ns, _optical(name), frame.rig[name])
         self._add(f"/{name}/camera_info", "sensor_msgs/CameraInfo", time_ns, info)
@@ -217,7 +210,6 @@ class McapWriter:
 
 
 def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFile:
-    """The boxes of a run of a sequence, with at least this score."""
     file = run / "predictions.json" if run.is_dir() else run
     check_output(out, file)
     boxes = above_score(read_boxes(file), score)
@@ -227,7 +219,6 @@ def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFi
 
 
 def _optical(camera: str) -> str:
-    """The name of a camera's optical frame."""
     return f"{camera}_optical"
 
 

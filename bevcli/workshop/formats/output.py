@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+import cv2
+
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import load_form
 from bevcli.sequences.options import WriteOptions
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
     from bevcli.frame import CameraImage, Frame, Sequence
 
 GROUP: Final = "bevcli.drive_writers"
-SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
+FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
+SUFFIXES = {"jpeg": ".jpg", "png": ".png"}
 
 
 class DriveWriter(AbstractContextManager["DriveWriter"], Protocol):
@@ -73,14 +76,18 @@ class FolderWriter(ExitStack):
         """Open what was written, so that nothing is left that a run would refuse. Raises InputError."""
 
     def _write_image(self, name: str, image: CameraImage) -> str:
-        """Write an image file as it was read, or else a PNG; returns its path relative to the folder, with suffix."""
-        import cv2
+        """Write the file of an image; returns its path relative to the folder, with suffix."""
+        content, form = image_file(image)
+        write_whole(self.folder / f"{name}{SUFFIXES[form]}", content, parents=True)
+        return f"{name}{SUFFIXES[form]}"
 
-        encoded, suffix = image.encoded, SUFFIXES.get(image.media_type or "")
-        if encoded is None or suffix is None:
-            encoded, suffix = cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), ".png"
-        write_whole(self.folder / f"{name}{suffix}", encoded, parents=True)
-        return f"{name}{suffix}"
+
+def image_file(image: CameraImage) -> tuple[bytes, str]:
+    """The file of an image as it was read, or else a PNG; and its format, "jpeg" or "png"."""
+    form = FORMATS.get(image.media_type or "")
+    if image.encoded is None or form is None:
+        return cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), "png"
+    return image.encoded, form
 
 
 @dataclass(frozen=True)

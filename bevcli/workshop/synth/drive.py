@@ -150,10 +150,6 @@ class RenderedDrive:
             *(np.stack([m[k] for m in motions]) for k in range(3)),
         )  # fmt: skip
 
-    def states(self, index: int) -> list[ActorState]:
-        """The annotated objects around the vehicle at a frame, in the order of the object indices in its views."""
-        return [state for _, state in self._actors(index)]
-
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
         seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))

@@ -222,11 +222,7 @@ def check_training_seeds(seeds: Items[int]) -> None:
 
 
 def split_drives(drives: Drives, held_out: int) -> tuple[Drives, Drives]:
-    """The drives to train on, and those to evaluate on: the last `held_out`, or all of them if that is 0.
-
-    Raises:
-        InputError: no drive is left to train on.
-    """
+    """The drives to train on, and the last `held_out` (0: all) to evaluate on. Raises InputError if none is left."""
     count = len(drives)
     if count <= held_out:
         raise InputError(

@@ -188,10 +188,7 @@ class GroundPlan:
 
 
 def _approach_side(street: Street, sign: int) -> int:
-    """The sign of the offset of the lanes that lead to a junction.
-
-    sign: +1 where the stretch begins at the junction, -1 where it ends there, along the street's axis.
-    """
+    """The sign of the offset of the lanes that lead to a junction. sign: +1 where the stretch begins there, else -1."""
     return sign if street.axis == 0 else -sign
 
 

@@ -234,10 +234,7 @@ def loft(rings: Sequence[ArrayLike], surface: Surface) -> Mesh:
 
 
 def prism(rings: ArrayLike, surface: Surface) -> Mesh:
-    """A faster `loft` between two horizontal rings.
-
-    rings: (2, P, 3), the lower ring first; both convex and counter-clockwise seen from above.
-    """
+    """A faster `loft` between two convex rings (2, P, 3), counter-clockwise from above, the lower one first."""
     points = np.asarray(rings, dtype=np.float32)
     count = points.shape[1]
     following = [(i, (i + 1) % count) for i in range(count)]

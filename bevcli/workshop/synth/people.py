@@ -36,10 +36,7 @@ Place = tuple[float, float]  # x and z, metres
 
 
 def person(name: str, stride: int) -> list[Mesh]:
-    """The parts of a person, about 1.75 m tall.
-
-    name: one of PERSON_NAMES. stride: +1 left leg in front, -1 right leg in front, 0 standing.
-    """
+    """The parts of a person, about 1.75 m tall. stride: +1 left leg in front, -1 right leg, 0 standing."""
     k = PERSON_NAMES.index(name)
     skin, hair, legs = SKIN[k % 4], HAIR[(k + 1) % 4], TROUSERS[k % 4]
     swing = 0.26 * stride

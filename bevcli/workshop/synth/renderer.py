@@ -118,10 +118,7 @@ def _transform(matrix, point, out):
 
 @njit(nogil=True, error_model="numpy")
 def _is_hidden(center, radius, pinhole, inverse_depth):
-    """True where all pixels that a sphere may cover already see something nearer.
-
-    center: (3,) camera frame, metres. radius: metres.
-    """
+    """True where all pixels that a sphere (camera frame, metres) may cover already see something nearer."""
     near, far = center[2] - radius, center[2] + radius
     left, right = center[0] - radius, center[0] + radius
     above, below = center[1] - radius, center[1] + radius
@@ -228,10 +225,7 @@ def _narrow(low, high, slope, needed, origin):
 
 @njit(nogil=True)
 def rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heights):
-    """Draw triangles that face the sun into the heights (S, S) of a `ShadowMap`, in place.
-
-    corners: (T, 3, 3) world, metres. scale: texels per metre.
-    """
+    """Draw triangles (T, 3, 3) that face the sun into the heights (S, S) of a `ShadowMap`. scale: texels per metre."""
     size = heights.shape[0]
     q = np.empty((3, 3))
     for t in range(corners.shape[0]):

@@ -101,10 +101,7 @@ def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], colum
 def crossers(
     city: CityPlan, assets: Assets, signals: Signals, span_s: tuple[float, float], node: tuple[int, int]
 ) -> list[Walker]:
-    """People who cross a street at a junction, over the whole simulation.
-
-    node: column and row of the junction. span_s: start and end of the simulation, seconds.
-    """
+    """People who cross a street at a junction (column, row), over the whole simulation."""
     rng = city.stream("crossers", *node)
     walkers: list[Walker] = []
     begin = span_s[0] - 30
@@ -119,10 +116,7 @@ def _crosser(
     city: CityPlan, assets: Assets, signals: Signals, node: tuple[int, int], begin: float,
     rng: np.random.Generator, name: str, index: int,
 ) -> Walker:  # fmt: skip
-    """One person who walks to the kerb, waits for the signal, crosses the road and walks on.
-
-    begin: start of the walk, seconds. index: number of the crosser at this junction; neighbours keep apart.
-    """
+    """One person who walks to the kerb, waits for the signal, crosses the road and walks on; neighbours keep apart."""
     arm = int(rng.integers(4))
     street, cross = city.street_at(node, arm), city.street_at(node, arm + 1)
     side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
@@ -177,10 +171,7 @@ class Roadside:
         self.block = lru_cache(maxsize=None)(self._block)
 
     def _stretch(self, axis: int, index: int, cross: int) -> list[StandingActor]:
-        """Actors on the parking lanes of a stretch.
-
-        axis, index: of the street. cross: index of the street that crosses it at the beginning of the stretch.
-        """
+        """Actors on the parking lanes of a stretch of street. cross: index of the street that crosses it first."""
         return [*self._kerbside(axis, index, cross, -1), *self._kerbside(axis, index, cross, 1)]
 
     def _block(self, column: int, row: int) -> list[StandingActor]:
@@ -232,10 +223,7 @@ class Roadside:
     def _works(
         self, street: Street, side: int, closed: tuple[float, float], rng: np.random.Generator, name: str
     ) -> Iterator[StandingActor]:
-        """Road works on a part of the parking lane: barriers along the traffic, cones, a machine and workers.
-
-        closed: start and end along the street, plan coordinates, metres.
-        """
+        """Barriers along the traffic, cones, a machine and workers. closed: start and end along the street, metres."""
         start, end = closed
         edge, middle = street.half_width - 3.05, street.half_width - 1.4
         barrier = self.assets.draw("barrier", rng)

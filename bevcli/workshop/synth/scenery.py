@@ -246,10 +246,7 @@ class Scenery:
         return template.placed((float(x), float(y), KERB_M), yaw)
 
     def signals_around(self, here: ArrayLike, signals: Signals, time_s: float) -> Iterator[TriangleSoup]:
-        """Traffic signals around a world point (2,), with their lights at a time in seconds.
-
-        Each junction has one signal for each approach, behind the junction on the right.
-        """
+        """Traffic signals around a world point (2,): for each approach, behind the junction on the right."""
         city = self.city
         for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
             street, cross = city.street_at(node, direction), city.street_at(node, direction + 1)

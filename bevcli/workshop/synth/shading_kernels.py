@@ -337,10 +337,7 @@ def _bricks(u, z, footprint, brick, out):
 
 @njit(nogil=True)
 def _pane(seed, column, storey, up, lamps, out):
-    """Albedo of a window into out (3,): a dark room, a curtain, or a lit room.
-
-    up: vertical position in the window, -0.5 to 0.5.
-    """
+    """Albedo of a window into out (3,): a dark room, a curtain, or a lit room. up: -0.5 to 0.5 in the window."""
     chance = _hash(seed + column * 7919, storey * 104729 + seed) % 100
     out[0], out[1], out[2] = 0.035, 0.045, 0.055
     if chance < 26 and up > -0.5 + (chance % 5) * 0.2:  # curtain or blind
@@ -351,10 +348,7 @@ def _pane(seed, column, storey, up, lamps, out):
 
 @njit(nogil=True)
 def _shop(u, z, length, shop_m, seed, out):
-    """Albedo of a shop front into out (3,): posts, windows, doors, signs. Returns whether the point is glass.
-
-    u: position along the wall, metres. length, shop_m: length and height of the shop front, metres.
-    """
+    """Albedo of a shop front into out (3,). Returns whether the point is glass. u: position along the wall, metres."""
     unit = 4.2
     count = max(1.0, np.floor(length / unit))
     width = length / count

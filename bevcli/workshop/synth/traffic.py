@@ -172,10 +172,7 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
 
 @njit(nogil=True)
 def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
-    """(count, 2) evenly spaced points of a route from at start to end.
-
-    points: (P, 2) of the route. positions: (P,) along it, metres.
-    """
+    """(count, 2) evenly spaced points of a route (P, 2) with positions (P,), from start to end, metres."""
     result = np.empty((count, 2))
     for i in range(count):
         at = start + (end - start) * i / (count - 1)
@@ -257,10 +254,7 @@ class DrivingActor:
 
 
 def interpolated_track(track: Array, time_s: float) -> float:
-    """Route position in metres at a time: cubic Hermite interpolation between the steps of a track.
-
-    track: (3, T) times, route positions and speeds of the steps; seconds, metres and m/s.
-    """
+    """Route position in metres at a time: cubic Hermite interpolation between the steps of a track (3, T)."""
     times, fronts, speeds = track
     k = min(max(int(times.searchsorted(time_s, side="right")) - 1, 0), len(times) - 2)
     span = times[k + 1] - times[k]

@@ -107,54 +107,99 @@ class DistillationLossConfig:
     """The [training.distillation_loss] table.
 
     Attributes:
-        weight: of the mean squared difference of the BEV maps; 0 disables it.
+        weight: of the mean squared difference of the BEV maps; 0 disables this part.
+        feature_weight: of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0
+            disables this part. With it the teacher sees the images that the model sees, with all augmentation.
         teacher: weights of the teacher, a file or a model's name.
         model: name or TOML file of the teacher's model, which may have another backbone and normalisation of images;
             "" for the model that is trained.
     """
 
     weight: float = 0.0
+    feature_weight: float = 0.0
     teacher: str = ""
     model: str = ""
 
     def __post_init__(self) -> None:
-        if self.weight < 0 or (self.weight and not self.teacher):
-            raise ValueError("weight must not be negative, and teacher must name weights where it is positive")
+        if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
+            raise ValueError(
+                "weight and feature_weight must not be negative, and teacher must name weights where one is positive"
+            )
+
+    @property
+    def active(self) -> bool:
+        """Some part of the loss is not disabled."""
+        return max(self.weight, self.feature_weight) > 0
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The results of a teacher for one frame of B clips with N cameras.
+
+    Attributes:
+        bev: (B, Y·X, C) float32; None where only the features are learned.
+        features: (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned.
+    """
+
+    bev: Tensor | None
+    features: tuple[Tensor, ...]
 
 
 class Teacher:
-    """The model whose BEV maps another one learns, in evaluation mode.
+    """The model that another one learns from, in evaluation mode.
 
-    It sees the images and the calibration before they were augmented.
+    It sees the images and the calibration before they were augmented or, where a model learns its features, the images
+    that the model sees.
     """
 
     def __init__(self, model: Network, config: DistillationLossConfig, device: torch.device) -> None:
         """Raises BevcliError where the weights or the teacher's model are missing, or do not fit the model."""
-        self._image = model.config.image
+        self._config, self._taught = config, model.config
         self._network = build_network(load_config(config.model)) if config.model else copy.deepcopy(model)
         load_weights(weights_file(Path(config.teacher)), self._network, config.model)
-        own, other = _map_of(model.config), _map_of(self._network.config)
+        own, other = _maps_of(model.config), _maps_of(self._network.config)
         if own != other:
             raise ConfigError(f"{config.model}: cannot teach {model.config.name}: it has {other} (expected {own})")
         self._network.eval().requires_grad_(False).to(device)
         choose_kernels(self._network, device)
 
     @torch.no_grad()
-    def bev_maps(self, clip: Batch) -> Iterator[Tensor]:
-        """(B, Y·X, C) float32 for each frame of clips, lazily."""
-        own, steps, memory = self._network.config.image, clip_steps(self._network), None
-        if self._image != own:
-            images = [renormalised(one.images, self._image, own) for one in clip.inputs]
-            inputs = (replace(one, images=each) for one, each in zip(clip.inputs, images, strict=True))
-            clip = replace(clip, inputs=tuple(inputs))
-        for frame in range(len(clip.inputs)):
-            outputs, memory = steps.outputs(clip, frame, memory)
-            yield outputs.bev.float()
+    def lessons(self, clip: Batch) -> Iterator[Lesson]:
+        """The results for each frame of clips, lazily."""
+        image, own, network = self._taught.image, self._network.config.image, self._network
+        steps, memory = clip_steps(network), None
+        if image != own:
+            clip = replace(
+                clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
+            )
+        for frame, inputs in enumerate(clip.inputs):
+            bev = None
+            with last_outputs(network.neck) as features:
+                if self._config.weight:
+                    outputs, memory = steps.outputs(clip, frame, memory)
+                    bev = outputs.bev.float()
+                else:
+                    network.image_features(inputs.images, inputs.camera_index)
+            yield Lesson(bev, tuple(x.float() for x in features[0]) if self._config.feature_weight else ())
 
 
-def _map_of(config: ModelConfig) -> str:
-    grid, (width, height) = config.bev_grid, config.image.size
-    return f"{grid.rows} x {grid.columns} BEV cells of {config.channels} channels, images of {width} x {height}"
+def _maps_of(config: ModelConfig) -> str:
+    """What a teacher and the model have in common, in words."""
+    sizes = " and ".join(f"{height} x {width}" for height, width in config.level_shapes)
+    grid = config.bev_grid
+    maps = f"{config.neck.levels} maps of {config.channels} channels and {sizes} cells"
+    return f"{maps}, {grid.rows} x {grid.columns} BEV cells"
+
+
+@contextlib.contextmanager
+def last_outputs(part: nn.Module) -> Iterator[deque[Any]]:
+    """Inside, the only item is what the last forward pass of a part returned. No hook remains."""
+    kept = deque[Any](maxlen=1)
+    hook = part.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
+    try:
+        yield kept
+    finally:
+        hook.remove()
 
 
 @dataclass(frozen=True)
@@ -166,7 +211,7 @@ class LossConfigs:
         segmentation_loss: the segmentation head's, where the model has one.
         dense_loss: auxiliary, on the BEV map.
         perspective_loss: auxiliary, on the image features.
-        distillation_loss: auxiliary, against the BEV map of a teacher.
+        distillation_loss: auxiliary, against the BEV map or the image features of a teacher.
     """
 
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
@@ -189,7 +234,6 @@ class FrameLosses:
         self.configs = configs
         self._config, self._own_heads = model.config, own_heads(model.config)
         self._query_groups = model.config.decoder.training_groups
-        self._feature_maps = deque[Any](maxlen=1)  # of the last forward pass
         self._dense_head: DenseHead | None = None
         self._perspective_head: PerspectiveHead | None = None
         self.auxiliary_heads = nn.ModuleDict()
@@ -203,21 +247,16 @@ class FrameLosses:
     @contextlib.contextmanager
     def watching(self, model: Network) -> Iterator[None]:
         """Inside, each forward pass of the model keeps its image features for the losses on them. No hook remains."""
-        kept = self._feature_maps
-        hook = model.neck.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
-        try:
+        with last_outputs(model.neck) as self._feature_maps:
             yield
-        finally:
-            hook.remove()
-            kept.clear()
 
     def __call__(
-        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Tensor | None = None
+        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Lesson | None = None
     ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
         Call it inside `watching`, right after the forward pass that made the outputs.
-        taught: the BEV map of the teacher.
+        taught: by the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
         losses = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
@@ -234,9 +273,13 @@ class FrameLosses:
                 targets.perspective,
                 self.configs.perspective_loss,
             )
-        if taught is not None:
-            difference = nn.functional.mse_loss(outputs.bev.float(), taught)
+        if taught is not None and taught.bev is not None:
+            difference = nn.functional.mse_loss(outputs.bev.float(), taught.bev)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
+        if taught is not None and taught.features:
+            pairs = zip(self._feature_maps[0], taught.features, strict=True)
+            shares = [nn.functional.mse_loss(own.float(), other) / other.var() for own, other in pairs]
+            losses |= {"features": self.configs.distillation_loss.feature_weight * torch.stack(shares).mean()}
         if self._own_heads is not None:
             matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._own_heads.losses(outputs, targets.truths, matches, self._config)

@@ -27,7 +27,7 @@ from bevcli.model.step import ModelOutputs
 from bevcli.workshop.training import files
 from bevcli.workshop.training.augmentation import randomised
 from bevcli.workshop.training.clip_steps import clip_steps
-from bevcli.workshop.training.frame_losses import FrameLosses, Teacher
+from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
 from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.workshop.training.loading import BatchMaker, loaded_batches
 from bevcli.workshop.training.samples import Batch
@@ -189,10 +189,10 @@ class Trainer:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
-        self._teacher = Teacher(job.model, taught, job.device) if taught.weight else None
+        self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self.maker = BatchMaker(
             job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
-            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None,
+            with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
             in_bytes=job.device.type == "cuda",
         )  # fmt: skip
         self._frozen: FrozenStages | None = None
@@ -291,12 +291,13 @@ class Trainer:
             job.model, batch, learn_all=config.clips.learn == "all", freeze_batch_norm=config.freeze_batch_norm
         )
         learned = len(batch.targets)
-        teacher_maps: Iterator[Tensor | None] = repeat(None)
-        if self._teacher is not None and batch.plain is not None:
-            teacher_maps = islice(self._teacher.bev_maps(batch.plain), len(batch.inputs) - learned, None)
+        lessons: Iterator[Lesson | None] = repeat(None)
+        if self._teacher is not None:
+            shown = batch if batch.plain is None else batch.plain
+            lessons = islice(self._teacher.lessons(shown), len(batch.inputs) - learned, None)
         for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                output, taught = next(outputs), next(teacher_maps)
+                output, taught = next(outputs), next(lessons)
             yield self._losses(inputs, output, targets, taught)
 
     def _update(self, losses: dict[str, Tensor]) -> Callable[[], dict[str, float]]:

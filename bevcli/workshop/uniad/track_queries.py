@@ -1,4 +1,7 @@
-"""Track queries (MOTR, Zeng et al. 2022; UniAD, Hu et al. 2023): decoder queries that follow one object over frames."""
+"""Track queries (MOTR, Zeng et al. 2022; UniAD, Hu et al. 2023): decoder queries that follow one object over frames.
+
+Each has a memory of its own embeddings, and all attend to each other before the next frame.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import ObjectQueries, inverse_sigmoid
-from bevcli.workshop.uniad.memory_bank import Memories
 
 NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego query
 
@@ -46,6 +49,44 @@ class TrackQueryConfig:
         counts = (self.max_misses, self.memory_length, self.memory_interval, self.attention_heads)
         if min(counts) < 1 or min(self.center_range_m) <= 0:
             raise ValueError("max_misses, memory_length, memory_interval, heads and center_range_m must be positive")
+
+
+@dataclass(frozen=True)
+class Memories:
+    """The memories of K tracks.
+
+    Attributes:
+        embeddings: (K, M, C), the newest last.
+        is_empty: (K, M) bool, slots without an embedding.
+        wait: (K,) int64 number of frames until the next embedding is saved; 0 saves in this frame.
+    """
+
+    embeddings: Tensor
+    is_empty: Tensor
+    wait: Tensor
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> Memories:
+        """The memories after a change of every tensor."""
+        return Memories(change(self.embeddings), change(self.is_empty), change(self.wait))
+
+    def __getitem__(self, selection: Tensor) -> Memories:
+        """The memories of a mask (K,) bool."""
+        return self.each(lambda column: column[selection])
+
+    @staticmethod
+    def empty(like: Tensor, length: int) -> Memories:
+        """The memories of K new tracks. like: (K, C), embeddings of the tracks. length: M."""
+        count, channels = like.shape
+        return Memories(
+            like.new_zeros(count, length, channels),
+            torch.ones(count, length, dtype=torch.bool, device=like.device),
+            torch.zeros(count, dtype=torch.int64, device=like.device),
+        )
+
+    def followed_by(self, others: Memories) -> Memories:
+        """These memories, then the others."""
+        columns = zip(vars(self).values(), vars(others).values(), strict=True)
+        return Memories(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True)
@@ -147,3 +188,92 @@ def live_and_die(
     ids = torch.where(born, next_id - 1 + born.cumsum(0), ids)
     ids = ids.masked_fill(missed & (misses >= config.max_misses), NO_TRACK)
     return ids, misses, next_id + int(born.sum())
+
+
+class MemoryBank(nn.Module):
+    """Attention of tracks to their memories, and the saving of new ones, after MOTR.
+
+    One track with 3 memories and an interval of 2 frames; sK is what was saved of its embedding in frame K:
+
+        frame           0        1        2        3        4        5        6
+        memories     [- - -]  [- - s0] [- - s0] [- s0 s2] [- s0 s2] [s0 s2 s4] ...   the newest last, - for none
+        attends to      -       s0       s0      s0, s2   s0, s2   s0, s2, s4
+        wait            0        1        0        1        0        1        0
+        saves then     s0        -       s2        -       s4        -       s6
+    """
+
+    def __init__(self, channels: int, heads: int, interval: int) -> None:
+        super().__init__()
+        self.interval = interval
+        self.attention = nn.MultiheadAttention(channels, heads, batch_first=True)
+        self.expand = nn.Linear(channels, channels)
+        self.reduce = nn.Linear(channels, channels)
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
+        self.save_projection = nn.Linear(channels, channels)
+
+    def forward(self, embedding: Tensor, memories: Memories) -> tuple[Tensor, Memories]:
+        """embedding: (K, C) of the decoder -> the embedding (K, C) after the attention, and the memories after it."""
+        remembers = ~memories.is_empty[:, -1]
+        if remembers.any():
+            attended = self._attend(embedding[remembers], memories[remembers])
+            embedding = embedding.masked_scatter(remembers[:, None], attended)
+        return embedding, self._saved(embedding, memories)
+
+    def _attend(self, embedding: Tensor, memories: Memories) -> Tensor:
+        slots = memories.embeddings
+        attended, _ = self.attention(
+            embedding[:, None], slots, slots, key_padding_mask=memories.is_empty, need_weights=False
+        )
+        embedding = self.norms[0](embedding + attended[:, 0])
+        return self.norms[1](embedding + self.reduce(F.relu(self.expand(embedding))))
+
+    def _saved(self, embedding: Tensor, memories: Memories) -> Memories:
+        saves = memories.wait == 0
+        newest = self.save_projection(embedding)[:, None]
+        shifted = torch.cat([memories.embeddings[:, 1:], newest], dim=1)
+        shifted_empty = torch.cat([memories.is_empty[:, 1:], torch.zeros_like(memories.is_empty[:, :1])], dim=1)
+        return Memories(
+            torch.where(saves[:, None, None], shifted, memories.embeddings),
+            torch.where(saves[:, None], shifted_empty, memories.is_empty),
+            torch.where(saves, self.interval - 1, memories.wait - 1),
+        )
+
+
+class QueryInteraction(nn.Module):
+    """Self-attention among the tracks; position and content of their queries take up the result."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.self_attention = nn.MultiheadAttention(channels, heads, batch_first=True)
+        self.feed_forward = ResidualBlock(channels)
+        self.norm = nn.LayerNorm(channels)
+        self.position = ResidualBlock(channels)
+        self.content = ResidualBlock(channels)
+
+    def forward(self, embedding: Tensor, position: Tensor, content: Tensor) -> tuple[Tensor, Tensor]:
+        """Position (K, C) and content (K, C) of the queries for the next frame.
+
+        Args:
+            embedding: (K, C) of the tracks, after the memory bank; K is at least 1.
+            position: (K, C) first half of their queries in this frame.
+            content: (K, C) second half.
+        """
+        key = (embedding + position)[None]
+        attended, _ = self.self_attention(key, key, embedding[None], need_weights=False)
+        embedding = self.norm(embedding + attended[0])
+        embedding = self.feed_forward(embedding, embedding)
+        return self.position(position, embedding), self.content(content, embedding)
+
+
+class ResidualBlock(nn.Module):
+    """A query plus a two-layer network of an embedding, normalised."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.expand = nn.Linear(channels, channels)
+        self.reduce = nn.Linear(channels, channels)
+        self.norm = nn.LayerNorm(channels)
+
+    def forward(self, query: Tensor, embedding: Tensor) -> Tensor:
+        """query, embedding: (K, C) -> (K, C)."""
+        return self.norm(query + self.reduce(F.relu(self.expand(embedding))))

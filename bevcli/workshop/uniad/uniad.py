@@ -19,17 +19,16 @@ from bevcli.model.decoder import ObjectQueries
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
-from bevcli.model.tensors import without_autocast
-from bevcli.model.upload import upload
-from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.workshop.uniad.map_merging import merge_map
-from bevcli.workshop.uniad.memory_bank import Memories, MemoryBank
+from bevcli.model.upload import upload, without_autocast
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map
 from bevcli.workshop.uniad.official_keys import OFFICIAL_NAMES
-from bevcli.workshop.uniad.query_interaction import QueryInteraction
 from bevcli.workshop.uniad.track_queries import (
     EGO,
     NO_TRACK,
     FrameMotion,
+    Memories,
+    MemoryBank,
+    QueryInteraction,
     TrackQueries,
     TrackQueryConfig,
     live_and_die,

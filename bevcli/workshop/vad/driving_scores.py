@@ -21,6 +21,7 @@ from bevcli.printing import aligned, counted
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes.format import is_nuscenes_root
+from bevcli.workshop.vad import DrivingScoreOptions
 from bevcli.workshop.vad.driving_metrics import (
     THRESHOLDS_M,
     LineScores,
@@ -33,13 +34,12 @@ from bevcli.workshop.vad.driving_metrics import (
 )
 from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
 from bevcli.workshop.vad.plan import Plan, read_plans
-from bevcli.workshop.vad.score_options import DrivingScoreOptions
 
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
 LATE_S = 0.1  # a frame this near counts as one at the time of a step
 
 
-class Drives:
+class FramesByTime:
     """The frames of a ground truth by scene and time, with boxes in the world frame."""
 
     def __init__(self, truth: Iterable[FrameBoxes]) -> None:
@@ -58,7 +58,9 @@ class Drives:
         return self._scenes[stamp.scene][nearest] if abs(times[nearest] - wanted) <= LATE_S * 1e9 else None
 
 
-def with_true_futures(boxes: Boxes3D, stamp: FrameStamp, drives: Drives, times_s: Sequence[float] | Array) -> Boxes3D:
+def with_true_futures(
+    boxes: Boxes3D, stamp: FrameStamp, drives: FramesByTime, times_s: Sequence[float] | Array
+) -> Boxes3D:
     """Boxes in the world frame with one future each: NaN from the first step on in which the object is not there.
 
     Raises InputError where the boxes have no identities.
@@ -154,7 +156,7 @@ def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> Drivin
     return DrivingScores(lines, motion, plan, notes)
 
 
-def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
+def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> FramesByTime:
     """The drives of the ground truth, which an option needs in the world frame."""
     if pairs.frame_of_reference != "world":
         raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
@@ -163,7 +165,7 @@ def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
             "forecasts and paths need ground truth in the world frame "
             f"(found the {truth.boxes.frame_of_reference} frame)"
         )
-    return Drives(truth.boxes.frames)
+    return FramesByTime(truth.boxes.frames)
 
 
 def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:

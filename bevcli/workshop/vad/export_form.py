@@ -8,9 +8,9 @@ from torch import Tensor
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.engines.export_form import Port, RecurrentForm
 from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.decoding import VADOutputs
 from bevcli.workshop.vad.line_decoder import LineOutputs
 from bevcli.workshop.vad.motion_head import MotionOutputs
+from bevcli.workshop.vad.vad import VADOutputs
 
 
 class VADForm(RecurrentForm):
@@ -44,9 +44,9 @@ class VADForm(RecurrentForm):
             f"(1, commands, T, 2): movement of the vehicle in each step, for the commands {', '.join(commands)}.",
         )
 
-    def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> VADOutputs:
+    def model_outputs(self, outputs: ModelOutputs, by_name: Mapping[str, Tensor]) -> VADOutputs:
         none = torch.zeros(0)  # features between the heads are not in the file
-        lines = LineOutputs(found["line_class_logits"][None], found["line_points"][None], none)
-        motion = MotionOutputs(found["future_offsets"], found["mode_logits"], none)
+        lines = LineOutputs(by_name["line_class_logits"][None], by_name["line_points"][None], none)
+        motion = MotionOutputs(by_name["future_offsets"], by_name["mode_logits"], none)
         parts = outputs.bev, outputs.class_logits, outputs.box_codes
-        return VADOutputs(*parts, lines=lines, motion=motion, plan=found["plan_offsets"])
+        return VADOutputs(*parts, lines=lines, motion=motion, plan=by_name["plan_offsets"])

@@ -12,7 +12,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.workshop.training.detection_loss import boxes_inside
 from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.driving_scores import LATE_S, Drives, followed, with_true_futures
+from bevcli.workshop.vad.driving_scores import LATE_S, FramesByTime, followed, with_true_futures
 from bevcli.workshop.vad.map_lines import TRUE_LINES, MapLines
 
 
@@ -53,7 +53,7 @@ def frame_truth(frame: Frame, sequence: Sequence, place: int, config: VADConfig)
             f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no true lines of the map: training "
             f"{config.name} needs {TRUE_LINES} (bevcli render writes it)"
         )
-    later = Drives(_frames_until(sequence, place, max(times)))
+    later = FramesByTime(_frames_until(sequence, place, max(times)))
     bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
     boxes = with_true_futures(boxes, frame.stamp, later, times)
     driven = np.full((len(times), 2), np.nan)

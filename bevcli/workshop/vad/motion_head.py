@@ -1,4 +1,7 @@
-"""The motion head of VAD: each object attends to all objects and to the lines around it; its futures come of that."""
+"""The motion head and the planner of VAD: objects, and the own vehicle, attend to objects and lines.
+
+The futures of the objects and the planned paths come of that.
+"""
 
 from dataclasses import dataclass
 
@@ -100,9 +103,9 @@ class MotionHead(nn.Module):
         position = self.agent_position(positions).repeat_interleave(self.config.modes, dim=1)
         modes = self.agent_attention(modes, position, modes, position)
         modes = modes.unflatten(1, (-1, self.config.modes))  # (B, Q, M, C)
-        found = torch.cat([modes, self._attend_to_lines(modes, positions, lines)], dim=-1)  # (B, Q, M, 2 C)
-        offsets = self.trajectory_branch(found).unflatten(-1, (self.config.steps, 2))
-        return MotionOutputs(offsets, self.mode_branch(found)[..., 0], self.agent_fusion(found.flatten(2)))
+        attended = torch.cat([modes, self._attend_to_lines(modes, positions, lines)], dim=-1)  # (B, Q, M, 2 C)
+        offsets = self.trajectory_branch(attended).unflatten(-1, (self.config.steps, 2))
+        return MotionOutputs(offsets, self.mode_branch(attended)[..., 0], self.agent_fusion(attended.flatten(2)))
 
     def _attend_to_lines(self, modes: Tensor, positions: Tensor, lines: MapTokens) -> Tensor:
         """(B, Q, M, C): each object attends to its own lines, at their positions relative to it."""
@@ -111,14 +114,14 @@ class MotionHead(nn.Module):
         values = features[:, None].expand(-1, positions.shape[1], -1, -1)
         # As in the released code, the object itself is at the origin.
         own = self.line_position(positions.new_zeros(1, 1, 2))
-        found = self.line_attention(
+        attended = self.line_attention(
             modes.flatten(0, 1),
             own,
             values.flatten(0, 1),
             self.line_position(relative).flatten(0, 1),
             masked.flatten(0, 1),
         )
-        return found.unflatten(0, modes.shape[:2])
+        return attended.unflatten(0, modes.shape[:2])
 
     def lines_in_reach(self, positions: Tensor, lines: MapTokens) -> tuple[Tensor, Tensor]:
         """Relative positions (B, Q, N + 1, 2) of the lines, and masks (B, Q, N + 1) of those not attended to.
@@ -175,3 +178,33 @@ def line_positions(points: Tensor) -> Tensor:
     """
     nearest = points.norm(dim=-1).argmin(-1)  # (B, N)
     return points.gather(2, nearest[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+
+
+class Planner(nn.Module):
+    """One path for each command. Nothing else of the vehicle enters: its speed is in the BEV map only."""
+
+    def __init__(self, config: MotionConfig, commands: int, channels: int) -> None:
+        super().__init__()
+        self.shape = (commands, config.steps, 2)
+        self.ego_query = nn.Parameter(torch.randn(1, channels))
+        self.agent_attention = config.attention(channels)
+        self.agent_position = nn.Linear(2, channels)
+        self.line_attention = config.attention(channels)
+        self.line_position = nn.Linear(2, channels)
+        self.path_branch = branch(2 * channels, 3, commands * config.steps * 2)
+
+    def forward(self, features: Tensor, positions: Tensor, lines: MapTokens) -> Tensor:
+        """Movement (B, commands, T, 2) in each step along x and y of the bev frame, metres.
+
+        Args:
+            features: (B, Q, C) of the objects, `MotionOutputs.features`.
+            positions: (B, Q, 2) their centres, 0 to 1 over the range.
+            lines: all are attended to, whatever their scores.
+        """
+        corner = positions.new_zeros(1, 1, 2)  # the released code places the vehicle there, not in the middle
+        ego = self.ego_query.expand(len(features), -1, -1)  # (B, 1, C)
+        with_agents = self.agent_attention(ego, self.agent_position(corner), features, self.agent_position(positions))
+        with_lines = self.line_attention(
+            with_agents, self.line_position(corner), lines.features, self.line_position(lines.positions)
+        )
+        return self.path_branch(torch.cat([with_agents, with_lines], dim=-1)[:, 0]).unflatten(-1, self.shape)

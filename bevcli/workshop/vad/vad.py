@@ -1,22 +1,58 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Self
 
+import numpy as np
 from torch import Tensor
 
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.box_coding import best_boxes
+from bevcli.model.decoder import best_classes
 from bevcli.model.network import STAGES
+from bevcli.model.official_keys import OfficialNames, Renames
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import ModelOutputs
-from bevcli.model.tensors import without_autocast
+from bevcli.model.upload import without_autocast
 from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
-from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
-from bevcli.workshop.vad.official_keys import OFFICIAL_NAMES
-from bevcli.workshop.vad.planner import Planner
+from bevcli.workshop.vad.map_lines import MapLines
+from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, Planner, line_positions
+from bevcli.workshop.vad.plan import Plan
+
+_RENAMES: Renames = (
+    (r"^pts_bbox_head\.map_instance_embedding\.weight$", "line_decoder.line_embedding"),
+    (r"^pts_bbox_head\.map_pts_embedding\.weight$", "line_decoder.point_embedding"),
+    (r"^pts_bbox_head\.transformer\.map_reference_points\.", "line_decoder.reference_points."),
+    (r"^pts_bbox_head\.transformer\.map_decoder\.", "line_decoder."),
+    (r"^pts_bbox_head\.map_cls_branches\.", "line_decoder.class_branches."),
+    (r"^pts_bbox_head\.map_reg_branches\.", "line_decoder.point_branches."),
+    (r"^pts_bbox_head\.lane_encoder\.layer_seq\.lmlp_(\d)\.mlp\.", r"line_encoder.layers.\1."),
+    (r"^pts_bbox_head\.motion_mode_query\.weight$", "motion_head.mode_queries"),
+    (r"^pts_bbox_head\.motion_decoder\.layers\.0\.", "motion_head.agent_attention."),
+    (r"^pts_bbox_head\.pos_mlp_sa\.", "motion_head.agent_position."),
+    (r"^pts_bbox_head\.motion_map_decoder\.layers\.0\.", "motion_head.line_attention."),
+    (r"^pts_bbox_head\.pos_mlp\.", "motion_head.line_position."),
+    (r"^pts_bbox_head\.traj_branches\.0\.", "motion_head.trajectory_branch."),
+    (r"^pts_bbox_head\.traj_cls_branches\.0\.", "motion_head.mode_branch."),
+    (r"^pts_bbox_head\.agent_fus_mlp\.", "motion_head.agent_fusion."),
+    (r"^pts_bbox_head\.ego_query\.weight$", "planner.ego_query"),
+    (r"^pts_bbox_head\.ego_agent_decoder\.layers\.0\.", "planner.agent_attention."),
+    (r"^pts_bbox_head\.ego_agent_pos_mlp\.", "planner.agent_position."),
+    (r"^pts_bbox_head\.ego_map_decoder\.layers\.0\.", "planner.line_attention."),
+    (r"^pts_bbox_head\.ego_map_pos_mlp\.", "planner.line_position."),
+    (r"^pts_bbox_head\.ego_fut_decoder\.", "planner.path_branch."),
+    (r"^((motion_head|planner)\..*)\.attentions\.0\.attn\.", r"\1.attention."),
+)
+
+# The weights of the loss are used in training only.
+OFFICIAL_NAMES = OfficialNames(
+    r"^pts_bbox_head\.map_", _RENAMES, unused=r"^pts_bbox_head\.map_code_weights$", unused_text="{first}"
+)
 
 PART_NAMES = (
     ("map decoder", "line_decoder"),
@@ -28,6 +64,37 @@ PART_NAMES = (
     ("planner: vehicle to lines", "planner.line_attention", "planner.line_position"),
     ("planner: paths", "planner"),
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VADOutputs(ModelOutputs):
+    """The outputs of one step.
+
+    Attributes:
+        lines: of the map.
+        motion: the futures of the object queries.
+        plan: (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres.
+    """
+
+    lines: LineOutputs
+    motion: MotionOutputs
+    plan: Tensor
+
+    @property
+    def further(self) -> dict[str, Tensor]:
+        return {
+            "line_class_logits": self.lines.class_logits[-1],
+            "line_points": self.lines.points[-1],
+            "future_offsets": self.motion.offsets,
+            "mode_logits": self.motion.mode_logits,
+            "plan_offsets": self.plan,
+        }
+
+    def last_layers(self) -> Self:
+        """See `ModelOutputs`. Features, which only the network uses, are left out."""
+        lines, none = self.lines, self.plan[:0]
+        last = LineOutputs(lines.class_logits[-1:], lines.points[-1:], none)
+        return replace(super().last_layers(), lines=last, motion=replace(self.motion, features=none))
 
 
 class VAD(BEVFormer):
@@ -80,3 +147,38 @@ def fix_first_attentions(model: VAD) -> None:
     fix_first_attention(model)
     first = model.line_decoder.layers[0]
     first.self_attention = ConstantSelfAttention(first, model.line_decoder.queries(batch=1))
+
+
+def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
+    """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
+    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config)
+    boxes, queries = best.decoded(config.classes), best.query[0]
+    offsets = _array(outputs.motion.offsets[0, queries])  # (K, M, T, 2)
+    places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
+    seconds = np.broadcast_to(np.array(config.future_times_s)[:, None], (*places.shape[:3], 1))
+    scores = _array(outputs.motion.mode_logits[0, queries].sigmoid())
+    return replace(boxes, futures=np.concatenate([seconds, places], axis=-1), future_scores=scores)
+
+
+def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
+    """The line_decoder.max_lines lines with the best scores, by falling score, bev frame; see `best_classes`."""
+    decoder = config.line_decoder
+    scores, queries, labels = (each[0] for each in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
+    points = line_places(outputs.lines.points[-1, 0, queries], config)  # (K, P, 2)
+    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
+
+
+def line_places(points: Tensor, config: VADConfig) -> Array:
+    """Points of lines (..., 2), 0 to 1 over the range -> metres, bev frame."""
+    (x0, x1), (y0, y1) = config.bev_grid.x_range_m, config.bev_grid.y_range_m
+    return _array(points) * (x1 - x0, y1 - y0) + (x0, y0)
+
+
+def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
+    """The planned paths, bev frame."""
+    return Plan(config.commands, _array(outputs.plan[0]).cumsum(1), np.array(config.future_times_s))
+
+
+def _array(values: Tensor) -> Array:
+    array: Array = values.double().cpu().numpy()
+    return array

@@ -40,6 +40,17 @@ LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 MOST_INVALID = 1000  # messages of a topic before the first valid one
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 _Value = TypeVar("_Value")
+# Parts of a topic's name that do not name a camera.
+GENERIC = re.compile(
+    r"(image|img)?_?(raw|rect|rectified|color|colour|rgb|bgr|mono|compressed|image|img|video|h264|h265|stream|_)*"
+)
+# Parts of names of images that no camera took, or not in the visible spectrum.
+NOT_A_CAMERA = re.compile(
+    r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
+)
+RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
+PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
+GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
 
 
 @contextmanager
@@ -183,19 +194,6 @@ def spread(count: int, wanted: int) -> Indices[int]:
     return indices
 
 
-# Parts of a topic's name that do not name a camera.
-GENERIC = re.compile(
-    r"(image|img)?_?(raw|rect|rectified|color|colour|rgb|bgr|mono|compressed|image|img|video|h264|h265|stream|_)*"
-)
-# Parts of names of images that no camera took, or not in the visible spectrum.
-NOT_A_CAMERA = re.compile(
-    r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
-)
-RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
-PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
-GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
-
-
 @dataclass(frozen=True)
 class StatedTopics:
     """Statements of the user about a bag, by the keys of the TOML above. "" and missing cameras: to be found.
@@ -220,7 +218,7 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
     if path is None:
         return StatedTopics(renamed=topics)
     stated = parse_toml(read_text(path, TOML_BYTES), path)
-    known = [one.name for one in fields(StatedTopics) if one.name != "renamed"]
+    known = [entry.name for entry in fields(StatedTopics) if entry.name != "renamed"]
     for key, value in stated.items():
         if key not in known:
             raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
@@ -271,15 +269,15 @@ class TopicFinder:
             CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
             for name, images in found.items()
         ]
-        without = [one for one in cameras if one.calibration is None and calibrated is None]
-        for one in without:
-            if one.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
+        without = [camera for camera in cameras if camera.calibration is None and calibrated is None]
+        for camera in without:
+            if camera.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
                 raise InputError(
-                    f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
+                    f"{bag.path}: camera {camera.camera}: no CameraInfo belongs to {camera.images}: pass "
                     f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
                 )
-        self.left_out = tuple(one.images for one in without)
-        self.cameras = tuple(one for one in cameras if one not in without)
+        self.left_out = tuple(camera.images for camera in without)
+        self.cameras = tuple(camera for camera in cameras if camera not in without)
         if not self.cameras:
             raise InputError(
                 f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
@@ -306,10 +304,10 @@ class TopicFinder:
     def table(self, pose: str) -> str:
         """A table of the topics that are used and those that are not. pose: where poses come from, "" for nowhere."""
         rows = []
-        for one in self.cameras:
-            rows.append((one.camera, one.images))
-            if one.calibration:
-                rows.append(("  calibration", one.calibration))
+        for camera in self.cameras:
+            rows.append((camera.camera, camera.images))
+            if camera.calibration:
+                rows.append(("  calibration", camera.calibration))
         rows += [("ego-motion", pose)] if pose else []
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
         used = {name for _, name in rows}

@@ -272,19 +272,19 @@ def _files_beside(
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
-    captured = capture_times(bag, [one.images for one in cameras])
-    times = {one.camera: captured[one.images][0] for one in cameras}
+    captured = capture_times(bag, [camera.images for camera in cameras])
+    times = {camera.camera: captured[camera.images][0] for camera in cameras}
     # The median time between images; a second for a single one.
     periods = {n: float(np.median(np.diff(own))) if len(own) > 1 else 1e9 for n, own in times.items()}
     slowest = max(periods.values())
     leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
     makers: dict[str, Callable[[int, int], Source]] = {
-        one.camera: BagVideo(bag, one.images, captured[one.images][1]).image
-        if one.is_video
-        else partial(bag_image, bag, one.images, captured[one.images][1])
-        for one in cameras
+        camera.camera: BagVideo(bag, camera.images, captured[camera.images][1]).image
+        if camera.is_video
+        else partial(bag_image, bag, camera.images, captured[camera.images][1])
+        for camera in cameras
     }
-    topics = {one.camera: one.images for one in cameras}
+    topics = {camera.camera: camera.images for camera in cameras}
     entries: list[FrameEntry] = []
     for place, time in enumerate(times[leading].tolist()):
         if entries and time <= entries[-1].stamp.timestamp_ns:
@@ -312,7 +312,7 @@ def _covered(
     kept = tuple(
         entry
         for entry in entries
-        if all(first <= one.timestamp_ns <= last for one in (entry.stamp, *entry.sources.values()))
+        if all(first <= timed.timestamp_ns <= last for timed in (entry.stamp, *entry.sources.values()))
     )
     if not kept:
         begin, end = entries[0].stamp.timestamp_ns, entries[-1].stamp.timestamp_ns

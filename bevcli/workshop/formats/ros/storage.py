@@ -173,7 +173,6 @@ class McapFile:
             offset = start + length
 
     def _note(self, opcode: int, content: bytes, chunk: int, offset: int) -> None:
-        """Keep a schema, a channel, or the place of a message."""
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -187,7 +186,6 @@ class McapFile:
 
 
 def _decompressed(content: bytes) -> bytes:
-    """The records of a chunk. Raises ValueError for a damaged one."""
     chunk = Chunk.read(ReadDataStream(BytesIO(content)))
     if chunk.uncompressed_size > LARGEST_CHUNK:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes (expected at most {LARGEST_CHUNK})")

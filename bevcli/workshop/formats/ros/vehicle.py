@@ -37,9 +37,9 @@ class TransformTree:
 
     def __init__(self, transforms: Iterable[Transform] = ()) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
-        for one in transforms:
-            if one.child != one.parent and one.parent_from_child is not None:
-                self._parents.setdefault(one.child, (one.parent, one.parent_from_child.matrix))
+        for transform in transforms:
+            if transform.child != transform.parent and transform.parent_from_child is not None:
+                self._parents.setdefault(transform.child, (transform.parent, transform.parent_from_child.matrix))
 
     @property
     def frames(self) -> list[str]:
@@ -84,12 +84,12 @@ def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform]
         found: list[Transform] = []
         for number in range(min(len(bag.times(topic)), MOST_MESSAGES)):
             if number and number % SAMPLED_MESSAGES == 0:
-                valid = {one.child for one in found if one.parent_from_child is not None}
-                if valid.issuperset(one.child for one in found):
+                valid = {transform.child for transform in found if transform.parent_from_child is not None}
+                if valid.issuperset(transform.child for transform in found):
                     break
             found += read_transforms(bag, topic, number)
         if is_static(topic):
-            notes += invalid_note(topic, [one.parent_from_child is not None for one in found])
+            notes += invalid_note(topic, [transform.parent_from_child is not None for transform in found])
         (static if is_static(topic) else changing).extend(found)
     return static, changing, notes
 
@@ -102,7 +102,7 @@ def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
 
 def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> tuple[EgoMotion, list[str]]:
     """Poses of a topic with Odometry or poses, and notes. child_from_ego: (4, 4), None: the poses are the vehicle's."""
-    return _motion_from(bag, [topic], [topic], lambda one: topic, child_from_ego)
+    return _motion_from(bag, [topic], [topic], lambda transform: topic, child_from_ego)
 
 
 def motion_from_transforms(
@@ -115,7 +115,7 @@ def motion_from_transforms(
     """
     links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
     by_child = dict(zip(frames[1:], links, strict=True))
-    return _motion_from(bag, topics, links, lambda one: by_child.get(one.child), child_from_ego)
+    return _motion_from(bag, topics, links, lambda transform: by_child.get(transform.child), child_from_ego)
 
 
 def _motion_from(
@@ -130,14 +130,17 @@ def _motion_from(
     are_valid: list[bool] = []
     for time, topic, number in _in_order(bag, {topic: range(len(bag.times(topic))) for topic in topics}):
         try:
-            stated = [(link, one) for one in read_transforms(bag, topic, number) if (link := link_of(one))]
+            transforms = read_transforms(bag, topic, number)
         except InputError:
             are_valid.append(False)
             continue
-        for link, one in stated:
-            are_valid.append(one.parent_from_child is not None)
-            if one.parent_from_child is not None:
-                samples[link][one.timestamp_ns or time] = one.parent_from_child
+        for transform in transforms:
+            link = link_of(transform)
+            if link is None:
+                continue
+            are_valid.append(transform.parent_from_child is not None)
+            if transform.parent_from_child is not None:
+                samples[link][transform.timestamp_ns or time] = transform.parent_from_child
     source = " and ".join(topics)
     parts = [_motion(sorted(own.items())) for own in samples.values() if own]
     first, last = max((part.first_ns for part in parts), default=0), min((part.last_ns for part in parts), default=0)
@@ -249,19 +252,18 @@ class VehicleReader:
     def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
         self._bag, self._finder, self._stated = bag, finder, stated
         static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
-        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
+        self._tree, self._moving = TransformTree([*static, *changing]), {transform.child for transform in changing}
         self.ego_frame = stated.ego_frame
 
     def rig(self) -> CameraRig:
         """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
         cameras = self._finder.cameras
-        frames = {one.camera: self._stated.frames.get(one.camera) or self._frame_of(one) for one in cameras}
+        frames = {camera.camera: self._stated.frames.get(camera.camera) or self._frame_of(camera) for camera in cameras}
         self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
-        found = tuple(self._camera(one, self._ego_from(frames[one.camera], one.camera)) for one in cameras)
+        found = tuple(self._camera(camera, self._ego_from(frames[camera.camera], camera.camera)) for camera in cameras)
         return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
 
     def _frame_of(self, topics: CameraTopics) -> str:
-        """The optical frame that the images name, or else the calibration."""
         named = (
             self._bag.first(topic, frame_of, "an image or a calibration")
             for topic in (topics.images, topics.calibration)
@@ -295,7 +297,6 @@ class VehicleReader:
         return common[0]
 
     def _child_of(self, topic: str) -> str:
-        """The frame whose poses a topic has, "" if it names none."""
         return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
 
     def _ego_from(self, frame: str, camera: str) -> Array:

@@ -1,17 +1,66 @@
-"""`bevcli quantize`: an exported model with backbone and neck in INT8."""
+"""`bevcli export-onnx` writes a model as an ONNX file; `bevcli quantize` writes that file in INT8."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part, argument
+from bevcli.cli.bridge import Part, argument, model_option
 from bevcli.inference.options import FILE_ENGINE, ModelOptions
 from bevcli.options import option, options
 from bevcli.printing import say
-from bevcli.workshop.engines.options import FileOptions
+from bevcli.workshop.engines.options import FileOptions, OnnxOptions
 
 PANEL = "Deploy"
+
+
+def export_onnx(
+    model: Annotated[
+        str | None,
+        model_option(
+            "tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that WEIGHTS "
+            "fit, else demo.",
+        ),
+    ] = None,
+    *,
+    model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],
+    file: FileOptions,
+    options: OnnxOptions,
+) -> None:
+    """Write one step of a model as an ONNX file of standard operators, without plugins.
+
+    The number of cameras is fixed, the batch is one; calibrations are inputs. What the model remembers is an input and
+    an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
+    docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
+    """
+    from bevcli.errors import BevcliError
+    from bevcli.inference.load import load_model
+    from bevcli.sequences.files.calibration_file import read_calibration
+    from bevcli.sequences.open import open_sequence
+    from bevcli.workshop.engines.differences import check_exported, difference_lines
+    from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
+
+    loaded = load_model(model, options=replace(model_options, device="cpu"))
+    loaded.require_parts("bevcli export-onnx")
+    if options.rig is not None:
+        if options.cameras is not None:
+            raise BevcliError("`rig` states the number of cameras: leave `cameras` out")
+        rig = read_calibration(options.rig)
+        loaded, options = loaded.for_rig(rig), replace(options, cameras=len(rig.cameras))
+    target = file.target(Path(f"{loaded.name}.onnx"))
+    drive = None if options.check is None else open_sequence(options.check, rate_hz=loaded.config.rate_hz)
+    write_onnx(
+        loaded.network,
+        target,
+        options,
+        contents=loaded.contents(),
+        untrained=loaded.untrained,
+        bundled=loaded.bundled,
+    )
+    say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    if drive is not None:
+        say("\n".join(difference_lines(list(check_exported(target, loaded, drive)))))
 
 
 @options()
@@ -52,11 +101,10 @@ def quantize(
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.inference.preprocess import calibration_images
     from bevcli.sequences.open import open_sequence
     from bevcli.workshop.engines.differences import check_exported, difference_lines
     from bevcli.workshop.engines.engine import load_exported
-    from bevcli.workshop.engines.export_onnx import quantize as write_quantized
+    from bevcli.workshop.engines.export_onnx import calibration_images, quantize as write_quantized
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")

@@ -1,20 +1,23 @@
-"""`bevcli train`: train a model on sequences with ground truth or on rendered drives."""
+"""`bevcli train` trains a model; `bevcli validate` runs one on several drives and scores them together."""
 
+import json
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part, model_option, print_note
+from bevcli.cli.bridge import Json, Part, model_option, print_note
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
+from bevcli.runs.options import RunOptions
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.options import ModelFileOptions, TrainOptions
+from bevcli.workshop.training.options import ModelFileOptions, TrainOptions, ValidationOptions
 
 if TYPE_CHECKING:
     from bevcli.workshop.training.trainer import Trainer
 
-PANEL = "Train"
+
+PANEL = {"train": "Train", "validate": "Score"}
 
 
 def train(
@@ -101,3 +104,46 @@ def _run(trainer: "Trainer") -> None:
         if trainer.done < job.config.steps:
             progress.message(f"stopped after step {trainer.done}: continue with --resume --out {job.out}")
             raise typer.Exit(signals.exit_code)
+
+
+def validate(
+    model: Annotated[
+        str | None,
+        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
+    ] = None,
+    *,
+    model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
+    run_options: Annotated[RunOptions, Part(only=("temporal",))],
+    drive_options: DriveOptions,
+    options: ValidationOptions,
+    as_json: Json = False,
+) -> None:
+    """Score a model on drives with ground truth, all drives together.
+
+    Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
+    `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
+    """
+    from bevcli.cli.progress import Progress
+    from bevcli.inference.load import load_model
+    from bevcli.workshop.synth.drives import count_frames, scored_drives
+    from bevcli.workshop.training.job import rig_for_drives
+    from bevcli.workshop.training.validation import check_scored_drives, validate as validate_model
+
+    loaded = load_model(model, options=model_options)
+    rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
+    drives = scored_drives(drive_options, loaded.config, rig)
+    notes = check_scored_drives(drive_options, drives, loaded.config)
+    if loaded.needs_export:
+        drive = drives.open(0)
+        loaded = loaded.in_engine(drive.rig, drive, report=print_note)
+        notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
+    runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
+    with Progress(count_frames(drives), "frames", notes) as progress:
+        scores = validate_model(
+            runner,
+            drives,
+            options.max_range,
+            after_frame=progress.advance,
+            each_drive=options.each,
+        )
+    say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")

@@ -1,0 +1,230 @@
+"""The short commands of the core: `bevcli samples`, `viz`, `project-debug`, `eval` and `export`."""
+
+import json
+import shutil
+import textwrap
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bevcli.cli.bridge import ExtensionsOf, FormatValues, Json, Part, Steps, argument, as_flags, print_note
+from bevcli.evaluation.options import EvaluationOptions, ExportOptions
+from bevcli.evaluation.scorers import score_options
+from bevcli.options import Option
+from bevcli.printing import counted, say
+from bevcli.rig.options import CheckOptions
+from bevcli.sequences.options import SequenceOptions
+from bevcli.viewer.options import ViewOptions
+from bevcli.writing import check_output, output_errors, write_whole
+
+if TYPE_CHECKING:
+    from bevcli.evaluation.box_format import BoxFormat
+    from bevcli.sequences.files.boxes_file import BoxesFile
+
+
+PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look", "eval": "Score", "export": "Score"}
+ERRORS_FOUND = 3  # exit code of `bevcli project-debug`
+
+
+def samples(
+    out: Annotated[Path, Option("The folder that gets the sample.", metavar="DIR")] = Path("samples"),
+) -> None:
+    """Copy the sample drive, a rendered street, to DIR/street, and the notebook first_steps.ipynb.
+
+    The drive is a complete sequence folder. What exists in DIR is left as it is.
+    """
+    package = Path(__file__).parents[1]
+    installed = package / "samples"
+    # An editable installation has the samples beside the package.
+    source = installed if installed.is_dir() else package.parent / "samples"
+    for name, advice in (
+        ("street", f"run `bevcli run {out / 'street'}`"),
+        ("first_steps.ipynb", "needs pip install 'bevcli[notebook]'"),
+    ):
+        target = out / name
+        if target.exists():
+            say(f"{target}: exists already")
+            continue
+        with output_errors(target):
+            if (source / name).is_dir():
+                shutil.copytree(source / name, target)
+            else:
+                write_whole(target, (source / name).read_bytes())
+        say(f"{target}: copied; {advice}")
+
+
+def viz(
+    recording: Annotated[Path, argument("A recording (.rrd), or the output folder of `bevcli run`.")],
+    options: ViewOptions,
+) -> None:
+    """Show a recording in the viewer, or write an image, a video or a summary.
+
+    The viewer opens if none of --summary, --screenshot and --video is given: in a window if there is a
+    display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
+    """
+    from bevcli.viewer.recording_file import open_recording, recording_in
+
+    if options.frame is not None and options.screenshot is None:
+        raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
+    recording = recording_in(recording)
+    with open_recording(recording) as file:
+        if file != recording:
+            say(f"note: {recording} is incomplete (its run was stopped or is still going)")
+        if options.summary or options.screenshot or options.video:
+            _write_views(recording, file, options)
+        else:
+            _open_viewer(file, options)
+
+
+def _write_views(recording: Path, read_from: Path, options: ViewOptions) -> None:
+    """Write what the options name. read_from: the recording, or a repaired copy of it."""
+    from bevcli.cli.progress import Progress
+    from bevcli.viewer.native import take_screenshot
+    from bevcli.viewer.recording_reader import summarise
+    from bevcli.viewer.video import frame_rate, write_video
+
+    if options.summary:
+        say(summarise(recording, read_from))
+    if options.screenshot is not None:
+        views = take_screenshot(read_from, options.screenshot, options.frame)
+        say(f"{options.screenshot}: {len(views)} views")
+    if options.video is not None:
+        count, rate = frame_rate(read_from)
+        with Progress(count, "frames") as progress:
+            write_video(read_from, options.video, count, rate, progress.advance)
+        say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
+
+
+def _open_viewer(recording: Path, options: ViewOptions) -> None:
+    from bevcli.viewer.native import display_is_there, show_window
+    from bevcli.viewer.web import WebViewer, web_viewer_assets
+
+    if display_is_there() and not options.web:
+        if show_window(recording):
+            return
+        say("note: the viewer's window did not open; use the browser instead")
+    viewer = WebViewer(web_viewer_assets(), recording, options.host, options.port)
+    say(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
+    viewer.serve()
+
+
+def project_debug(
+    calibration: Annotated[Path, argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
+    source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
+    format_options: Annotated[FormatValues, Part(only=("topics", "topics_file"))],
+    options: CheckOptions,
+    further: Annotated[Steps, ExtensionsOf("project-debug")],
+    as_json: Json = False,
+) -> None:
+    """Find mistakes in a calibration.
+
+    Checks the camera poses and lenses, the bev frame and, with a sequence, its ego-motion, its timestamps, and whether
+    the images fit how the vehicle moves (the short form of `bevcli calibrate`). Writes
+    cameras.png (pillars, ground grid and horizon in each image), coverage.png (how many cameras see each BEV cell),
+    recording.rrd (for bevcli viz) and findings.json. Existing files are overwritten.
+
+    Exit code: 0 without errors, 3 with findings of severity error.
+    """
+    from bevcli.config import load_config
+    from bevcli.inference.training_rigs import training_rig_notes
+    from bevcli.rig.check_calibration import check_calibration
+    from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
+    from bevcli.sequences.open import open_sequence
+
+    given = {name: value for name, value in format_options.items() if value}
+    check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
+    if not check.errors:
+        if options.sequence is not None:
+            given["calibration"] = calibration
+        how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
+        open_drive = partial(open_sequence, options.sequence or calibration, **how)
+        findings = [finding for step in further for finding in step(open_drive)]
+        check = replace(check, report=with_findings(check.report, findings))
+    written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")
+    if as_json:
+        say(check.to_json())
+    else:
+        notes = [
+            textwrap.fill(f"Model {options.model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
+            for note in training_rig_notes(check.rig, load_config(options.model))
+        ]
+        say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
+    if check.errors:
+        raise typer.Exit(ERRORS_FOUND)
+
+
+def evaluate(
+    predictions: Annotated[Path, argument("predictions.json, the folder of a run, or a results_nusc.json.")],
+    ground_truth: Annotated[
+        Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
+    ],
+    source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
+    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
+    options: EvaluationOptions,
+    results: Annotated[FormatValues, Part(classes=score_options)],
+    as_json: Json = False,
+) -> None:
+    """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
+
+    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
+    runs a model on several drives and scores them together.
+    """
+    from bevcli.evaluation.evaluate import evaluate
+
+    scores = evaluate(
+        predictions,
+        ground_truth,
+        options.max_range,
+        options.count_missing,
+        scene=source.scene,
+        class_map=source.class_map,
+        **format_options,
+        **results,
+    )
+    say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
+    for note in scores.notes:
+        print_note(note)
+    if options.plot is not None:
+        for path in scores.write_plots(options.plot):
+            say(f"wrote {path}", err=True)
+
+
+def export(
+    predictions: Annotated[
+        Path,
+        argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
+    ],
+    options: ExportOptions,
+) -> None:
+    """Write boxes as a table, a boxes file, KITTI labels, or a nuScenes submission.
+
+    KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
+    those above the score of the run.
+    """
+    from bevcli.registry import load_form
+    from bevcli.sequences.files.boxes_file import above_score
+
+    chosen: BoxFormat = load_form("bevcli.box_formats", options.form)
+    file = predictions / "predictions.json" if predictions.is_dir() else predictions
+    target = options.out or file.parent / chosen.target
+    check_output(target, file)
+    boxes = above_score(_read_boxes(file), options.score)
+    say(f"{target}: {chosen.write(boxes, target, options, file)}")
+
+
+def _read_boxes(file: Path) -> "BoxesFile":
+    """The boxes of a boxes file or of a recording."""
+    from bevcli.sequences.files.boxes_file import read_boxes
+
+    if file.suffix.lower() != ".rrd":
+        return read_boxes(file)
+    from bevcli.viewer.recording_file import open_recording
+    from bevcli.viewer.recording_reader import read_recording
+
+    with open_recording(file) as whole:
+        if whole != file:
+            say(f"note: {file} is incomplete (its run was stopped or is still going)", err=True)
+        return read_recording(whole)

@@ -1,0 +1,46 @@
+"""`bevcli render` renders a drive; `bevcli demo` renders a short one, runs it and opens the viewer."""
+
+from pathlib import Path
+from typing import Annotated
+
+from bevcli.cli.bridge import argument
+from bevcli.inference.options import ModelOptions
+from bevcli.printing import counted, say
+from bevcli.recording.options import RecordingOptions
+from bevcli.runs.options import OutputOptions, RunOptions
+from bevcli.sequences.options import SequenceOptions
+from bevcli.viewer.options import ViewOptions
+from bevcli.workshop.synth.options import DemoOptions, RenderOptions
+
+PANEL = "Start"
+DEMO_RESOLUTION = (800, 450)
+
+
+def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
+    """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
+    from bevcli.cli.progress import Progress
+    from bevcli.jit import is_compiled
+    from bevcli.workshop.synth.drive import render as render_sequence
+    from bevcli.workshop.synth.shading_kernels import shade_pixels
+
+    if not is_compiled(shade_pixels):
+        say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
+    with Progress(options.frames, "frames") as progress:
+        summary = render_sequence(out, options, progress=lambda frame: progress.advance())
+    size = f"{counted(summary.frames, 'frames')}, {counted(len(summary.cameras), 'cameras')}"
+    say(f"{summary.folder}: {size}, {summary.weather}, seed {summary.seed}")
+
+
+def demo(options: DemoOptions) -> None:
+    """Render a short drive, run BEVFormer on it and open the recording.
+
+    The demo model was trained on rendered drives only.
+    """
+    from bevcli.cli.commands import viz
+    from bevcli.cli.run import run
+
+    drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
+    render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
+    if options.view:
+        viz(options.out / "results/recording.rrd", ViewOptions())
