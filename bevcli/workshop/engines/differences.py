@@ -132,23 +132,3 @@ def _probabilities(segmentation: SegmentationOutputs) -> Tensor:
 
 def _largest(ours: Tensor, theirs: Tensor) -> float:
     return (ours - theirs).abs().max().item()
-
-
-def paired_steps(
-    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
-) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
-    """Step two versions of a model on the CPU over the same frames, each with its own history.
-
-    Yields each frame that has an image, and the outputs of both.
-    """
-    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
-    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
-    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
-    with contextlib.ExitStack() as hooks:
-        for runner in runners:
-            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
-            hooks.enter_context(hook)
-        for prepared in frames:
-            if prepared.frame.images:
-                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
-                yield prepared, outputs[runners[0]], outputs[runners[1]]
