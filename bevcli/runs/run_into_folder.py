@@ -9,7 +9,7 @@ from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
-from bevcli.inference.runner import RunnerState, read_commands
+from bevcli.inference.runner import Commands, Runner, RunnerState, read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.sequence_checks import CheckedDrive
@@ -67,16 +67,9 @@ def run_into_folder(
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
         facts = run_facts(model, sequence, options) | {"commands": str(commands)}
-        memory = model_class(model.config).memory_type
-        state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
-        if resume and state is None and folder.has_files():
-            raise OutputError(f"{out}: `resume`: its run saved no state; {START_ANEW}")
-        if state is not None and state.files is not None:
+        state = _state_to_start_from(folder, facts, model, resume)
+        if state.files is not None:
             resumed(state.frames)
-        else:
-            folder.remove_written()
-            state = RunState(facts, None, Counts())
-            save_state(folder.state_path, state)
         checked = sequence if isinstance(sequence, CheckedDrive) else CheckedDrive(sequence)
         summary = RunSummary(model, checked, options, state.counts)
         folder.add(out / SUMMARY)
@@ -92,13 +85,7 @@ def run_into_folder(
 
         try:
             with files, writer, WriteBehind(write) as background:
-                runner = model.runner(
-                    track=options.track,
-                    temporal=options.temporal,
-                    ask_attention=options.recording.shows_internals,
-                    probes=tuple(options.recording.probes),
-                    commands=commands,
-                )
+                runner = _runner(model, options, commands)
                 after, indices = state.runner, range(done, len(sequence.stamps))
                 for prepared, upcoming in runner.frames(sequence, indices, runner.preprocessor(options.cameras)):
                     after, prediction = runner.step(after, prepared, upcoming)
@@ -111,9 +98,31 @@ def run_into_folder(
                 summary.write(out, files.written())
             if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < done == summary.frames:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
-                raise OutputError(
-                    f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
-                ) from error
+                message = f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
+                raise OutputError(message) from error
             raise
         summary.write(out, files.written())
     return summary
+
+
+def _state_to_start_from(folder: RunFolder, facts: dict[str, str], model: Model, resume: bool) -> RunState[Any]:
+    """The saved state of an interrupted run, or a new one without files; then those of earlier runs are removed."""
+    memory = model_class(model.config).memory_type
+    state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
+    if resume and state is None and folder.has_files():
+        raise OutputError(f"{folder.path}: `resume`: its run saved no state; {START_ANEW}")
+    if state is None or state.files is None:
+        folder.remove_written()
+        state = RunState(facts, None, Counts())
+        save_state(folder.state_path, state)
+    return state
+
+
+def _runner(model: Model, options: RunOptions, commands: Commands) -> Runner:
+    return model.runner(
+        track=options.track,
+        temporal=options.temporal,
+        ask_attention=options.recording.shows_internals,
+        probes=tuple(options.recording.probes),
+        commands=commands,
+    )
