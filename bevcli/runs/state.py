@@ -31,7 +31,7 @@ from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts, RunSummary
 from bevcli.writing import write_whole
 
-FORMAT = "bevcli-state/7"
+FORMAT = "bevcli-state/8"
 LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may state an array of gigabytes
 SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
