@@ -21,10 +21,16 @@ def own(group: Group) -> dict[str, str]:
 
 
 @cache
+def installed() -> Any:
+    """The entry points of all installed packages, read once; Python 3.11 has another type for them than 3.12."""
+    return entry_points()
+
+
+@cache
 def entries(group: Group) -> dict[str, EntryPoint]:
     """The entries of a group by name, in the order of their names. Raises BevcliError where two have the same name."""
     found = {name: EntryPoint(name, value, group) for name, value in own(group).items()}
-    for entry in entry_points(group=group):
+    for entry in installed().select(group=group):
         if entry.value.startswith("bevcli."):  # of an earlier version, which an editable install may still list
             continue
         other = found.setdefault(entry.name, entry)

@@ -20,7 +20,7 @@ from command_line import MINI_TOML
 from forks import FORKS, run_in_fork
 from source_code import ROOT as PACKAGE, trees
 
-from bevcli.registry import entries, own
+from bevcli.registry import entries, installed, own
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/extend.md").read_text()
@@ -74,6 +74,7 @@ def bevcli(folder: Path, *arguments: str) -> str:
 
 def install(folder: Path) -> None:
     sys.path.insert(0, str(folder))
+    installed.cache_clear()
     entries.cache_clear()
 
 

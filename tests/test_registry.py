@@ -1,7 +1,7 @@
 """The registry: bevcli's own entries need no installation, and a fault of another package's is one clear line."""
 
 import tomllib
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import get_args
 
@@ -20,7 +20,7 @@ def installed(monkeypatch):
 
     def install(*entries):
         found = [EntryPoint(name, value, GROUP) for name, value in entries]
-        monkeypatch.setattr(registry, "entry_points", lambda group: found)
+        monkeypatch.setattr(registry, "installed", lambda: EntryPoints(found))
         registry.entries.cache_clear()
         registry.load.cache_clear()
 

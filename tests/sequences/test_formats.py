@@ -73,11 +73,13 @@ def plug_in(tmp_path, monkeypatch):
     (facts / "entry_points.txt").write_text("[bevcli.sequences]\nstrips = strips:FORMAT\n")
     (site / "strips.py").write_text(PLUG_IN)
     monkeypatch.syspath_prepend(str(site))
+    registry.installed.cache_clear()
     registry.entries.cache_clear()
     yield
     sys.modules.pop("strips", None)
     monkeypatch.undo()
     importlib.invalidate_caches()
+    registry.installed.cache_clear()
     registry.entries.cache_clear()
     registry.load.cache_clear()
 
