@@ -24,6 +24,7 @@ ALLOWED = {
     ): "the tasks read files; packages of object stores have time limits of their own",
     ("cli/bridge.py", "_flags.get"): "a context variable, not a queue",
     ("cli/stop_signals.py", "numbers.recv"): "in a daemon thread, until a signal comes or the command ends",
+    ("registry.py", "installed().select"): "chooses among entry points",
     ("viewer/native.py", "process.wait"): "until the user closes the viewer's window",
     ("viewer/web.py", "self.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/writer.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
