@@ -48,6 +48,9 @@ def resumed_after_damage(seeds: Path, case: Path, random: Random) -> None:
     _run(_models()["same"], case, resume=True)
     written = _contents(case)
     assert not [name for name, text in whole.items() if written.get(name) != text], f"{done}: the run succeeded"
+    held = [case / "out" / name for name in ("recording.rrd", "predictions.json", "predictions.json.partial")]
+    if not any(path.is_relative_to(each) for path in held for each in damaged):
+        assert _frames(case) == list(range(FRAMES)), f"{done}: the recording lacks frames"
 
 
 def exchanged_input(seeds: Path, case: Path, random: Random) -> None:
