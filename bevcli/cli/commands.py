@@ -15,7 +15,7 @@ from bevcli.evaluation.options import EvaluationOptions, ExportOptions
 from bevcli.evaluation.scorers import score_options
 from bevcli.options import Option
 from bevcli.printing import counted, say
-from bevcli.rig.options import CheckOptions
+from bevcli.rig import CheckOptions
 from bevcli.sequences.options import SequenceOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.writing import check_output, output_errors, write_whole

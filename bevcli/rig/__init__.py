@@ -1,10 +1,32 @@
-"""Diagnosis of a calibration: what is wrong with a camera rig, and drawings that show it.
+"""Diagnosis of a calibration: what is wrong with a camera rig, and drawings that show it. `CheckOptions`.
 
 check_calibration    reads a calibration or a sequence, runs all checks; the result is written, printed, or used
 rig_report           coverage of the BEV grid, the rig next to nuScenes', and the terminal's text
-rig_checks           all checks of a rig in their order; lenses and the bev frame
-pose_checks          mounting of cameras; units, inverted transforms, quaternion order, axes, camera names
-sequence_checks      ego-motion and camera timestamps; the cheap checks before a run
-drawings             cameras.png and coverage.png
-rig_recording        recording.rrd, for the rerun viewer
+sequence_checks      all checks of a sequence: the rig in their order, ego-motion, times of images; those before a run
+rig_checks           mounting, names and lenses of cameras; the bev frame
+mistakes             units, inverted transforms, quaternion order, axes: explanations of implausible poses
+drawings             cameras.png, coverage.png and recording.rrd
 """
+
+from pathlib import Path
+
+from bevcli.inference.options import complete_model
+from bevcli.options import option, options
+
+
+@options()
+class CheckOptions:
+    """The sequence that belongs to a calibration, the model that its rig is compared with, and the output."""
+
+    sequence: Path | None = option(
+        reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
+    )
+    frame: int = option(default=0, help="Index of the frame whose images are drawn on.", minimum=0)
+    out: Path | None = option(default=None, help="The output folder. Default: runs/NAME-project-debug.")
+    model: str = option(
+        reads="path or name",
+        default="demo",
+        help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml.",
+        metavar="NAME|FILE",
+        complete=complete_model,
+    )

@@ -70,16 +70,15 @@ class CalibrationCheck:
         OutputError where a file cannot be written.
         """
         # Only writing draws: matplotlib and rerun take a second to load.
-        from bevcli.rig.drawings import write_camera_sheet, write_coverage_map
-        from bevcli.rig.rig_recording import write_rig_recording
+        from bevcli.rig import drawings
 
         folder = Path(folder)
         write_whole(folder / "findings.json", f"{self.to_json()}\n".encode(), parents=True)
         if not self.rig.cameras:
             return [folder / "findings.json"]
-        write_camera_sheet(folder / "cameras.png", self.rig, self.report, self.images)
-        write_coverage_map(folder / "coverage.png", self.rig, self.report.coverage)
-        write_rig_recording(folder / "recording.rrd", self.rig, self.report, self.images)
+        drawings.write_camera_sheet(folder / "cameras.png", self.rig, self.report, self.images)
+        drawings.write_coverage_map(folder / "coverage.png", self.rig, self.report.coverage)
+        drawings.write_rig_recording(folder / "recording.rrd", self.rig, self.report, self.images)
         return [folder / name for name in ("cameras.png", "coverage.png", "recording.rrd", "findings.json")]
 
 

@@ -1,70 +1,234 @@
-"""All checks of a rig: their order, which finding suppresses which, and the checks of lenses and of the bev frame.
+"""The checks of a rig, one by one: mounting and names of the cameras, their lenses, and the bev frame.
 
-Published weights expect nuScenes' LIDAR_TOP as bev frame: x right, y forward, 1.84 m above the ground.
+A name such as CAM_BACK_LEFT states a viewing direction. Published weights expect nuScenes' LIDAR_TOP as bev frame: x
+right, y forward, 1.84 m above the ground. `sequence_checks` runs the checks; `mistakes` explains implausible poses.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
-from bevcli.findings import Finding, errors_of, rig_error
-from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.transforms import Array, inverse, rigid
-from bevcli.rig.pose_checks import check_names, check_poses, corrected, reordered, seen_fov_deg, units_per_metre
+from bevcli.findings import Finding, rig_error
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array
 
-BEV_ASSUMED = Finding(
-    "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
-    advice="the default is used: a level frame at (0.94, 0, 1.84) m, x right, y forward",
-)  # fmt: skip
-MERGED_FROM = 3  # cameras with the same mistake: from this many on it is one finding on the whole rig
+_STEP_DEG = 0.1
+_ANGLES = np.radians(np.arange(-90 + _STEP_DEG / 2, 90, _STEP_DEG))
 
 
-def rig_errors(rig: CameraRig) -> tuple[Finding, ...]:
-    """The errors that `check_rig` finds, without the time that the coverage takes."""
-    return errors_of(rig_findings(rig))
+@dataclass(frozen=True)
+class Mounting:
+    """Position and angles of a camera in the ego frame."""
+
+    x: float  # metres
+    y: float  # metres
+    height: float  # above the ground plane, metres
+    yaw_deg: float  # viewing direction, counter-clockwise from straight ahead
+    pitch_deg: float  # positive upwards
+    roll_deg: float  # positive when the camera leans to its right; 180 is upside down
 
 
-def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[Finding]:
-    """All findings but those about coverage and the comparison with nuScenes. found_before: from reading the file.
+def mounting_of(ego_from_camera: Array) -> Mounting:
+    """The mounting of a camera with this pose (4, 4)."""
+    right, down, forward = ego_from_camera[:3, 0], ego_from_camera[:3, 1], ego_from_camera[:3, 2]
+    x, y, height = ego_from_camera[:3, 3].tolist()
+    return Mounting(
+        x=x,
+        y=y,
+        height=height,
+        yaw_deg=float(np.degrees(np.arctan2(forward[1], forward[0]))),
+        pitch_deg=float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1)))),
+        roll_deg=float(np.degrees(np.arctan2(-right[2], -down[2]))),
+    )
 
-    Consequences of a reported error are suppressed: a camera with an error from reading is not checked again, and names
-    are compared only for cameras with plausible poses.
+
+def degrees_text(angle_deg: float, digits: int = 1) -> str:
+    """An angle as text, such as "0.4°"; zero has no sign."""
+    return f"{round(angle_deg, digits) + 0.0:.{digits}f}°"
+
+
+def seen_fov_deg(camera: Camera) -> tuple[float, float]:
+    """Horizontal and vertical field of view through the optical axis, in degrees, lens distortion included.
+
+    At most 180, because points behind the camera's plane are not projected.
     """
-    cameras = _without_errors(rig.cameras, found_before)
-    poses, lenses = check_poses(cameras), check_lenses(cameras)
-    names = check_names(_without_errors(cameras, poses)) + (_swapped_behind_mistake(cameras) if poses else ())
-    rig_has_error = any(finding.camera is None for finding in errors_of(found_before))
-    bev = () if rig_has_error else check_bev_frame(rig.ego_from_bev)
-    assumed = [BEV_ASSUMED] if rig.ego_from_bev_assumed else []
-    return [*found_before, *_merged(poses, cameras), *_merged(lenses, cameras), *names, *bev, *assumed]
+    (left, right), (up, down) = seen_range_deg(camera, 0), seen_range_deg(camera, 1)
+    return right - left, down - up
 
 
-def _swapped_behind_mistake(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
-    """Swapped names of cameras whose poses share another mistake, such as all inverted: seen once that is undone."""
-    swapped = [finding for finding in check_names(corrected(cameras)) if finding.code == "swapped-names"]
-    return tuple(replace(finding, advice=f"{finding.advice}, after correcting the poses") for finding in swapped)
+def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
+    """Smallest and largest angle to the optical axis that is inside the image, degrees.
+
+    axis: 0 counts angles to the right, 1 downwards. (0, 0) where no ray is inside the image.
+    """
+    rays = np.zeros((len(_ANGLES), 3))
+    rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
+    pixels, _ = camera.project(rays)
+    size = (camera.width, camera.height)[axis]
+    with np.errstate(invalid="ignore"):
+        inside = (pixels[:, axis] > 0) & (pixels[:, axis] < size)
+    seen = np.degrees(_ANGLES[inside])
+    if len(seen) == 0:
+        return 0.0, 0.0
+    return float(seen[0]) - _STEP_DEG / 2, float(seen[-1]) + _STEP_DEG / 2
 
 
-def _without_errors(cameras: Sequence[Camera], findings: Iterable[Finding]) -> tuple[Camera, ...]:
-    wrong = {finding.camera for finding in errors_of(findings)}
-    return tuple(camera for camera in cameras if camera.name not in wrong)
+WORDS = {"front": "front", "forward": "front", "fwd": "front", "back": "back", "rear": "back", "backward": "back"}
+# Centre of each sector, degrees counter-clockwise from straight ahead.
+SECTORS = {
+    ("front", ""): 0.0, ("front", "left"): 50.0, ("", "left"): 90.0, ("back", "left"): 130.0, ("back", ""): 180.0,
+    ("back", "right"): -130.0, ("", "right"): -90.0, ("front", "right"): -50.0,
+}  # fmt: skip
+CONTRADICTION_DEG = 95.0  # a larger angle between name and pose is a contradiction
+SWAP_GAIN_DEG = 60.0  # names are swapped if a permutation reduces the summed angle by at least this
+EGO_TURN_DEG = (60.0, 35.0)  # all cameras turned by at least the first; their turns differ by at most the second
+SAME_PLACE_M, SAME_DIRECTION_DEG = 0.02, 1.0
+SAME_FOV = 0.2  # relative; one place may hold a wide and a tele camera, which differ by more
+MAX_CAMERA_DISTANCE_M = 15.0  # from the ego origin; the rear end of a bus or a lorry
+CAMERA_HEIGHTS_M = (0.15, 5.0)  # from a bumper to the roof of a lorry
+MAX_PITCH_DEG = 30.0  # beyond it, and without the horizon in the image, a camera looks at the ground or the sky
+MAX_ROLL_DEG = 30.0
 
 
-def _merged(findings: Sequence[Finding], cameras: Sequence[Camera]) -> list[Finding]:
-    """Findings with the same code and message on three or more cameras, or on all of several, become one on the rig."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for finding in findings:
-        groups.setdefault((finding.code, finding.message), []).append(finding)
-    merged: list[Finding] = []
-    for group in groups.values():
-        if len(group) >= MERGED_FROM or len(group) == len(cameras) > 1:
-            names = ", ".join(str(finding.camera) for finding in group)
-            found = f"{group[0].camera}: {group[0].found}"
-            merged.append(replace(group[0], camera=None, message=f"{group[0].message} ({names})", found=found))
-        else:
-            merged += group
-    return merged
+def direction_of_name(name: str) -> float | None:
+    """Viewing direction that a name such as "CAM_BACK_LEFT" or "rearRight" states.
+
+    Degrees counter-clockwise from straight ahead; None if the name states none, or a contradiction.
+    """
+    words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
+    ends = {end for part, end in WORDS.items() for word in words if word.startswith(part) or word.endswith(part)}
+    sides = {side for side in ("left", "right") for word in words if word.startswith(side) or word.endswith(side)}
+    if len(ends) > 1 or len(sides) > 1:
+        return None
+    return SECTORS.get(("".join(ends), "".join(sides)))
+
+
+def turn_deg(a: float, b: float) -> float:
+    """The angle between two directions in degrees, 0 to 180."""
+    return abs((a - b + 180.0) % 360.0 - 180.0)
+
+
+def side_of(yaw_deg: float) -> str:
+    """The side of the vehicle that a direction points to, such as "back left"."""
+    words = min(SECTORS, key=lambda sector: turn_deg(SECTORS[sector], yaw_deg))
+    return " ".join(filter(None, words)) if words != ("front", "") else "ahead"
+
+
+def check_names(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
+    """Find copied poses, swapped names, and an ego frame whose x axis is not forward; at most one error per camera."""
+    copies = _copied_poses(cameras)
+    copied = {name for names, _ in copies for name in names}
+    findings = tuple(finding for _, finding in copies)
+    yaws = {camera.name: mounting_of(camera.ego_from_camera).yaw_deg for camera in cameras}
+    stated = {name: direction_of_name(name) for name in yaws if name not in copied}
+    named = {name: direction for name, direction in stated.items() if direction is not None}
+    if sum(turn_deg(direction, yaws[name]) for name, direction in named.items()) < SWAP_GAIN_DEG:
+        return findings
+    turned = _turned_ego_frame(named, yaws)
+    return findings + ((turned,) if turned else _swapped_names(named, yaws))
+
+
+def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Finding]]:
+    copies = []
+    for a, b in combinations(cameras, 2):
+        distance = float(np.linalg.norm(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]))
+        cosine = np.clip((np.trace(a.ego_from_camera[:3, :3].T @ b.ego_from_camera[:3, :3]) - 1) / 2, -1, 1)
+        turn = float(np.degrees(np.arccos(cosine)))
+        fov_a, fov_b = seen_fov_deg(a)[0], seen_fov_deg(b)[0]
+        same_fov = abs(fov_a - fov_b) <= SAME_FOV * max(fov_a, fov_b)
+        if distance < SAME_PLACE_M and turn < SAME_DIRECTION_DEG and same_fov:
+            finding = Finding(
+                "same-pose", "error", b.name, f"has the same pose as {a.name}",
+                f"{distance:.3f} m and {turn:.2f}° apart", "different positions or viewing directions",
+                "one pose is a copy of the other: give each camera its own",
+            )  # fmt: skip
+            copies.append(((a.name, b.name), finding))
+    return copies
+
+
+def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> Finding | None:
+    """All cameras turned by about the same angle from their names: x of the ego frame is not forward."""
+    if len(named) < 3:
+        return None
+    turns = np.exp(1j * np.radians([yaws[name] - named[name] for name in named]))
+    turn = float(np.degrees(np.angle(turns.mean())))
+    spread = max(turn_deg(float(np.degrees(np.angle(turned))), turn) for turned in turns)
+    if abs(turn) < EGO_TURN_DEG[0] or spread > EGO_TURN_DEG[1]:
+        return None
+    return rig_error(
+        "ego-axes", "all cameras are turned by the same angle from the directions in their names",
+        f"turned by {turn:.0f}°", "0° ± 35°", "the ego frame is x forward, y left, z up: rotate the poses into it",
+    )  # fmt: skip
+
+
+def _swapped_names(named: Mapping[str, float], yaws: Mapping[str, float]) -> tuple[Finding, ...]:
+    """One finding if exchanging names makes them fit the poses; else one for each name that contradicts its pose."""
+    from scipy.optimize import linear_sum_assignment  # its import takes 0.3 s, which most runs save
+
+    names = list(named)
+    cost = np.array([[turn_deg(named[name], yaws[owner]) for owner in names] for name in names])
+    rows, owners = linear_sum_assignment(cost)
+    gain = float(np.trace(cost) - cost[rows, owners].sum())
+    moved = [names[row] for row, owner in zip(rows, owners, strict=True) if row != owner]
+    if moved and gain >= SWAP_GAIN_DEG:
+        return (_swap_finding(moved, named, yaws),)
+    contradicted = [name for name in names if turn_deg(named[name], yaws[name]) > CONTRADICTION_DEG]
+    return tuple(
+        Finding(
+            "name-against-pose", "error", name, "the name and the pose state different directions",
+            f"looks {_direction_text(yaws[name])}", _direction_text(named[name]),
+            "check which camera this calibration belongs to",
+        )
+        for name in contradicted
+    )  # fmt: skip
+
+
+def _swap_finding(moved: Sequence[str], named: Mapping[str, float], yaws: Mapping[str, float]) -> Finding:
+    names = f"{', '.join(moved[:-1])} and {moved[-1]}"
+    return Finding(
+        "swapped-names", "error", moved[0], f"the names or poses of {names} are swapped",
+        "; ".join(f"{name} looks {_direction_text(yaws[name])}" for name in moved),
+        "; ".join(_direction_text(named[name]) for name in moved),
+        "exchange the poses, or the names",
+    )  # fmt: skip
+
+
+def _direction_text(yaw_deg: float) -> str:
+    return f"{side_of(yaw_deg)} ({yaw_deg:.0f}°)"
+
+
+def pose_defects(camera: Camera) -> list[Finding]:
+    """The implausible properties of a pose, as errors; the first is the most telling."""
+    mounting, name = mounting_of(camera.ego_from_camera), camera.name
+    (low, high), away_m = CAMERA_HEIGHTS_M, np.hypot(mounting.x, mounting.y)
+    defects = []
+    if away_m > MAX_CAMERA_DISTANCE_M:
+        found = f"{away_m:.1f} m from the ego origin"
+        defects.append(
+            _defect("camera-far", name, "is not on the vehicle", found, f"at most {MAX_CAMERA_DISTANCE_M:g} m")
+        )
+    if not low <= mounting.height <= high:
+        found, expected = f"{mounting.height:.2f} m", f"{low:g} to {high:g} m above the ground"
+        advice = "the ego origin is on the ground, under the rear axle"
+        defects.append(_defect("camera-height", name, "has an implausible height", found, expected, advice))
+    if abs(mounting.pitch_deg) > max(MAX_PITCH_DEG, seen_fov_deg(camera)[1] / 2):
+        where = "ground" if mounting.pitch_deg < 0 else "sky"
+        found, expected = f"pitch {mounting.pitch_deg:.0f}°", "the horizon in the image"
+        defects.append(_defect(f"looks-at-{where}", name, f"looks at the {where}", found, expected))
+    elif abs(mounting.roll_deg) > MAX_ROLL_DEG:
+        message = "is upside down" if abs(mounting.roll_deg) > 150 else "is rolled about its viewing direction"
+        found, advice = f"roll {mounting.roll_deg:.0f}°", "check the camera's pose; a quaternion has w first"
+        defects.append(_defect("camera-rolled", name, message, found, f"within {MAX_ROLL_DEG:g}°", advice))
+    return defects
+
+
+def _defect(
+    code: str, name: str, message: str, found: str, expected: str, advice: str = "check the camera's pose"
+) -> Finding:
+    return Finding(code, "error", name, message, found, expected, advice)
 
 
 CENTER_TOLERANCE = 0.15  # offset of the principal point from the image centre, relative to it; real cameras: 0.08
@@ -76,20 +240,19 @@ LARGEST_SKEW = 0.05  # relative to fx; real cameras: below 0.001
 FARTHEST_CENTER = 0.25  # from the image, relative to its size: farther out not even cropped images have it
 VALID_SHARE = 0.7  # a lens model must be valid up to this share of the distance to the image border
 MAX_BEND = 2.0  # largest factor by which it may change the angle of a ray
-_ANGLES = np.radians(np.arange(0.25, 89.5, 0.25))
+_LENS_ANGLES = np.radians(np.arange(0.25, 89.5, 0.25))
 
 
-def check_lenses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
+def check_lenses(cameras: Sequence[Camera]) -> list[Finding]:
     """At most one error a camera: of the lens model, image size, field of view or matrix; or else warnings."""
     findings: list[Finding] = []
     for camera in cameras:
-        possible = (_distortion(camera), _resolution(camera), _field_of_view(camera), _center_or_skew(camera))
-        error = next((finding for finding in possible if finding is not None), None)
-        findings.extend([error] if error is not None else _lens_warnings(camera))
-    return tuple(findings)
+        error = _distortion_error(camera) or _size_error(camera) or _matrix_error(camera)
+        findings += [error] if error else _lens_warnings(camera)
+    return findings
 
 
-def _distortion(camera: Camera) -> Finding | None:
+def _distortion_error(camera: Camera) -> Finding | None:
     """A lens model that folds back inside the image, or that changes angles by too much."""
     if camera.distortion is None:
         return None
@@ -100,15 +263,15 @@ def _distortion(camera: Camera) -> Finding | None:
         if abs(edge) < 1:
             continue
         radii = np.sign(edge) * _radii(camera, direction, float(np.sign(edge)))
-        ideal = focal * (_ANGLES if fisheye else np.tan(_ANGLES))
+        ideal = focal * (_LENS_ANGLES if fisheye else np.tan(_LENS_ANGLES))
         valid = np.cumprod(np.isfinite(radii) & (radii > 0)).astype(bool)
         reach = float(np.max(radii[valid], initial=0.0))
         needed = VALID_SHARE * min(abs(edge), ideal[-1])
         if reach < needed:
             found = f"folds back {reach:.0f} px from the principal point"
             return _absurd(camera, found, f"valid over {abs(edge):.0f} px")
-        bent = _ANGLES[valid][np.argmax(radii[valid] >= needed)]
-        straight = float(np.interp(needed, ideal, _ANGLES))
+        bent = _LENS_ANGLES[valid][np.argmax(radii[valid] >= needed)]
+        straight = float(np.interp(needed, ideal, _LENS_ANGLES))
         if not 1 / MAX_BEND <= bent / straight <= MAX_BEND:
             found = f"{np.degrees(bent):.0f}° where a lens without distortion has {np.degrees(straight):.0f}°"
             return _absurd(camera, found, f"within a factor of {MAX_BEND:g}")
@@ -116,9 +279,9 @@ def _distortion(camera: Camera) -> Finding | None:
 
 
 def _radii(camera: Camera, axis: int, sign: float) -> Array:
-    """Distance from the principal point along an axis, pixels, of rays at _ANGLES to the optical axis."""
-    rays = np.zeros((len(_ANGLES), 3))
-    rays[:, axis], rays[:, 2] = sign * np.sin(_ANGLES), np.cos(_ANGLES)
+    """Distance from the principal point along an axis, pixels, of rays at _LENS_ANGLES to the optical axis."""
+    rays = np.zeros((len(_LENS_ANGLES), 3))
+    rays[:, axis], rays[:, 2] = sign * np.sin(_LENS_ANGLES), np.cos(_LENS_ANGLES)
     return camera.project(rays)[0][:, axis] - camera.intrinsics[axis, 2]
 
 
@@ -128,14 +291,15 @@ def _absurd(camera: Camera, found: str, expected: str) -> Finding:
     return Finding("distortion-absurd", "error", camera.name, message, found, expected, advice)
 
 
-def _resolution(camera: Camera) -> Finding | None:
+def _size_error(camera: Camera) -> Finding | None:
     """Intrinsics for images of another size: the principal point is at the centre of such an image."""
     doubled = 2 * camera.intrinsics[[0, 1], 2]
     size = np.array([camera.width, camera.height], dtype=np.float64)
     scale = doubled / size
     found = f"principal point {doubled[0] / 2:.0f}, {doubled[1] / 2:.0f} in {camera.width} x {camera.height}"
     expected = f"about {size[0] / 2:.0f}, {size[1] / 2:.0f}"
-    if _near(doubled[0] / size[1]) and _near(doubled[1] / size[0]) and not _near(size[0] / size[1]):
+    crossed = np.abs(doubled / size[::-1] - 1) <= CENTER_TOLERANCE
+    if crossed.all() and abs(size[0] / size[1] - 1) > CENTER_TOLERANCE:
         message, advice = "width and height, or the axes of the intrinsics, are swapped", "exchange them"
         return Finding("intrinsics-resolution", "error", camera.name, message, found, expected, advice)
     off = np.abs(scale - 1) > CENTER_TOLERANCE
@@ -149,20 +313,17 @@ def _resolution(camera: Camera) -> Finding | None:
     return Finding("intrinsics-resolution", "error", camera.name, message, found + focal, expected, advice)
 
 
-def _field_of_view(camera: Camera) -> Finding | None:
+def _matrix_error(camera: Camera) -> Finding | None:
+    """A field of view or a skew that no camera has, or a principal point far outside of the image."""
     horizontal, vertical = seen_fov_deg(camera)
     fisheye = camera.distortion is not None and camera.distortion.model == "kannala_brandt"
     widest = 180.0 if fisheye else MAX_PINHOLE_FOV_DEG
-    if min(horizontal, vertical) >= MIN_FOV_DEG / 2 and MIN_FOV_DEG <= horizontal <= widest:
-        return None
-    expected = f"{MIN_FOV_DEG:g}° to {widest:g}°"
-    found = f"{horizontal:.1f}° horizontally, focal length {camera.intrinsics[0, 0]:.0f} px, image width {camera.width}"
-    message, advice = "the field of view is implausible", "give the focal length in pixels of these images"
-    return Finding("fov-implausible", "error", camera.name, message, found, expected, advice)
-
-
-def _center_or_skew(camera: Camera) -> Finding | None:
-    """A principal point far outside of the image, or a skew that no camera has."""
+    if min(horizontal, vertical) < MIN_FOV_DEG / 2 or not MIN_FOV_DEG <= horizontal <= widest:
+        found = f"{horizontal:.1f}° horizontally, focal length {camera.intrinsics[0, 0]:.0f} px, "
+        found += f"image width {camera.width}"
+        message, advice = "the field of view is implausible", "give the focal length in pixels of these images"
+        expected = f"{MIN_FOV_DEG:g}° to {widest:g}°"
+        return Finding("fov-implausible", "error", camera.name, message, found, expected, advice)
     advice = "write the matrix row by row, [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], in pixels of these images"
     skew, center = float(camera.intrinsics[0, 1]), camera.intrinsics[:2, 2]
     if abs(skew) > LARGEST_SKEW * camera.intrinsics[0, 0]:
@@ -194,92 +355,39 @@ def _lens_warnings(camera: Camera) -> list[Finding]:
     return warnings
 
 
-def _near(ratio: float) -> bool:
-    return abs(ratio - 1) <= CENTER_TOLERANCE
-
-
-HEIGHT_M = 1.84  # of LIDAR_TOP in nuScenes
+BEV_HEIGHT_M = 1.84  # of LIDAR_TOP in nuScenes
 HEIGHT_ERROR_M, HEIGHT_WARNING_M = 1.2, 0.4
 TILT_ERROR_DEG, TILT_WARNING_DEG = 15.0, 6.0
 TILT_INFO_DEG = 1.0  # the demo model's training drives are level; nuScenes' LIDAR_TOP is tilted by 1 to 3
 HEADING_DEG = 20.0
-MAX_DISTANCE_M = 6.0
+MAX_BEV_DISTANCE_M = 6.0
 
 
-def check_bev_frame(ego_from_bev: Array) -> tuple[Finding, ...]:
-    """Findings about ego_from_bev (4, 4): at most one error, or else warnings."""
-    unit = units_per_metre(float(np.linalg.norm(ego_from_bev[:3, 3])))
-    if unit != 1:
-        found, expected = f"{np.linalg.norm(ego_from_bev[:3, 3]):.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
-        message = f'the translation of "ego_from_bev" is in {"millimetres" if unit == 1000 else "centimetres"}'
-        return (rig_error("translation-unit", message, found, expected, f"divide the translation by {unit:g}"),)
-    if _is_plausible(ego_from_bev):
-        return _bev_warnings(ego_from_bev)
-    return (_mistake(ego_from_bev) or _defect(ego_from_bev),)
+def bev_angles_deg(ego_from_bev: Array) -> tuple[float, float]:
+    """Tilt and heading of the bev frame: of its z from straight up, and of its y to the left of forward, degrees."""
+    tilt = np.arccos(np.clip(ego_from_bev[2, 2], -1, 1))
+    return float(np.degrees(tilt)), float(np.degrees(np.arctan2(ego_from_bev[1, 1], ego_from_bev[0, 1])))
 
 
-def _tilt_deg(ego_from_bev: Array) -> float:
-    """Angle between z of the bev frame and straight up, degrees."""
-    return float(np.degrees(np.arccos(np.clip(ego_from_bev[2, 2], -1, 1))))
+def is_plausible_bev_frame(ego_from_bev: Array) -> bool:
+    """True if the bev frame is on the vehicle, at about nuScenes' height, level, and has y forward."""
+    (tilt, heading), (x, y, height) = bev_angles_deg(ego_from_bev), ego_from_bev[:3, 3]
+    turned = tilt > TILT_ERROR_DEG or abs(heading) > HEADING_DEG
+    return not turned and bool(abs(height - BEV_HEIGHT_M) <= HEIGHT_ERROR_M and np.hypot(x, y) <= MAX_BEV_DISTANCE_M)
 
 
-def _heading_deg(ego_from_bev: Array) -> float:
-    """Angle of y of the bev frame, degrees counter-clockwise from the vehicle's forward direction; 0 is expected."""
-    return float(np.degrees(np.arctan2(ego_from_bev[1, 1], ego_from_bev[0, 1])))
-
-
-def _is_plausible(pose: Array) -> bool:
-    height = abs(pose[2, 3] - HEIGHT_M) <= HEIGHT_ERROR_M
-    level = _tilt_deg(pose) <= TILT_ERROR_DEG and abs(_heading_deg(pose)) <= HEADING_DEG
-    return bool(height and level and np.hypot(pose[0, 3], pose[1, 3]) <= MAX_DISTANCE_M)
-
-
-def _mistake(pose: Array) -> Finding | None:
-    """The common mistake whose undoing gives a plausible frame."""
-    # KITTI, Waymo and Argoverse have x forward: rotated to x right, such a frame is plausible.
-    turned = rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-    if _is_plausible(turned):
-        message, advice = "has x forward", "rotate it by 90° about z, unless your weights were trained with x forward"
-        found, expected = "x forward, y left", "x right, y forward"
-        return rig_error("bev-x-forward", f'"ego_from_bev" {message}', found, expected, advice)
-    if _is_plausible(inverse(pose)):
-        code, message, advice = "transform-inverted", "is bev_from_ego, the inverse", "invert it"
-    elif _is_plausible(reordered(pose, 1)) or _is_plausible(reordered(pose, -1)):
-        code, advice = "quaternion-order", "put w first"
-        message = "has a quaternion that is not in the order w, x, y, z"
-    else:
-        return None
-    found = f"tilt {_tilt_deg(pose):.0f}°, y {_heading_deg(pose):.0f}° from forward, height {pose[2, 3]:.2f} m"
-    return rig_error(code, f'"ego_from_bev" {message}', found, "x right, y forward, z up, z 1.84 m", advice)
-
-
-def _defect(pose: Array) -> Finding:
-    """The implausible property of the frame, where no common mistake explains it."""
-    if _tilt_deg(pose) > TILT_ERROR_DEG:
-        found, advice = f"{_tilt_deg(pose):.0f}°", "z of the bev frame points up"
-        return rig_error("bev-tilted", '"ego_from_bev" is tilted', found, "level within 15°", advice)
-    if abs(_heading_deg(pose)) > HEADING_DEG:
-        message, found = 'y of "ego_from_bev" is not forward', f"y is {_heading_deg(pose):.0f}° to the left"
-        return rig_error("bev-axes", message, found, "x right, y forward", "rotate it about z")
-    if abs(pose[2, 3] - HEIGHT_M) > HEIGHT_ERROR_M:
-        message, found = '"ego_from_bev" is not at the height that the weights expect', f"{pose[2, 3]:.2f} m"
-        advice = "give its height above the ground; pillars extend from 4.5 m below this frame to 2.5 m above it"
-        return rig_error("bev-height", message, found, f"about {HEIGHT_M} m", advice)
-    found, expected = f"{np.hypot(pose[0, 3], pose[1, 3]):.1f} m from the ego origin", f"at most {MAX_DISTANCE_M:g} m"
-    return rig_error("bev-far", '"ego_from_bev" is not on the vehicle', found, expected, "check its translation")
-
-
-def _bev_warnings(pose: Array) -> tuple[Finding, ...]:
-    findings = []
-    if abs(pose[2, 3] - HEIGHT_M) > HEIGHT_WARNING_M:
-        message, found = '"ego_from_bev" is higher or lower than nuScenes\'', f"{pose[2, 3]:.2f} m"
+def bev_warnings(ego_from_bev: Array) -> list[Finding]:
+    """What is unusual about a plausible bev frame."""
+    findings, height, tilt = [], ego_from_bev[2, 3], bev_angles_deg(ego_from_bev)[0]
+    if abs(height - BEV_HEIGHT_M) > HEIGHT_WARNING_M:
+        message, found = '"ego_from_bev" is higher or lower than nuScenes\'', f"{height:.2f} m"
         advice = "place it 1.84 m above the ground"
-        findings.append(Finding("bev-height", "warning", None, message, found, f"about {HEIGHT_M} m", advice))
-    message, found = '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.1f}°"
-    if _tilt_deg(pose) > TILT_WARNING_DEG:
+        findings.append(Finding("bev-height", "warning", None, message, found, f"about {BEV_HEIGHT_M} m", advice))
+    message, found = '"ego_from_bev" is tilted', f"{tilt:.1f}°"
+    if tilt > TILT_WARNING_DEG:
         findings.append(Finding("bev-tilted", "warning", None, message, found, "under 6°", "level it"))
-    elif _tilt_deg(pose) > TILT_INFO_DEG:
+    elif tilt > TILT_INFO_DEG:
         expected = "as in training: 1 to 3° in nuScenes, 0° in rendered drives"
         advice = "nothing for the demo model, which levels the frame itself"
         findings.append(Finding("bev-tilted", "info", None, message, found, expected, advice))
-    return tuple(findings)
+    return findings

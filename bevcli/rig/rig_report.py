@@ -15,8 +15,8 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.printing import aligned, counted
-from bevcli.rig.pose_checks import degrees_text, mounting_of, seen_fov_deg, side_of
-from bevcli.rig.rig_checks import rig_findings
+from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, side_of
+from bevcli.rig.sequence_checks import rig_findings
 
 COVERAGE_GRID = BevGrid(rows=100, columns=100)
 UNSEEN_WARNING = 0.02
@@ -211,12 +211,12 @@ def _cameras(rig: CameraRig, coverage: Coverage) -> str:
     rows = []
     for camera in rig.cameras:
         mounting = mounting_of(camera.ego_from_camera)
-        x, y, z = mounting.position
         size, fov = f"{camera.width}x{camera.height}", f"{seen_fov_deg(camera)[0]:.0f}°"
         angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
         lens = camera.distortion.model if camera.distortion else "pinhole"
         seen = f"{coverage.shares[camera.name]:.0%}"
-        rows.append((camera.name, size, fov, *angles, f"{x:.2f}", f"{y:.2f}", f"{z:.2f} m", lens, seen))
+        position = (f"{mounting.x:.2f}", f"{mounting.y:.2f}", f"{mounting.height:.2f} m")
+        rows.append((camera.name, size, fov, *angles, *position, lens, seen))
     return aligned([header, *rows], left=(0, 9))
 
 

@@ -1,6 +1,11 @@
-"""Checks of a sequence: ego-motion (units, jumps, axes), times of the images, and the cheap checks before a run."""
+"""All checks of a sequence: its rig, in their order, ego-motion (units, jumps, axes) and times of the images.
 
-from collections.abc import Mapping, Sequence
+`CheckedDrive` runs the cheap ones before a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -8,10 +13,16 @@ import numpy as np
 
 from bevcli.findings import Finding, errors_of, rig_error
 from bevcli.frame import DerivedSequence, FrameStamp, Sequence as Drive
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig.rig_checks import rig_errors
+from bevcli.rig import rig_checks
 
+BEV_ASSUMED = Finding(
+    "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
+    advice="the default is used: a level frame at (0.94, 0, 1.84) m, x right, y forward",
+)  # fmt: skip
+MERGED_FROM = 3  # cameras with the same mistake: from this many on it is one finding on the whole rig
 MAX_SPEED = 70.0  # m/s, 250 km/h
 MIN_MOVING_SPEED = 1.0  # m/s; at lower speeds the direction of motion is noise
 SPEED_FACTOR = 1.3  # largest ratio of the stated speed to the speed from the poses
@@ -44,7 +55,7 @@ def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
     These are the errors of `check_calibration` that need neither images nor the coverage of the BEV grid. source: the
     drive's path, for the command that each line names.
     """
-    findings = rig_errors(drive.rig)
+    findings = errors_of(rig_findings(drive.rig))
     motion = drive.ego_motion
     if motion is not None and drive.stamps:
         times, stamps = motion.timestamps_ns, drive.stamps
@@ -58,51 +69,102 @@ def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
     )
 
 
+def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[Finding]:
+    """All findings about a rig but those about coverage and the comparison with nuScenes.
+
+    found_before: from reading the file. Consequences of a reported error are suppressed: a camera with an error from
+    reading is not checked again, and names are compared only for cameras with plausible poses.
+    """
+    wrong, poses, swapped, bev = errors_of(found_before), list[Finding](), list[Finding](), list[Finding]()
+    cameras = _without_errors(rig.cameras, wrong)
+    if any(map(rig_checks.pose_defects, cameras)):
+        from bevcli.rig import mistakes  # which few rigs need
+
+        poses = mistakes.pose_errors(cameras)
+        # Swapped names of cameras whose poses share another mistake, such as all inverted, are seen once it is undone.
+        swapped = [
+            replace(finding, advice=f"{finding.advice}, after correcting the poses")
+            for finding in rig_checks.check_names(mistakes.corrected(cameras))
+            if finding.code == "swapped-names"
+        ]
+    names = rig_checks.check_names(_without_errors(cameras, poses))
+    if all(finding.camera is not None for finding in wrong):
+        if rig_checks.is_plausible_bev_frame(rig.ego_from_bev):
+            bev = rig_checks.bev_warnings(rig.ego_from_bev)
+        else:
+            from bevcli.rig import mistakes
+
+            bev = [mistakes.bev_frame_error(rig.ego_from_bev)]
+    if rig.ego_from_bev_assumed:
+        bev.append(BEV_ASSUMED)
+    return [*found_before, *_merged([*poses, *rig_checks.check_lenses(cameras)], cameras), *names, *swapped, *bev]
+
+
+def _without_errors(cameras: Sequence[Camera], errors: Iterable[Finding]) -> tuple[Camera, ...]:
+    wrong = {finding.camera for finding in errors}
+    return tuple(camera for camera in cameras if camera.name not in wrong)
+
+
+def _merged(findings: Sequence[Finding], cameras: Sequence[Camera]) -> list[Finding]:
+    """Findings with the same code and message on three or more cameras, or on all of several, become one on the rig."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        groups.setdefault((finding.code, finding.message), []).append(finding)
+    merged: list[Finding] = []
+    for group in groups.values():
+        if len(group) >= MERGED_FROM or len(group) == len(cameras) > 1:
+            names = ", ".join(str(finding.camera) for finding in group)
+            found = f"{group[0].camera}: {group[0].found}"
+            merged.append(replace(group[0], camera=None, message=f"{group[0].message} ({names})", found=found))
+        else:
+            merged += group
+    return merged
+
+
 @dataclass(frozen=True)
 class _Drive:
-    """T poses of a drive."""
+    """T poses of a drive, two or more."""
 
     rotations: Array  # (T, 3, 3), world_from_ego
     steps: Array  # (T-1, 3), from each pose to the next, metres in the world frame
     seconds: Array  # (T-1,), duration of each step
+    speeds: Array  # (T-1,), speed from pose to pose, m/s
+    distance_m: float  # distance driven, steps below the moving speed left out
+    headings_deg: Array  # (M,), direction of each step with motion, counter-clockwise from ego x; empty: a short drive
+    tilt_deg: float  # median angle between z of the ego frame and z of the world frame
 
-    @property
-    def speeds(self) -> Array:
-        """(T-1,), speed from pose to pose, m/s."""
-        return np.linalg.norm(self.steps, axis=1) / self.seconds
-
-    def tilt_deg(self) -> float:
-        """Median angle between z of the ego frame and z of the world frame, degrees."""
-        return float(np.degrees(np.median(np.arccos(np.clip(self.rotations[:, 2, 2], -1, 1)))))
-
-    def distance_m(self) -> float:
-        """Distance driven in metres, steps below the moving speed left out."""
-        return float(np.linalg.norm(self.steps, axis=1)[self.speeds > MIN_MOVING_SPEED].sum())
-
-    def headings_deg(self) -> Array:
-        """(M,), direction of each step with motion, degrees counter-clockwise from ego x; empty for a short drive."""
-        moving = (self.speeds > MIN_MOVING_SPEED) & (self.distance_m() >= MIN_DISTANCE_M)
-        steps = np.einsum("tji,tj->ti", self.rotations[:-1], self.steps)[moving]
-        return np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
+    @classmethod
+    def of(cls, ego_motion: EgoMotion) -> _Drive:
+        """The poses of ego-motion."""
+        rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
+        steps, seconds = np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9
+        speeds = np.linalg.norm(steps, axis=1) / seconds
+        distance_m = float(np.linalg.norm(steps, axis=1)[speeds > MIN_MOVING_SPEED].sum())
+        moving = (speeds > MIN_MOVING_SPEED) & (distance_m >= MIN_DISTANCE_M)
+        ego_steps = np.einsum("tji,tj->ti", rotations[:-1], steps)[moving]
+        headings_deg = np.degrees(np.arctan2(ego_steps[:, 1], ego_steps[:, 0]))
+        tilt_deg = float(np.degrees(np.median(np.arccos(np.clip(rotations[:, 2, 2], -1, 1)))))
+        return cls(rotations, steps, seconds, speeds, distance_m, headings_deg, tilt_deg)
 
     def is_plausible(self) -> bool:
         """True if the vehicle is level, not too fast, and drives forward in most steps."""
-        headings = self.headings_deg()
+        headings = self.headings_deg
         ahead = len(headings) == 0 or (np.abs(headings) <= FORWARD_DEG).mean() >= MOST_STEPS
-        return bool(self.tilt_deg() <= MAX_TILT_DEG and np.median(self.speeds) <= MAX_SPEED and ahead)
+        return bool(self.tilt_deg <= MAX_TILT_DEG and np.median(self.speeds) <= MAX_SPEED and ahead)
 
 
 def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     """Findings about the poses of one scene, or else about its stated velocities; none for a single row."""
-    drive = _drive(ego_motion)
-    if len(drive.steps) == 0:
+    if len(ego_motion.timestamps_ns) < 2:
         return ()
+    drive = _Drive.of(ego_motion)
     cause = None if drive.is_plausible() else _mistake(drive, ego_motion) or _units(drive)
     if cause is not None:
         return (cause,)
     findings = tuple(filter(None, (_jump(drive, ego_motion), _direction(drive))))
-    speed = _stated_speed(drive, ego_motion) if ego_motion.velocities_are_stated and not findings else None
-    return (*findings, speed) if speed is not None else findings
+    if findings or not ego_motion.velocities_are_stated:
+        return findings
+    return tuple(filter(None, (_stated_speed(drive, ego_motion),)))
 
 
 def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[Finding, ...]:
@@ -120,11 +182,6 @@ def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence
     An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
     """
     return tuple(filter(None, (_check_times_of(name, frame_ns, times) for name, times in camera_ns.items())))
-
-
-def _drive(ego_motion: EgoMotion) -> _Drive:
-    rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
-    return _Drive(rotations, np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9)
 
 
 def _units(drive: _Drive) -> Finding | None:
@@ -161,17 +218,17 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
         (("ego-inverted", "the poses are ego_from_world, the inverse", "invert them"),
          replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
     ):  # fmt: skip
-        if _drive(undone).is_plausible():
+        if _Drive.of(undone).is_plausible():
             return rig_error(code, message, _motion_text(drive), "level, driving forward", advice)
     return None
 
 
 def _direction(drive: _Drive) -> Finding | None:
     """A tilted ego frame, or driving sideways or backwards in most steps."""
-    if drive.tilt_deg() > MAX_TILT_DEG:
+    if drive.tilt_deg > MAX_TILT_DEG:
         advice = "z of the ego frame and of the world frame point up: check the axes"
         return rig_error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)
-    headings = drive.headings_deg()
+    headings = drive.headings_deg
     if len(headings) == 0:
         return None
     ahead = float((np.abs(headings) <= FORWARD_DEG).mean())
@@ -186,11 +243,11 @@ def _direction(drive: _Drive) -> Finding | None:
 
 
 def _motion_text(drive: _Drive) -> str:
-    headings, tilt = drive.headings_deg(), f"tilt {drive.tilt_deg():.0f}°"
+    headings, tilt = drive.headings_deg, f"tilt {drive.tilt_deg:.0f}°"
     if len(headings) == 0:
         return tilt
     middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
-    return f"moves {middle:.0f}° from forward over {drive.distance_m():.0f} m, {tilt}"
+    return f"moves {middle:.0f}° from forward over {drive.distance_m:.0f} m, {tilt}"
 
 
 def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
