@@ -13,7 +13,7 @@ from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions
 from bevcli.workshop.batch.job import Job
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 RIG = CameraRig(
     tuple(make_camera(name, yaw, 80, 45) for name, yaw in NUSCENES_YAWS_DEG.items()), default_ego_from_bev()

@@ -34,21 +34,21 @@ OWN: dict[Group, dict[str, str]] = {
         "past BEVFormerV2": "bevcli.workshop.benchmark.versions:with_past",
     },
     "bevcli.sequences": {
-        "argoverse2": "bevcli.workshop.formats.argoverse2:FORMAT",
-        "dgp": "bevcli.workshop.formats.dgp:FORMAT",
-        "ros": "bevcli.workshop.formats.ros.format:FORMAT",
-        "t4": "bevcli.workshop.formats.t4:FORMAT",
+        "argoverse2": "bevcli.workshop.formats:ARGOVERSE2",
+        "dgp": "bevcli.workshop.formats:DGP",
+        "ros": "bevcli.workshop.formats:ROS",
+        "t4": "bevcli.workshop.formats:T4",
     },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
-        "native": "bevcli.workshop.formats.native_writer:OUTPUT",
+        "native": "bevcli.workshop.formats.output:NATIVE",
         "nuscenes": "bevcli.workshop.formats.nuscenes_writer:OUTPUT",
     },
     "bevcli.box_formats": {
         "kitti": "bevcli.workshop.formats.kitti:BOXES",
     },
     "bevcli.label_formats": {
-        "csv": "bevcli.workshop.formats.csv_labels:FORMAT",
+        "csv": "bevcli.workshop.formats.labels:CSV",
         "cvat": "bevcli.workshop.formats.cuboids:CVAT",
         "kitti": "bevcli.workshop.formats.kitti:LABELS",
         "kitti-raw": "bevcli.workshop.formats.cuboids:TRACKLETS",

@@ -17,7 +17,7 @@ from command_line import MINI_TOML, command, start
 from small_fleet import results_of, write_drive, write_fleet
 
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 from bevcli.workshop.synth.drive import render
 
 OPTIONS = ("--model", "mini.toml", "--untrained", "--rate", "all", "--score", "0", "--device", "cpu")

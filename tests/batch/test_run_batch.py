@@ -24,7 +24,7 @@ from bevcli.workshop.batch import worker as worker_module
 from bevcli.workshop.batch.job import find_drives
 from bevcli.workshop.batch.run_batch import run_batch
 from bevcli.workshop.batch.worker import Worker
-from bevcli.workshop.formats.ros.format import BagOptions
+from bevcli.workshop.formats import BagOptions
 
 COMPARED = ("predictions.json", "tracks.csv")
 

@@ -19,7 +19,7 @@ from small_fleet import RIG
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 FRAMES = 16
 pytestmark = pytest.mark.usefixtures("unchecked_recordings")

@@ -28,7 +28,7 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.open import open_sequence
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 FRAMES, STOP_AFTER = 4, 2
 CAMERAS = ("CAM_FRONT", "CAM_BACK")

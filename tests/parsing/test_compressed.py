@@ -13,7 +13,7 @@ import zstandard
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import decompressed
-from bevcli.workshop.formats.ros.format import is_ros_bag
+from bevcli.workshop.formats import is_ros_bag
 from bevcli.workshop.formats.ros.messages import Topic, decoder
 from bevcli.workshop.formats.ros.storage import SqliteFile
 

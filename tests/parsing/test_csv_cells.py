@@ -13,7 +13,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 SIGNS = ("=", "+", "-", "@", "\t", "\r")
 

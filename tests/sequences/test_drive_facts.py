@@ -14,7 +14,7 @@ from bevcli.frame import DriveFacts
 from bevcli.geometry.transforms import GeoOrigin
 from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 MUNICH = DriveFacts(rendered=True, geo_origin=GeoOrigin(48.1374, 11.5755, 60.0))
 SAMPLES = Path(__file__).parents[2] / "samples"

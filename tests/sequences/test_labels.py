@@ -20,7 +20,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes,
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
 from bevcli.workshop.formats.labels import WithLabels, _labelled_places, read_labels
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 

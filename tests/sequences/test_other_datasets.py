@@ -27,11 +27,12 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
+from bevcli.registry import load
 from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
 
-FORMATS: dict[str, Format] = {name: resolve_name(f"{one.module}:FORMAT") for name, one in WRITTEN.items()}
+FORMATS: dict[str, Format] = {name: load("bevcli.sequences", name) for name in WRITTEN}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}
 LENS = Distortion("brown_conrady", (-0.24, -0.21, 0.0, 0.0, 0.32))  # as of a camera of Argoverse 2
 DOCUMENT = (Path(__file__).parents[2] / "docs/other-inputs.md").read_text()

@@ -12,7 +12,7 @@ from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.native_writer import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter
 
 
 def assert_same_rig(one: CameraRig, other: CameraRig) -> None:

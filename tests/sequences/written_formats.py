@@ -232,7 +232,7 @@ class WrittenFormat:
 
     Attributes:
         write: the frames and the folder.
-        module: of the `Format`.
+        module: of the reader.
         options: of the format, for what the writer writes.
     """
 

@@ -1,1 +1,110 @@
-"""Formats of other programs: drives, labels and boxes, and `convert`."""
+"""Formats of other programs: drives, labels and boxes, and `convert`.
+
+Here is what recognises a drive of each format, and its options; its reader is imported when it is chosen.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+from bevcli.options import option, options, parse_pairs
+from bevcli.parsing.files import open_regular
+from bevcli.sequences.format import Format
+from bevcli.sequences.options import FormatOptions, RigOptions
+
+# Any of these makes a folder a log of Argoverse 2, so that an incomplete one gets an error that names the missing file.
+ARGOVERSE2_FILES = (
+    "city_SE3_egovehicle.feather",
+    "calibration/egovehicle_SE3_sensor.feather",
+    "calibration/intrinsics.feather",
+)
+DGP_FOLDERS = ("calibration", "ontology", "rgb")  # a folder with these is a scene that lacks its file
+T4_TABLES = ("scene", "sample", "sample_data")  # any of them makes a folder a T4 dataset
+AXLE_HEIGHT_M = 0.33
+BAG_SUFFIXES = (".mcap", ".db3")
+PACKED = (".zst", ".zstd", ".lz4", ".gz", ".xz", ".bz2")
+BAG_METADATA = "metadata.yaml"
+
+
+@options("Input")
+class Argoverse2Options(FormatOptions):
+    """The options of an Argoverse 2 log."""
+
+    stereo: bool = option(default=False, help="Argoverse 2: also use the two stereo cameras.")
+    distorted: bool = option(
+        default=False,
+        help="Argoverse 2: the images have the lens distortion k1 to k3. The published images have none.",
+    )
+    axle_height_m: float = option(
+        default=AXLE_HEIGHT_M, help="Argoverse 2: height of the rear axle above the ground, metres.", metavar="M"
+    )
+
+
+@options("Input")
+class BagOptions(RigOptions):
+    """The options of a bag."""
+
+    topics: Mapping[str, str] = option(
+        default_factory=dict,
+        help="ROS bags: the image topic of a camera, where it is not found. Repeatable.",
+        flag="--topic",
+        metavar="CAMERA=/TOPIC",
+        parse=partial(parse_pairs, expected="CAMERA=/TOPIC, such as CAM_FRONT=/camera/front/image_raw"),
+        repeatable=True,
+    )
+    topics_file: Path | None = option(
+        reads="path",
+        default=None,
+        help="ROS bags: topics and frames of a vehicle (docs/other-inputs.md).",
+        flag="--topics",
+        metavar="FILE.toml",
+    )
+
+
+def is_packed_bag(path: Path) -> bool:
+    """True for the name of a compressed bag, such as drive.mcap.zst."""
+    return path.suffix in PACKED and path.with_suffix("").suffix in BAG_SUFFIXES
+
+
+def is_ros_bag(path: Path) -> bool:
+    """True for an .mcap or .db3 file, or a folder with some."""
+    if not path.is_dir():
+        return path.suffix in BAG_SUFFIXES or is_packed_bag(path)
+    if any(file.suffix in BAG_SUFFIXES or is_packed_bag(file) for file in path.iterdir()):
+        return True
+    if not (path / BAG_METADATA).is_file():
+        return False
+    with open_regular(path / BAG_METADATA) as file:
+        return b"rosbag2_bagfile_information" in file.read(4096)
+
+
+ARGOVERSE2 = Format(
+    name="an Argoverse 2 log",
+    expected="city_SE3_egovehicle.feather",
+    recognises=lambda path: any((path / marker).exists() for marker in ARGOVERSE2_FILES),
+    opener="bevcli.workshop.formats.argoverse2:open_log",
+    options=Argoverse2Options,
+    annotated=True,
+)
+DGP = Format(
+    name="a DGP scene",
+    expected="scene_*.json",
+    recognises=lambda path: any(path.glob("scene_*.json")) or all((path / name).is_dir() for name in DGP_FOLDERS),
+    opener="bevcli.workshop.formats.dgp:open_scene",
+    annotated=True,
+)
+ROS = Format(
+    name="a ROS bag",
+    expected=".mcap or .db3 files",
+    recognises=lambda path: is_ros_bag(path) or path.suffix == ".bag",
+    opener="bevcli.workshop.formats.ros.sequence:open_bag",
+    options=BagOptions,
+    precedence=10,
+)
+T4 = Format(
+    name="a T4 dataset",
+    expected="annotation/sample_data.json",
+    recognises=lambda path: any((path / "annotation" / f"{name}.json").exists() for name in T4_TABLES),
+    opener="bevcli.workshop.formats.t4:open_t4",
+    annotated=True,
+)

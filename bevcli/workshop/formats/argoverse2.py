@@ -1,12 +1,30 @@
-"""A log of the Argoverse 2 sensor dataset as an input format."""
+"""An Argoverse 2 log as a Sequence.
 
-from bevcli.options import option, options
-from bevcli.sequences.format import Format
-from bevcli.sequences.options import FormatOptions
+Argoverse's egovehicle frame is at the rear axle, above the ground. The ego frame here is below it, on the ground.
+"""
 
-# Any of these makes a folder a log, so that an incomplete one gets an error that names the missing file.
-MARKERS = ("city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather")
-AXLE_HEIGHT_M = 0.33
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa  # which rerun brings, so that it is installed anyway
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D, with_track_velocities
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
+from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
+from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
+from bevcli.parsing.documents import LARGEST_INTEGER
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.printing import reason_of
+from bevcli.sequences.files.calibration_file import checked_camera
+from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats import Argoverse2Options
+
 # Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
 # and STROLLER, stay as they are, and are not scored.
 CLASS_OF_CATEGORY = {
@@ -28,27 +46,212 @@ CLASS_OF_CATEGORY = {
     "CONSTRUCTION_CONE": "traffic_cone",
     "CONSTRUCTION_BARREL": "traffic_cone",
 }
+LARGEST_BYTES = 256 * MIB
+LARGEST_NUMBER = 1e12  # metres or pixels
+SHORTEST_QUATERNION = 1e-3
+QUATERNION, TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+RING = (
+    "ring_front_center", "ring_front_right", "ring_front_left", "ring_side_right", "ring_side_left",
+    "ring_rear_right", "ring_rear_left",
+)  # fmt: skip
+STEREO = ("stereo_front_left", "stereo_front_right")
+LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+SPACING_NS = 100_000_000  # time between the poses that kinematics are derived from; the table has some 5 µs apart
+NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
+SIZE = ("length_m", "width_m", "height_m")
+ANNOTATIONS = "annotations.feather"
+Times = NDArray[np.int64]
 
 
-@options("Input")
-class Argoverse2Options(FormatOptions):
-    """The options of an Argoverse 2 log."""
+class FeatherTable:
+    """The columns of a Feather file. Raises InputError where the file is missing or broken, or lacks a column.
 
-    stereo: bool = option(default=False, help="Argoverse 2: also use the two stereo cameras.")
-    distorted: bool = option(
-        default=False,
-        help="Argoverse 2: the images have the lens distortion k1 to k3. The published images have none.",
+    required: names of columns.
+    """
+
+    def __init__(self, path: Path, required: Iterable[str]) -> None:
+        self.path = path
+        data = read_bytes(path, LARGEST_BYTES)
+        try:
+            self._table = pa.ipc.open_file(pa.BufferReader(data)).read_all()
+            self._table.validate(full=True)
+        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+            raise InputError(f"{path}: is not a complete Feather file ({reason_of(error)[:200]})") from None
+        for name in required:
+            if self._table.column_names.count(name) != 1:
+                found = ", ".join(self._table.column_names[:20])
+                raise InputError(f'{path}: has no column "{name:.60}" (found: {found:.200})')
+
+    def __len__(self) -> int:
+        return int(self._table.num_rows)
+
+    def numbers(self, names: Iterable[str]) -> Array:
+        """(N, C) finite values of columns of numbers. Raises InputError."""
+        return np.stack([self._numbers(name) for name in names], axis=1)
+
+    def integers(self, name: str) -> NDArray[np.int64]:
+        """(N,) values of a column of integers. Raises InputError."""
+        column = self._table[name]
+        if not pa.types.is_integer(column.type) or column.null_count:
+            raise self._error(name, "integers", column)
+        try:
+            return column.cast(pa.int64()).to_numpy().astype(np.int64)
+        except pa.ArrowException:
+            raise self._error(name, "integers of at most 63 bits", column) from None
+
+    def texts(self, name: str) -> list[str]:
+        """(N) values of a column of texts. Raises InputError."""
+        column = self._table[name]
+        try:
+            texts = column.cast(pa.string()).to_pylist()
+        except pa.ArrowException:
+            raise self._error(name, "texts", column) from None
+        if column.null_count or any(len(text) > 200 for text in texts):
+            raise self._error(name, "texts of at most 200 characters", column)
+        return [str(text) for text in texts]
+
+    def poses(self) -> tuple[Array, Array]:
+        """(N, 3) translations, metres, and (N, 4) quaternions w, x, y, z of norm 1. Raises InputError."""
+        quaternions = self.numbers(QUATERNION)
+        norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        if not (norms > SHORTEST_QUATERNION).all():
+            raise InputError(f"{self.path}: expected quaternions of norm 1, found one of norm 0")
+        return self.numbers(TRANSLATION), quaternions / norms
+
+    def _numbers(self, name: str) -> Array:
+        column = self._table[name]
+        if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)) or column.null_count:
+            raise self._error(name, "numbers", column)
+        values = column.to_numpy().astype(np.float64)
+        wrong = np.flatnonzero(~(np.abs(values) < LARGEST_NUMBER))
+        if len(wrong):
+            found = f"{values[wrong[0]]:g} in row {wrong[0]}"
+            raise InputError(f'{self.path}: column "{name}": expected finite numbers below 1e12, found {found}')
+        return values
+
+    def _error(self, name: str, expected: str, column: pa.ChunkedArray) -> InputError:
+        found = f"{column.type}{' with missing values' if column.null_count else ''}"
+        return InputError(f'{self.path}: column "{name}": expected {expected}, found {found:.80}')
+
+
+def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> ListedSequence:
+    """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
+
+    A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
+    The ego frame is below Argoverse's, on the ground. The world frame is that of the city. Raises InputError.
+    """
+    common.refuse_static(path)
+    rig = _read_rig(path / "calibration", own)
+    motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+    images = {name: _image_times(path / "sensors/cameras" / name) for name in rig.names}
+    annotated = (path / ANNOTATIONS).exists()
+    names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+    boxes = _read_annotations(path / ANNOTATIONS, motion, own, names) if annotated else {}
+    entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
+    times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
+    truth = {place: boxes[time] for place, time in enumerate(times) if time in boxes}
+    notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
+    files = tuple(sorted((*path.glob("*.feather"), *path.glob("calibration/*.feather"))))
+    return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
+
+
+def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
+    """The poses in city_SE3_egovehicle.feather, as those of the frame below the axle. Raises InputError."""
+    table = FeatherTable(path, ("timestamp_ns", *QUATERNION, *TRANSLATION))
+    if not len(table):
+        raise InputError(f"{path}: has no poses (expected at least one)")
+    times, first = np.unique(table.integers("timestamp_ns"), return_index=True)
+    axles, quaternions = (column[first] for column in table.poses())
+    up = np.stack([rotation_from_quaternion(q)[:, 2] for q in quaternions])
+    poses = (times, axles - axle_height_m * up, quaternions)
+    rows = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1, SPACING_NS)))
+    return motion_of_keyframes((times[rows], poses[1][rows], quaternions[rows]), poses)
+
+
+def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
+    path, poses_path = folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"
+    table = FeatherTable(path, ("sensor_name", *LENS, "width_px", "height_px"))
+    lenses = dict(zip(table.texts("sensor_name"), table.numbers(LENS), strict=True))
+    sizes = np.stack([table.integers("width_px"), table.integers("height_px")], axis=1)
+    size_of = dict(zip(lenses, sizes.tolist(), strict=True)) if len(lenses) == len(table) else {}
+    poses = FeatherTable(poses_path, ("sensor_name", *QUATERNION, *TRANSLATION))
+    axle_from = dict(zip(poses.texts("sensor_name"), map(Pose, *poses.poses()), strict=True))
+    names = [name for name in RING if name in lenses] + (list(STEREO) if own.stereo else [])
+    if not names:
+        raise InputError(f"{path}: has none of the ring cameras (expected {RING[0]} and others)")
+    for name in names:
+        for known, file in ((lenses, path), (size_of, path), (axle_from, poses_path)):
+            if name not in known:
+                raise InputError(f"{file}: has no row of {name}, or two of one camera (expected one)")
+    ego_from_axle = rigid((0, 0, own.axle_height_m))
+    ego_from = {name: ego_from_axle @ axle_from[name].matrix for name in names}
+    cameras = [_camera(name, size_of[name], lenses[name], ego_from[name], path, own) for name in names]
+    return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
+
+
+def _camera(
+    name: str, size: list[int], lens: Array, ego_from_camera: Array, path: Path, own: Argoverse2Options
+) -> Camera:
+    (width, height), (fx, fy, cx, cy, k1, k2, k3) = size, lens
+    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    distortion = brown_conrady((k1, k2, 0, 0, k3, 0, 0, 0)) if own.distorted else None
+    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, distortion), path)
+
+
+def _image_times(folder: Path) -> Times:
+    """(N,) ns, increasing, of the images TIMESTAMP.jpg in a camera's folder; none without the folder."""
+    names = [file.stem for file in folder.glob("*.jpg")] if folder.is_dir() else []
+    times = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19]
+    return np.array(sorted(time for time in times if time <= LARGEST_INTEGER), dtype=np.int64)
+
+
+def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options, names: ClassNames) -> dict[int, Boxes3D]:
+    columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
+    table = FeatherTable(path, columns)
+    translations, quaternions = table.poses()
+    boxes = Boxes3D(
+        translations + [0, 0, own.axle_height_m],
+        table.numbers(SIZE),
+        np.array([yaw_of_rotation(rotation_from_quaternion(q)) for q in quaternions], dtype=np.float64),
+        np.full((len(table), 2), np.nan),
+        np.array([names[name] for name in table.texts("category")], dtype=np.str_),
+        instances=np.array(table.texts("track_uuid"), dtype=np.str_),
+        num_points=table.integers("num_interior_pts"),
     )
-    axle_height_m: float = option(
-        default=AXLE_HEIGHT_M, help="Argoverse 2: height of the rear axle above the ground, metres.", metavar="M"
-    )
+    times = table.integers("timestamp_ns")
+    frames = np.unique(times)
+    try:
+        in_city = [boxes[times == time].transformed(motion.pose_at(int(time)).matrix) for time in frames]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return dict(zip(frames.tolist(), with_track_velocities(in_city, frames.tolist()), strict=True))
 
 
-FORMAT = Format(
-    name="an Argoverse 2 log",
-    expected="city_SE3_egovehicle.feather",
-    recognises=lambda path: any((path / marker).exists() for marker in MARKERS),
-    opener="bevcli.workshop.formats.argoverse2_log:open_log",
-    options=Argoverse2Options,
-    annotated=True,
-)
+def _entries(
+    path: Path, rig: CameraRig, images: Mapping[str, Times], annotated: Times
+) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    leading = next((times for times in images.values() if len(times)), None)
+    if leading is None:
+        raise InputError(
+            f"{path / 'sensors/cameras'}: has no images (expected {rig.names[0]}/TIMESTAMP_NS.jpg and others)"
+        )
+    times = annotated if len(annotated) else leading
+    near = f"within {NEAR_NS / 1e6:.0f} ms"
+    entries = []
+    for index, time in enumerate(times.tolist()):
+        if sources := _sources(path / "sensors/cameras", images, time):
+            dropped = {name: f"has no image {near} of the frame" for name in rig.names if name not in sources}
+            entries.append(FrameEntry(FrameStamp(index, "", time), sources, dropped, str(path)))
+    if not entries:
+        raise InputError(f"{path}: no image is {near} of a time that has boxes in {ANNOTATIONS}")
+    note = f"{len(times) - len(entries)} of {len(times)} frames have no image and are left out"
+    return tuple(entries), (note,) if len(entries) < len(times) else ()
+
+
+def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
+    found = {}
+    for name, times in images.items():
+        nearest = int(times[np.abs(times - time).argmin()]) if len(times) else None
+        if nearest is not None and abs(nearest - time) <= NEAR_NS:
+            found[name] = ImageSource(folder / name / f"{nearest}.jpg", nearest)
+    return found

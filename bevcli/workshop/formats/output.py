@@ -1,22 +1,34 @@
-"""OutputFormat: a format that drives are written in, registered under `bevcli.drive_writers`."""
+"""OutputFormat: a format that drives are written in, registered under `bevcli.drive_writers`; native folders."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import csv
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Any, Final, Protocol
 
 import cv2
+import numpy as np
 
 from bevcli.errors import InputError, OutputError
+from bevcli.frame import CameraImage, DriveFacts, Frame, FrameResult, Ground, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig, same_rig
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics
+from bevcli.geometry.transforms import Pose
+from bevcli.parsing.documents import cell_of
 from bevcli.registry import load_form
-from bevcli.sequences.options import WriteOptions
+from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.map_folder import write_map
+from bevcli.sequences.format import true_result_files
+from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
+from bevcli.sequences.native.tables import write_ego_motion
+from bevcli.sequences.options import SequenceOptions, WriteOptions
 from bevcli.writing import remove_parts, whole_folder, write_whole
-
-if TYPE_CHECKING:
-    from bevcli.frame import CameraImage, Frame, Sequence
 
 GROUP: Final = "bevcli.drive_writers"
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
@@ -123,3 +135,136 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     return chosen.opener(path, sequence, options)
+
+
+# The files that the writer creates and `force` removes. Other files in the folder are kept.
+PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
+
+
+class NativeWriter(FolderWriter):
+    """Writes a native sequence folder frame by frame.
+
+        with NativeWriter(folder, with_ego_motion=True) as writer:
+            writer.write(frame)
+
+    Image files are copied byte for byte; images of a video become PNG. ego_motion.csv gets the pose at the time of
+    every frame and image. After an error, what was written is deleted. calibration.json is written last, so that a
+    killed process leaves no valid sequence.
+
+    with_ego_motion: whether the frames have poses. force: replace a sequence in the folder. facts: of the drive.
+    Raises OutputError if the folder exists and `force` is false, or it cannot be written. Raises InputError for a
+    frame with another calibration than the first or a repeated index, and for scenes that overlap in time.
+    """
+
+    def __init__(
+        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
+    ) -> None:
+        super().__init__(folder, (*PARTS, *true_result_files("native")), force=force)
+        self._facts = facts or DriveFacts()
+        self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
+        self._rig: CameraRig | None = None
+        self._numbers: set[int] = set()
+        self._motion: dict[int, tuple[Pose, Kinematics]] = {}
+        self._scenes: dict[str, tuple[int, int]] = {}  # first and last time of each scene, ns
+        self._boxes: BoxesWriter | None = None
+        self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
+        try:
+            table = self.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
+        except OSError as error:
+            raise OutputError(f"{folder / 'frames.csv'}: cannot be written ({error.strerror})") from None
+        self._rows = csv.writer(table, lineterminator="\n")
+
+    def write(self, frame: Frame) -> None:
+        self._check(frame)
+        number = f"{frame.stamp.index:06d}"
+        cells = {name: self._write_image(f"images/{name}/{number}", image) for name, image in frame.images.items()}
+        self._write_row(frame, cells)
+        if self._with_ego_motion:
+            self._store_motion(frame)
+        pose = frame.world_from_ego if self._with_ego_motion else None
+        if frame.ground_truth is not None:
+            self._write_boxes(frame, frame.ground_truth, pose)
+        if frame.ground_truth_map is not None:
+            write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
+        for result in frame.ground_truth_results:
+            self._write_result(Ground(frame.stamp, frame.rig.ego_from_bev, pose), result)
+
+    def _finish(self) -> None:
+        if self._rig is None:
+            raise OutputError(f"{self.folder}: no frame was written (expected at least one)")
+        if self._with_ego_motion:
+            self._check_scenes()
+            write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
+        write_calibration(self.folder / "calibration.json", self._rig, self._facts)
+
+    def _read_back(self) -> None:
+        FolderSequence(self.folder, SequenceOptions(ego_motion="optional"))
+
+    def _check(self, frame: Frame) -> None:
+        stamp = frame.stamp
+        if self._rig is None:
+            self._rig = frame.rig
+            cameras = [cell_of(name) for name in frame.rig.names]
+            times = [f"{name}.timestamp_ns" for name in cameras]
+            self._rows.writerow(["frame", "scene", "timestamp_ns", *cameras, *times])
+        elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
+            raise InputError(
+                f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
+                "sequence has a single calibration: convert scene by scene (`scene`)"
+            )
+        if stamp.index in self._numbers:
+            raise InputError(f"frame {stamp.index} ({stamp.scene}): its index occurred before: renumber the frames")
+        self._numbers.add(stamp.index)
+
+    def _write_row(self, frame: Frame, cells: Mapping[str, str]) -> None:
+        names = frame.rig.names
+        times = [frame.images[name].timestamp_ns if name in cells else "" for name in names]
+        stamp = frame.stamp
+        row = [stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
+        self._rows.writerow(row)
+
+    def _store_motion(self, frame: Frame) -> None:
+        for name, image in frame.images.items():
+            self._motion.setdefault(image.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
+        self._motion[frame.stamp.timestamp_ns] = (frame.world_from_ego, frame.kinematics)
+        times = [frame.stamp.timestamp_ns, *(image.timestamp_ns for image in frame.images.values())]
+        times += self._scenes.get(frame.stamp.scene, ())
+        self._scenes[frame.stamp.scene] = (min(times), max(times))
+
+    def _check_scenes(self) -> None:
+        """Raise InputError if scenes overlap in time: they share one ego_motion.csv."""
+        spans = sorted((first, last, name) for name, (first, last) in self._scenes.items())
+        for (_, end, earlier), (start, _, later) in pairwise(spans):
+            if start <= end:
+                raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (`scene`)")
+
+    def _write_boxes(self, frame: Frame, boxes: Boxes3D, pose: Pose | None) -> None:
+        if self._boxes is None:
+            self._boxes = self.enter_context(BoxesWriter(self.folder / BOXES_FILE, self._reference))
+        extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
+        self._boxes.write(FrameBoxes(frame.stamp, pose, boxes, extras))
+
+    def _write_result(self, ground: Ground, result: FrameResult) -> None:
+        kind = type(result)
+        if kind not in self._results:
+            writer = kind.writer(self.folder / kind.true_file, self._reference, {"classes": list(kind.true_names)})
+            self._results[kind] = self.enter_context(writer)
+        self._results[kind].write(ground, result)
+
+
+def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
+    times = sorted(rows)
+    poses, kinematics = zip(*(rows[time] for time in times), strict=True)
+    return EgoMotion(
+        np.array(times, dtype=np.int64),
+        np.stack([pose.translation for pose in poses]),
+        np.stack([pose.quaternion for pose in poses]),
+        *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
+    )
+
+
+def _native_writer(folder: Path, sequence: Sequence, options: WriteOptions) -> NativeWriter:
+    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
+
+
+NATIVE = OutputFormat("a sequence folder", _native_writer, keeps_maps=True)

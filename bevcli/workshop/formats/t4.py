@@ -1,17 +1,13 @@
 """T4 datasets of TIER IV, as Autoware uses them: nuScenes' tables with additions."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from bevcli.sequences.format import Format
+from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes.index import Dialect
+from bevcli.sequences.nuscenes.sequence import TableSequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 
-if TYPE_CHECKING:
-    from bevcli.frame import Sequence
-
-TABLES = ("scene", "sample", "sample_data")  # any of them makes a folder a T4 dataset
 LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
 # The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
 VISIBILITIES = {"full": 1.0, "most": 0.75, "partial": 0.3, "none": 0.05}
@@ -50,26 +46,12 @@ CLASS_OF_CATEGORY = {
 }
 
 
-def open_t4(path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
+def open_t4(path: Path, common: SequenceOptions, own: FormatOptions) -> TableSequence:
     """The keyframes of a T4 dataset.
 
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
     lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableSequence`.
     """
-    from bevcli.sequences.files.class_names import ClassNames
-    from bevcli.sequences.nuscenes.format import NuScenesOptions
-    from bevcli.sequences.nuscenes.index import Dialect
-    from bevcli.sequences.nuscenes.sequence import TableSequence
-
     names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
     dialect = Dialect(LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, bev_is_lidar=False)
     return TableSequence(path, path / "annotation", common, dialect, NuScenesOptions())
-
-
-FORMAT = Format(
-    name="a T4 dataset",
-    expected="annotation/sample_data.json",
-    recognises=lambda path: any((path / "annotation" / f"{name}.json").exists() for name in TABLES),
-    opener=open_t4,
-    annotated=True,
-)

@@ -29,7 +29,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml, read_yaml
 from bevcli.parsing.files import MIB, decompressed, read_text
 from bevcli.printing import aligned, counted, reason_of
-from bevcli.workshop.formats.ros.format import METADATA, SUFFIXES, is_packed_bag
+from bevcli.workshop.formats import BAG_METADATA, BAG_SUFFIXES, is_packed_bag
 from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, frame_of
 
 if TYPE_CHECKING:
@@ -142,20 +142,20 @@ class Bag:
         """The files in order. Also notes whether rosbag2 compressed single messages."""
         if self.path.is_file():
             return [self.path]
-        found = sorted(file for file in self.path.iterdir() if file.suffix in SUFFIXES)
-        stated = _metadata(self.path / METADATA)
+        found = sorted(file for file in self.path.iterdir() if file.suffix in BAG_SUFFIXES)
+        stated = _metadata(self.path / BAG_METADATA)
         listed = [self.path / Path(name).name for name in stated.get("relative_file_paths", [])]
         mode = str(stated.get("compression_mode", "")).lower()
         packed = sorted(file.name for file in self.path.iterdir() if is_packed_bag(file))
         if packed and not found:
             raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d {packed[0]})")
         self._compression = mode
-        paths = [file for file in listed if file.suffix in SUFFIXES and file.is_file()] or found
+        paths = [file for file in listed if file.suffix in BAG_SUFFIXES and file.is_file()] or found
         if not listed and len({SPLIT_NUMBER.sub("", file.stem) for file in paths}) > 1:
             names = ", ".join(file.name for file in paths[:4])
-            raise InputError(f"{self.path}: has several bags and no {METADATA}: pass one of them ({names})")
+            raise InputError(f"{self.path}: has several bags and no {BAG_METADATA}: pass one of them ({names})")
         if not paths:
-            raise InputError(f"{self.path}: has no .mcap or .db3 file (expected those listed in {METADATA})")
+            raise InputError(f"{self.path}: has no .mcap or .db3 file (expected those listed in {BAG_METADATA})")
         return sorted(paths, key=_number) if not listed else paths
 
 

@@ -37,8 +37,8 @@ from bevcli.sequences.images import (
     decode,
 )
 from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
-from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
 from bevcli.workshop.formats.ros.vehicle import (
     VehicleReader,
