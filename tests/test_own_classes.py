@@ -8,8 +8,8 @@ import pytest
 
 from bevcli.config import as_table, config_of_table, load_config
 from bevcli.errors import ConfigError, InputError
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.evaluate import evaluate
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, are_nuscenes, object_classes

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bevcli.cli.bridge import ExtensionsOf, FormatValues, Json, Part, Steps, argument, as_flags, print_note
-from bevcli.evaluation.options import EvaluationOptions, ExportOptions
-from bevcli.evaluation.scorers import score_options
+from bevcli.evaluation import EvaluationOptions, ExportOptions, score_options
 from bevcli.options import Option
 from bevcli.printing import counted, say
 from bevcli.rig import CheckOptions

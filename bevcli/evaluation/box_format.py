@@ -6,7 +6,7 @@ These are boxes files, CSV tables, and nuScenes submissions for detection (resul
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.options import ExportOptions
+from bevcli.evaluation import ExportOptions
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -63,39 +63,32 @@ class CsvWriter(GrowingFile):
         """resume_at: `size` of an earlier writer of this file, to go on from there. name: for errors."""
         super().__init__(path, resume_at, name)
         if resume_at is None:
-            self._append([dict(zip(COLUMNS, COLUMNS, strict=True))])
+            self.append((",".join(COLUMNS) + "\n").encode())
 
     def write(self, frame: FrameBoxes, frame_of_reference: str) -> int:
         """Adds a row for each box of a frame, and returns their number."""
-        rows = list(_rows(frame, frame_of_reference))
-        self._append(rows)
-        return len(rows)
-
-    def _append(self, rows: list[dict[str, Any]]) -> None:
-        text = io.StringIO()
-        cells = [row | {name: cell_of(row[name]) for name in NAMES if row.get(name)} for row in rows]
-        csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(cells)
+        text, stamp = io.StringIO(), frame.stamp
+        table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        boxes = boxes_to_json(replace(frame.boxes, futures=None))  # a cell has one number
+        for box in boxes:
+            center, size, velocity = box.pop("center"), box.pop("size_lwh"), box.pop("velocity")
+            row = {
+                "frame": stamp.index,
+                "scene": stamp.scene,
+                "timestamp_ns": stamp.timestamp_ns,
+                "frame_of_reference": frame_of_reference,
+                **box,
+                **dict(zip(NUMBERS, (*center, *size, box["yaw"], *velocity), strict=True)),
+            }
+            table.writerow(row | {name: cell_of(row[name]) for name in NAMES if row.get(name)})
         self.append(text.getvalue().encode())
+        return len(boxes)
 
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:
     """Write all boxes in their frame of reference; return their number. Raises OutputError."""
     with whole_file(path) as unfinished, CsvWriter(unfinished, name=path) as writer:
         return sum(writer.write(frame, boxes.frame_of_reference) for frame in boxes.frames)
-
-
-def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]]:
-    stamp = frame.stamp
-    for box in boxes_to_json(replace(frame.boxes, futures=None)):  # a cell has one number
-        center, size, velocity = box.pop("center"), box.pop("size_lwh"), box.pop("velocity")
-        yield {
-            "frame": stamp.index,
-            "scene": stamp.scene,
-            "timestamp_ns": stamp.timestamp_ns,
-            "frame_of_reference": frame_of_reference,
-            **box,
-            **dict(zip(NUMBERS, (*center, *size, box["yaw"], *velocity), strict=True)),
-        }
 
 
 CSV = BoxFormat("boxes.csv", lambda boxes, target, *_: counted(write_csv(boxes, target), "boxes"))

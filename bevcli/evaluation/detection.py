@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, gather, match_class
+from bevcli.evaluation.matching import ERRORS, ClassMatches, DetectionConfig, ScoredBoxes, gather, match_class
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
 

@@ -7,12 +7,13 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from pkgutil import resolve_name
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation import SCORES
 from bevcli.evaluation.detection import DetectionScores, ScoreTable, evaluate_detections
 from bevcli.evaluation.inputs import (
     Compared,
@@ -23,12 +24,13 @@ from bevcli.evaluation.inputs import (
     pair_frames,
     without_cycles_in_racks,
 )
-from bevcli.evaluation.scorers import ResultScores, score_results
+from bevcli.evaluation.matching import ERRORS, DetectionConfig
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
+from bevcli.options import defaults
 from bevcli.printing import aligned, counted
-from bevcli.registry import load
+from bevcli.registry import entries, load
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
@@ -57,6 +59,23 @@ class SegmentationScores:
     def iou(self) -> dict[str, float]:
         """By class, 0 to 1; NaN where neither predictions nor ground truth have the class."""
         return {name: self.intersection[name] / union if union else math.nan for name, union in self.union.items()}
+
+
+class ResultScores(Protocol):
+    """The scores of one kind of results."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed or left out, one line each."""
+        ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """Further members of the JSON object of the scores."""
+        ...
+
+    def tables(self) -> Iterable[str]:
+        """Further tables for a terminal."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -181,6 +200,23 @@ def evaluate(
     if impossible := truth.impossible_boxes:
         notes = (*notes, f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}")
     return Scores(detection, segmentation, others, notes, pairs=pairs)
+
+
+def score_results(values: Mapping[str, bool], compared: Compared) -> dict[str, ResultScores]:
+    """The scores that options ask for, by the name of their scorer. Raises InputError as `Scorer` says.
+
+    values: by option.
+    """
+    scores, unknown = dict[str, ResultScores](), set(values)
+    for name in entries(SCORES) if values else ():
+        scorer = load(SCORES, name)
+        own = {option: values[option] for option in defaults(scorer.options) if option in values}
+        unknown -= own.keys()
+        if any(own.values()):
+            scores[name] = resolve_name(scorer.function)(scorer.options(**own), compared)
+    if unknown:
+        raise TypeError(f"evaluate() has no option `{unknown.pop()}`")
+    return scores
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:

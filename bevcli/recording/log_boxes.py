@@ -12,8 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_greedily
+from bevcli.evaluation.matching import DetectionConfig, ScoredBoxes, descending_scores, match_greedily
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.evaluate import evaluate
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "detection_metrics.json").read_text())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.runs.state import load_state, save_state

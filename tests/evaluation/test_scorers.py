@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from bevcli import registry
 from bevcli.cli.bridge import command
 from bevcli.cli.commands import evaluate as eval_command
+from bevcli.evaluation import Scorer
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.evaluation.scorers import Scorer
 from bevcli.geometry.transforms import Pose
 from bevcli.options import option, options
 from bevcli.registered import OWN

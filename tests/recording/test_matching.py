@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR

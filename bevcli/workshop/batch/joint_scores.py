@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import DetectionScores
 from bevcli.evaluation.evaluate import FrameScores, SegmentationScores
-from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, with_all_columns
+from bevcli.evaluation.matching import ClassMatches, DetectionConfig, ScoredBoxes, with_all_columns
 from bevcli.geometry.boxes import Boxes3D
 
 

@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevcli._version import __version__
-from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.evaluate import OWN_CLASSES
+from bevcli.evaluation.matching import ERRORS, DetectionConfig
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation import ExportOptions
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.options import ExportOptions
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass

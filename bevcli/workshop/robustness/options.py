@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from bevcli.evaluation.options import MAX_RANGE_HELP
+from bevcli.evaluation import MAX_RANGE_HELP
 from bevcli.options import option, options
 
 LostImage = Literal["black", "missing"]

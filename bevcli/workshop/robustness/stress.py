@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import inverse

@@ -1,6 +1,6 @@
 """The nuScenes devkit's scores of tracks, and plots of detection scores."""
 
-from bevcli.evaluation.scorers import Scorer
+from bevcli.evaluation import Scorer
 from bevcli.options import option, options
 
 

@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
 from bevcli.evaluation.evaluate import Scores
 from bevcli.evaluation.inputs import FramePairs
-from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
+from bevcli.evaluation.matching import ERRORS, ClassMatches, ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.writing import whole_file
 

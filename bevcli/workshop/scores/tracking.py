@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import ClassRanges, ranges_m
 from bevcli.evaluation.evaluate import number
 from bevcli.evaluation.inputs import Compared
+from bevcli.evaluation.matching import ClassRanges, ranges_m
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass

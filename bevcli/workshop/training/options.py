@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from bevcli.evaluation.options import MAX_RANGE_HELP
+from bevcli.evaluation import MAX_RANGE_HELP
 from bevcli.inference.options import complete_model
 from bevcli.options import option, options, parse_pairs
 

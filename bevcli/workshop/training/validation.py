@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite
+from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite, score_results
 from bevcli.evaluation.inputs import Compared, FramePairs
-from bevcli.evaluation.scorers import score_results
+from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import MAP_CLASSES, Frame, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass

@@ -1,6 +1,6 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map, lines of the map, forecasts of all objects, and a planned path."""
 
-from bevcli.evaluation.scorers import Scorer
+from bevcli.evaluation import Scorer
 from bevcli.options import option, options
 
 
