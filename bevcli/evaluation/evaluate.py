@@ -13,17 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.evaluation import SCORES
+from bevcli.evaluation import SCORES, inputs
 from bevcli.evaluation.detection import DetectionScores, ScoreTable, evaluate_detections
-from bevcli.evaluation.inputs import (
-    Compared,
-    FramePairs,
-    ScoredInput,
-    open_ground_truth,
-    open_predictions,
-    pair_frames,
-    without_cycles_in_racks,
-)
 from bevcli.evaluation.matching import ERRORS, DetectionConfig
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
@@ -128,7 +119,7 @@ class Scores(FrameScores):
         pairs: the frames that were scored.
     """
 
-    pairs: FramePairs
+    pairs: inputs.FramePairs
 
     def table(self) -> str:
         frames = f"{counted(self.detection.frame_count, 'frames')}, matched by {self.pairs.matched_by}"
@@ -177,18 +168,18 @@ def evaluate(
         ConfigError: max_range is not positive.
         TypeError: `results` has an option that no scorer has.
     """
-    predicted = open_predictions(Path(predictions), class_map)
+    predicted = inputs.open_predictions(Path(predictions), class_map)
     classes = predicted.boxes.classes or NUSCENES_CLASSES
-    truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
-    pairs = pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
-    pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
+    truth = inputs.open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
+    pairs = inputs.pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
+    pairs = inputs.without_cycles_in_racks(pairs, truth.bicycle_racks)
     model_range = _model_range_m(predicted, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     predicted_boxes, true_boxes = pairs.boxes
     detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(predicted, truth, pairs)
-    others = score_results(results, Compared(pairs, classes, limit, predicted, truth))
+    others = score_results(results, inputs.Compared(pairs, classes, limit, predicted, truth))
     notes = (
         *pairs.notes,
         *map_notes,
@@ -202,7 +193,7 @@ def evaluate(
     return Scores(detection, segmentation, others, notes, pairs=pairs)
 
 
-def score_results(values: Mapping[str, bool], compared: Compared) -> dict[str, ResultScores]:
+def score_results(values: Mapping[str, bool], compared: inputs.Compared) -> dict[str, ResultScores]:
     """The scores that options ask for, by the name of their scorer. Raises InputError as `Scorer` says.
 
     values: by option.
@@ -219,7 +210,7 @@ def score_results(values: Mapping[str, bool], compared: Compared) -> dict[str, R
     return scores
 
 
-def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:
+def _range_notes(max_range: float | None, model_range: float | None, pairs: inputs.FramePairs) -> Iterator[str]:
     if max_range is None and not pairs.ego_pose_known:
         yield 'no frame has "world_from_ego": class ranges are not applied (`max_range=M` applies them)'
     if model_range is not None:
@@ -236,7 +227,7 @@ def _with_attributes(frames: Sequence[Boxes3D], classes: Mapping[str, ObjectClas
 
 
 def _score_maps(
-    predictions: ScoredInput, ground_truth: ScoredInput, pairs: FramePairs
+    predictions: inputs.ScoredInput, ground_truth: inputs.ScoredInput, pairs: inputs.FramePairs
 ) -> tuple[SegmentationScores | None, list[str]]:
     """The scores of the maps, and notes about frames that were left out."""
     predicted, true = predictions.maps, ground_truth.maps
@@ -297,7 +288,9 @@ def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[n
     return predicted.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()
 
 
-def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> float | None:
+def _model_range_m(
+    predictions: inputs.ScoredInput, pairs: inputs.FramePairs, classes: Mapping[str, ObjectClass]
+) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
     stated = predictions.boxes.extras.get("range_m")
     farthest = max(kind.range_m for kind in classes.values())

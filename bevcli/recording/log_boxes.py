@@ -31,7 +31,7 @@ from bevcli.recording.colors import (
 from bevcli.recording.components import Components, any_values, components, line_strips, ui_points
 from bevcli.recording.log_cameras import labels_in_scene
 
-MATCH_DISTANCE_M = DetectionConfig().error_distance_m
+MATCH_DISTANCE_M = DetectionConfig.error_distance_m
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = ui_points(0.8), ui_points(1.6)
 PAST_S = 5.0  # length of a trail

@@ -248,7 +248,26 @@ def check_lenses(cameras: Sequence[Camera]) -> list[Finding]:
     findings: list[Finding] = []
     for camera in cameras:
         error = _distortion_error(camera) or _size_error(camera) or _matrix_error(camera)
-        findings += [error] if error else _lens_warnings(camera)
+        if error is not None:
+            findings.append(error)
+            continue
+        fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+        if abs(fx / fy - 1) > SQUARE_PIXELS:
+            message, found = "the pixels are not square", f"fx / fy = {fx / fy:.2f}"
+            advice = "correct only for images that were scaled along one axis"
+            findings.append(Finding("pixels-not-square", "warning", camera.name, message, found, "about 1", advice))
+        center, size = camera.intrinsics[:2, 2], np.array([camera.width, camera.height])
+        if (np.abs(2 * center / size - 1) > 2 * CENTER_TOLERANCE).any():
+            found, expected = f"{center[0]:.0f}, {center[1]:.0f}", f"about {size[0] / 2:.0f}, {size[1] / 2:.0f}"
+            message, advice = "the principal point is far from the image centre", "correct only for cropped images"
+            findings.append(Finding("principal-point", "warning", camera.name, message, found, expected, advice))
+        if camera.distortion is None and seen_fov_deg(camera)[0] > WIDE_PINHOLE_DEG:
+            found, message = (
+                f"{seen_fov_deg(camera)[0]:.0f}°",
+                "the field of view is wide, but there is no lens distortion",
+            )
+            advice = "add the lens model, or undistort the images"
+            findings.append(Finding("distortion-missing", "warning", camera.name, message, found, advice=advice))
     return findings
 
 
@@ -334,25 +353,6 @@ def _matrix_error(camera: Camera) -> Finding | None:
     message, found = "the principal point is far outside of the image", f"{center[0]:.0f}, {center[1]:.0f}"
     expected = f"about {camera.width / 2:.0f}, {camera.height / 2:.0f}"
     return Finding("principal-point", "error", camera.name, message, found, expected, advice)
-
-
-def _lens_warnings(camera: Camera) -> list[Finding]:
-    warnings = []
-    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
-    if abs(fx / fy - 1) > SQUARE_PIXELS:
-        message, found = "the pixels are not square", f"fx / fy = {fx / fy:.2f}"
-        advice = "correct only for images that were scaled along one axis"
-        warnings.append(Finding("pixels-not-square", "warning", camera.name, message, found, "about 1", advice))
-    center, size = camera.intrinsics[:2, 2], np.array([camera.width, camera.height])
-    if (np.abs(2 * center / size - 1) > 2 * CENTER_TOLERANCE).any():
-        found, expected = f"{center[0]:.0f}, {center[1]:.0f}", f"about {size[0] / 2:.0f}, {size[1] / 2:.0f}"
-        message, advice = "the principal point is far from the image centre", "correct only for cropped images"
-        warnings.append(Finding("principal-point", "warning", camera.name, message, found, expected, advice))
-    if camera.distortion is None and seen_fov_deg(camera)[0] > WIDE_PINHOLE_DEG:
-        found, message = f"{seen_fov_deg(camera)[0]:.0f}°", "the field of view is wide, but there is no lens distortion"
-        advice = "add the lens model, or undistort the images"
-        warnings.append(Finding("distortion-missing", "warning", camera.name, message, found, advice=advice))
-    return warnings
 
 
 BEV_HEIGHT_M = 1.84  # of LIDAR_TOP in nuScenes

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -75,8 +75,9 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     found_before: from reading the file. Consequences of a reported error are suppressed: a camera with an error from
     reading is not checked again, and names are compared only for cameras with plausible poses.
     """
-    wrong, poses, swapped, bev = errors_of(found_before), list[Finding](), list[Finding](), list[Finding]()
-    cameras = _without_errors(rig.cameras, wrong)
+    poses, swapped, bev = list[Finding](), list[Finding](), list[Finding]()
+    wrong = {finding.camera for finding in errors_of(found_before)}
+    cameras = [camera for camera in rig.cameras if camera.name not in wrong]
     if any(map(rig_checks.pose_defects, cameras)):
         from bevcli.rig import mistakes  # which few rigs need
 
@@ -87,8 +88,9 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
             for finding in rig_checks.check_names(mistakes.corrected(cameras))
             if finding.code == "swapped-names"
         ]
-    names = rig_checks.check_names(_without_errors(cameras, poses))
-    if all(finding.camera is not None for finding in wrong):
+    badly_posed = {finding.camera for finding in poses}
+    names = rig_checks.check_names([camera for camera in cameras if camera.name not in badly_posed])
+    if None not in wrong:
         if rig_checks.is_plausible_bev_frame(rig.ego_from_bev):
             bev = rig_checks.bev_warnings(rig.ego_from_bev)
         else:
@@ -98,11 +100,6 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     if rig.ego_from_bev_assumed:
         bev.append(BEV_ASSUMED)
     return [*found_before, *_merged([*poses, *rig_checks.check_lenses(cameras)], cameras), *names, *swapped, *bev]
-
-
-def _without_errors(cameras: Sequence[Camera], errors: Iterable[Finding]) -> tuple[Camera, ...]:
-    wrong = {finding.camera for finding in errors}
-    return tuple(camera for camera in cameras if camera.name not in wrong)
 
 
 def _merged(findings: Sequence[Finding], cameras: Sequence[Camera]) -> list[Finding]:
@@ -132,25 +129,23 @@ class _Drive:
     distance_m: float  # distance driven, steps below the moving speed left out
     headings_deg: Array  # (M,), direction of each step with motion, counter-clockwise from ego x; empty: a short drive
     tilt_deg: float  # median angle between z of the ego frame and z of the world frame
+    is_plausible: bool  # the vehicle is level, not too fast, and drives forward in most steps
 
     @classmethod
     def of(cls, ego_motion: EgoMotion) -> _Drive:
         """The poses of ego-motion."""
         rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
         steps, seconds = np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9
-        speeds = np.linalg.norm(steps, axis=1) / seconds
-        distance_m = float(np.linalg.norm(steps, axis=1)[speeds > MIN_MOVING_SPEED].sum())
+        distances = np.linalg.norm(steps, axis=1)
+        speeds = distances / seconds
+        distance_m = float(distances[speeds > MIN_MOVING_SPEED].sum())
         moving = (speeds > MIN_MOVING_SPEED) & (distance_m >= MIN_DISTANCE_M)
         ego_steps = np.einsum("tji,tj->ti", rotations[:-1], steps)[moving]
         headings_deg = np.degrees(np.arctan2(ego_steps[:, 1], ego_steps[:, 0]))
         tilt_deg = float(np.degrees(np.median(np.arccos(np.clip(rotations[:, 2, 2], -1, 1)))))
-        return cls(rotations, steps, seconds, speeds, distance_m, headings_deg, tilt_deg)
-
-    def is_plausible(self) -> bool:
-        """True if the vehicle is level, not too fast, and drives forward in most steps."""
-        headings = self.headings_deg
-        ahead = len(headings) == 0 or (np.abs(headings) <= FORWARD_DEG).mean() >= MOST_STEPS
-        return bool(self.tilt_deg <= MAX_TILT_DEG and np.median(self.speeds) <= MAX_SPEED and ahead)
+        ahead = len(headings_deg) == 0 or (np.abs(headings_deg) <= FORWARD_DEG).mean() >= MOST_STEPS
+        is_plausible = bool(tilt_deg <= MAX_TILT_DEG and np.median(speeds) <= MAX_SPEED and ahead)
+        return cls(rotations, steps, seconds, speeds, distance_m, headings_deg, tilt_deg, is_plausible)
 
 
 def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
@@ -158,13 +153,21 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     if len(ego_motion.timestamps_ns) < 2:
         return ()
     drive = _Drive.of(ego_motion)
-    cause = None if drive.is_plausible() else _mistake(drive, ego_motion) or _units(drive)
+    cause = None if drive.is_plausible else _mistake(drive, ego_motion) or _units(drive)
     if cause is not None:
         return (cause,)
-    findings = tuple(filter(None, (_jump(drive, ego_motion), _direction(drive))))
-    if findings or not ego_motion.velocities_are_stated:
-        return findings
-    return tuple(filter(None, (_stated_speed(drive, ego_motion),)))
+    findings, speeds = [], drive.speeds
+    jumps = np.flatnonzero((speeds > MAX_SPEED) & (speeds > JUMP_FACTOR * np.median(speeds)))
+    if len(jumps):
+        first = int(jumps[0])
+        found = f"{len(jumps)} of {len(speeds)} steps; {np.linalg.norm(drive.steps[first]):.1f} m in "
+        found += f"{drive.seconds[first]:.2f} s at {int(ego_motion.timestamps_ns[first + 1])} ns"
+        message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
+        findings.append(rig_error("ego-jump", message, found, f"at most {MAX_SPEED:g} m/s", advice))
+    findings += _direction(drive)
+    if not findings and ego_motion.velocities_are_stated:
+        findings += _stated_speed(drive, ego_motion)
+    return tuple(findings)
 
 
 def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[Finding, ...]:
@@ -195,18 +198,6 @@ def _units(drive: _Drive) -> Finding | None:
     return rig_error("ego-units", message, found, expected, advice)
 
 
-def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
-    speeds = drive.speeds
-    jumps = np.flatnonzero((speeds > MAX_SPEED) & (speeds > JUMP_FACTOR * np.median(speeds)))
-    if len(jumps) == 0:
-        return None
-    first = int(jumps[0])
-    found = f"{len(jumps)} of {len(speeds)} steps; {np.linalg.norm(drive.steps[first]):.1f} m in "
-    found += f"{drive.seconds[first]:.2f} s at {int(ego_motion.timestamps_ns[first + 1])} ns"
-    message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
-    return rig_error("ego-jump", message, found, f"at most {MAX_SPEED:g} m/s", advice)
-
-
 def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
     """The common mistake whose undoing gives a plausible drive."""
     quaternions = ego_motion.quaternions
@@ -218,28 +209,28 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
         (("ego-inverted", "the poses are ego_from_world, the inverse", "invert them"),
          replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
     ):  # fmt: skip
-        if _Drive.of(undone).is_plausible():
+        if _Drive.of(undone).is_plausible:
             return rig_error(code, message, _motion_text(drive), "level, driving forward", advice)
     return None
 
 
-def _direction(drive: _Drive) -> Finding | None:
+def _direction(drive: _Drive) -> list[Finding]:
     """A tilted ego frame, or driving sideways or backwards in most steps."""
     if drive.tilt_deg > MAX_TILT_DEG:
         advice = "z of the ego frame and of the world frame point up: check the axes"
-        return rig_error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)
+        return [rig_error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)]
     headings = drive.headings_deg
     if len(headings) == 0:
-        return None
+        return []
     ahead = float((np.abs(headings) <= FORWARD_DEG).mean())
     back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean())
     if back >= MOST_STEPS:
         advice = "x of the ego frame is forward: rotate the poses by 180° about z, unless the whole drive is in reverse"
-        return rig_error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)
+        return [rig_error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)]
     if 1 - ahead - back >= MOST_STEPS:
         advice = "the ego frame is x forward, y left: rotate the poses into it"
-        return rig_error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)
-    return None
+        return [rig_error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)]
+    return []
 
 
 def _motion_text(drive: _Drive) -> str:
@@ -250,18 +241,18 @@ def _motion_text(drive: _Drive) -> str:
     return f"moves {middle:.0f}° from forward over {drive.distance_m:.0f} m, {tilt}"
 
 
-def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
+def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> list[Finding]:
     """Velocities in the file that do not fit the distance between its poses."""
     moving = drive.speeds > MIN_MOVING_SPEED
     if not moving.any():
-        return None
+        return []
     stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
     ratio = float(np.median(stated / drive.speeds[moving]))
     if 1 / SPEED_FACTOR <= ratio <= SPEED_FACTOR:
-        return None
+        return []
     found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(drive.speeds[moving]):.1f} m/s"
     message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
-    return rig_error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)
+    return [rig_error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)]
 
 
 def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | None]) -> Finding | None:

@@ -49,9 +49,9 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.label_formats": {
         "csv": "bevcli.workshop.formats.labels:CSV",
-        "cvat": "bevcli.workshop.formats.cuboids:CVAT",
+        "cvat": "bevcli.workshop.formats.kitti:CVAT",
         "kitti": "bevcli.workshop.formats.kitti:LABELS",
-        "kitti-raw": "bevcli.workshop.formats.cuboids:TRACKLETS",
+        "kitti-raw": "bevcli.workshop.formats.kitti:TRACKLETS",
     },
     "bevcli.scores": {
         "tracking": "bevcli.workshop.scores:SCORER",

@@ -8,6 +8,7 @@ from statistics import median
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import number
@@ -18,17 +19,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import aligned
-from bevcli.workshop.scores.association import (
-    MATCH,
-    MISS,
-    SWITCH,
-    Association,
-    Indices,
-    TrackedBoxes,
-    associate,
-    near_pairs,
-    scored_tracks,
-)
+from bevcli.workshop.scores.association import MATCH, MISS, SWITCH, TrackedBoxes, associate, near_pairs, scored_tracks
 
 
 @dataclass(frozen=True)
@@ -117,22 +108,20 @@ def score_class(truth: TrackedBoxes, predictions: TrackedBoxes, config: Tracking
     thresholds = np.interp(recalls, np.arange(1, len(scores) + 1) / len(truth), scores, right=np.nan)[::-1]
     levels["confidence"], levels["recall_hypo"] = thresholds, recalls[::-1]
     for threshold in np.unique(thresholds[~np.isnan(thresholds)]):
-        metrics = metrics_at(truth, predictions, associate(truth, predictions, pairs, threshold), threshold, config)
-        for name, value in metrics.items():
+        kept, matches = predictions[predictions.scores >= threshold], associate(truth, predictions, pairs, threshold)
+        for name, value in _metrics(truth, kept, matches.kinds, matches.distances, config).items():
             levels[name][thresholds == threshold] = value
     return ClassTracking(_overall(truth, levels), levels)
 
 
-def metrics_at(
-    truth: TrackedBoxes,
-    predictions: TrackedBoxes,
-    association: Association,
-    threshold: float,
-    config: TrackingConfig,
+def _metrics(
+    truth: TrackedBoxes, kept: TrackedBoxes, kinds: NDArray[np.int8], distances: Array, config: TrackingConfig
 ) -> dict[str, float]:
-    """The metrics at one score threshold, by the names of WORST. At least one ground-truth box is needed."""
-    kept = predictions[predictions.scores >= threshold]
-    counts = np.bincount(association.kinds, minlength=3)
+    """The metrics at one score threshold, by the names of WORST. At least one ground-truth box is needed.
+
+    kept: the predictions above the threshold. kinds, distances: (G,) of the association of the ground truth.
+    """
+    counts = np.bincount(kinds, minlength=3)
     fn, tp, ids = int(counts[MISS]), int(counts[MATCH]), int(counts[SWITCH])
     fp = len(kept) - tp - ids
     gt = len(truth)
@@ -144,18 +133,18 @@ def metrics_at(
         "motar": motar,
         "gt": gt,
         "mota": max(0.0, 1 - (fn + ids + fp) / gt),
-        "motp": float(np.nanmean(association.distances)) if tp + ids else np.nan,
+        "motp": float(np.nanmean(distances)) if tp + ids else np.nan,
         "faf": 100 * fp / len(counted),
         "tp": tp,
         "fp": fp,
         "fn": fn,
         "ids": ids,
-        **_over_objects(truth, association.kinds != MISS, counted, config),
+        **_over_objects(truth, kinds != MISS, counted, config),
     }
 
 
 def _over_objects(
-    truth: TrackedBoxes, matched: Indices | np.ndarray, counted: Indices, config: TrackingConfig
+    truth: TrackedBoxes, matched: NDArray[np.bool_], counted: NDArray[np.int64], config: TrackingConfig
 ) -> dict[str, float]:
     """The metrics that look at each object's whole way: mt, ml, frag, tid and lgd.
 

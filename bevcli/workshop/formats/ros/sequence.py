@@ -24,27 +24,13 @@ from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.parsing.files import is_there
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.printing import one_line
+from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
-from bevcli.sequences.images import (
-    MOST_PIXELS,
-    FrameEntry,
-    ListedSequence,
-    MessageSource,
-    Source,
-    UnreadableImage,
-    VideoReader,
-    bev_frame_notes,
-    decode,
-)
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
-from bevcli.workshop.formats.ros.vehicle import (
-    VehicleReader,
-    capture_times,
-    find_geo_origin,
-)
+from bevcli.workshop.formats.ros.vehicle import VehicleReader, capture_times, find_geo_origin
 
 # Encoding -> channels, bytes a channel, conversion to BGR. ROS names the top left 2x2 pixels of a Bayer pattern.
 RAW_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
@@ -75,11 +61,11 @@ SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the f
 EGO_MOTION_FILE = "ego_motion.csv"
 
 
-def bag_image(bag: Bag, topic: str, numbers: NDArray[np.int64], index: int, time_ns: int) -> MessageSource:
+def bag_image(bag: Bag, topic: str, numbers: NDArray[np.int64], index: int, time_ns: int) -> images.MessageSource:
     """Image `index` of a topic, read on demand. numbers: (N,) of its messages in order of capture. time_ns: roughly."""
     number = int(numbers[index])
     name = f"{bag.path}: {topic}: message {number}"
-    return MessageSource(name, time_ns, lambda: _read_message(bag, topic, number, time_ns, name))
+    return images.MessageSource(name, time_ns, lambda: _read_message(bag, topic, number, time_ns, name))
 
 
 def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> CameraImage:
@@ -90,7 +76,7 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
     try:
         message = bag.message(topic, index)
     except InputError as error:
-        raise UnreadableImage(str(error)) from None
+        raise images.UnreadableImage(str(error)) from None
     time, data = timestamp_ns(message) or time_ns, payload(message)
     if hasattr(message, "encoding"):
         return CameraImage(time, _raw_pixels(message, data, name))
@@ -102,7 +88,7 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
             "TIFF or BMP, or video as foxglove.CompressedVideo): write the topic in one of these"
         )
     if pixels is None:
-        raise UnreadableImage(f"{name} is not a complete image")
+        raise images.UnreadableImage(f"{name} is not a complete image")
     media_type = media_type_of(data) if is_as_stored else None
     return CameraImage(time, pixels, data if media_type else None, media_type)
 
@@ -115,11 +101,11 @@ def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
     """
     before, _, after = stated.partition("compressed")
     encoding = after.strip() or before.partition(";")[0]
-    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, MOST_PIXELS) if BAYER.fullmatch(encoding) else None
+    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, images.MOST_PIXELS) if BAYER.fullmatch(encoding) else None
     if pixels is not None and pixels.ndim == 2:
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         return cv2.cvtColor(pixels, RAW_ENCODINGS[encoding][2] or 0).astype(np.uint8, copy=False), False
-    pixels = decode(data)
+    pixels = images.decode(data)
     if pixels is None or not (after.strip() and encoding.startswith("rgb")):
         return pixels, True
     return pixels[..., ::-1].copy(), False
@@ -141,7 +127,7 @@ def _raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
     row_bytes = width * channels * depth
     step = int(message.step) or row_bytes
     if len(data) < step * height or step < row_bytes:
-        raise UnreadableImage(f"{where} is not a complete image")
+        raise images.UnreadableImage(f"{where} is not a complete image")
     rows = np.frombuffer(data, dtype=np.uint8, count=step * height).reshape(height, step)[:, :row_bytes]
     pixels = np.ascontiguousarray(rows)
     if depth == 2:
@@ -166,13 +152,13 @@ class BagVideo:
             raise InputError(f"{bag.path}: {topic}: video format {self._format} is not supported (expected {expected})")
         self._folder = tempfile.TemporaryDirectory(prefix="bevcli-video-")
         self._group: range = range(0)  # messages of the group of pictures that is open
-        self._reader: VideoReader | None = None
+        self._reader: images.VideoReader | None = None
         self._lock = threading.Lock()
 
-    def image(self, index: int, time_ns: int) -> MessageSource:
+    def image(self, index: int, time_ns: int) -> images.MessageSource:
         """The source of image `index`. time_ns: according to the index of the bag."""
         name = f"{self._bag.path}: {self._topic}: message {self._numbers[index]}"
-        return MessageSource(name, time_ns, lambda: self.read(index, time_ns))
+        return images.MessageSource(name, time_ns, lambda: self.read(index, time_ns))
 
     def read(self, index: int, time_ns: int) -> CameraImage:
         """Image `index`. Raises UnreadableImage if it cannot be decoded."""
@@ -184,7 +170,7 @@ class BagVideo:
                 pixels = self._reader.read(index - self._group.start)
                 time = timestamp_ns(self._bag.message(self._topic, self._numbers[index])) or time_ns
             except InputError as error:
-                raise UnreadableImage(f"{self._topic}: image {index} cannot be decoded ({error})") from None
+                raise images.UnreadableImage(f"{self._topic}: image {index} cannot be decoded ({error})") from None
         return CameraImage(time, pixels)
 
     def _open_group(self, index: int) -> None:
@@ -200,7 +186,7 @@ class BagVideo:
         path.write_bytes(b"".join(self._packet(number) for number in range(start, stop)))
         if self._reader is not None:
             self._reader.path.unlink(missing_ok=True)
-        self._reader, self._group = VideoReader(path), range(start, stop)
+        self._reader, self._group = images.VideoReader(path), range(start, stop)
 
     def _packet(self, index: int) -> bytes:
         return payload(self._bag.message(self._topic, self._numbers[index]))
@@ -214,7 +200,7 @@ def _is_keyframe(packet: bytes, video_format: str) -> bool:
     return any(head >> 1 & 0x3F in (32, 33) for head in heads)
 
 
-def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> ListedSequence:
+def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.ListedSequence:
     """A bag as a `Sequence`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
@@ -243,12 +229,12 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> ListedSequ
         *beside,
         *reader.notes,
         *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
-        *bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
+        *images.bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
         *motion_notes,
         *gaps,
     )
     anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
-    sequence = ListedSequence(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
+    sequence = images.ListedSequence(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
     sequence.facts = replace(facts, geo_origin=geo_origin)
     if path.is_file():
         sequence.name = path.resolve().stem
@@ -270,7 +256,7 @@ def _files_beside(
     return found if rig is None else rig, facts, file, notes
 
 
-def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
+def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameEntry, ...]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     captured = capture_times(bag, [camera.images for camera in cameras])
     times = {camera.camera: captured[camera.images][0] for camera in cameras}
@@ -278,18 +264,18 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
     periods = {n: float(np.median(np.diff(own))) if len(own) > 1 else 1e9 for n, own in times.items()}
     slowest = max(periods.values())
     leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
-    makers: dict[str, Callable[[int, int], Source]] = {
+    makers: dict[str, Callable[[int, int], images.Source]] = {
         camera.camera: BagVideo(bag, camera.images, captured[camera.images][1]).image
         if camera.is_video
         else partial(bag_image, bag, camera.images, captured[camera.images][1])
         for camera in cameras
     }
     topics = {camera.camera: camera.images for camera in cameras}
-    entries: list[FrameEntry] = []
+    entries: list[images.FrameEntry] = []
     for place, time in enumerate(times[leading].tolist()):
         if entries and time <= entries[-1].stamp.timestamp_ns:
             continue  # a message that was recorded twice
-        sources: dict[str, Source] = {}
+        sources: dict[str, images.Source] = {}
         dropped = {}
         for name, own in times.items():
             index = place if name == leading else _nearest(own, time)
@@ -298,13 +284,13 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
             else:
                 sources[name] = makers[name](index, int(own[index]))
         origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][place]}"
-        entries.append(FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
+        entries.append(images.FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
     return tuple(entries)
 
 
 def _covered(
-    entries: tuple[FrameEntry, ...], motion: EgoMotion | None, path: Path
-) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    entries: tuple[images.FrameEntry, ...], motion: EgoMotion | None, path: Path
+) -> tuple[tuple[images.FrameEntry, ...], tuple[str, ...]]:
     """The frames with poses around all of their images, and notes. Localisation often starts later than the cameras."""
     if motion is None:
         return entries, ()
