@@ -7,7 +7,7 @@ Input:
 
 Metrics; they read no files:
     detection           boxes of many frames -> AP, mAP, true-positive errors, NDS
-    matching            parameters of the score, boxes of many frames as one array, and their greedy matching
+    matching            parameters of the score, and greedy matching of boxes
 
 Output:
     box_format          formats that boxes are exported in; nuScenes submissions are read too

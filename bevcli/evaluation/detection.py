@@ -4,17 +4,99 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.evaluation.matching import ERRORS, ClassMatches, DetectionConfig, ScoredBoxes, gather, match_class
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.evaluation.matching import ERRORS, DetectionConfig, ScoredBoxes, descending_scores, match_greedily
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
 
 RECALLS = np.linspace(0, 1, 101)
+
+
+def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
+    """The boxes of F frames as one array.
+
+    ego_xy: (F, 2), the ego vehicle's position in the frame of reference of each frame's boxes, metres.
+    """
+    indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
+    boxes = with_all_columns(Boxes3D.concatenate(map(with_all_columns, frames)))
+    ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)
+    return ScoredBoxes(boxes, indices, ranges)
+
+
+def with_all_columns(boxes: Boxes3D) -> Boxes3D:
+    """The boxes with all optional columns but futures."""
+    missing: dict[str, Any] = {
+        name: np.full(len(boxes), column.unknown)
+        for name, column in OPTIONAL_COLUMNS.items()
+        if getattr(boxes, name) is None
+    }
+    return replace(boxes, futures=None, future_scores=None, **missing)
+
+
+@dataclass(frozen=True)
+class ClassMatches:
+    """The matching of one class: G ground truths and P predictions at D matching distances.
+
+    Attributes:
+        name: of the class.
+        ground_truth: G boxes.
+        predictions: P boxes, sorted by descending score.
+        matched: (D, P), the index of the ground truth that each prediction matches, -1 for a false positive.
+        truth_counts: (G,), bool, the ground truths that are scored.
+        counts: (D, P), bool, the predictions that are scored.
+    """
+
+    name: str
+    ground_truth: ScoredBoxes
+    predictions: ScoredBoxes
+    matched: NDArray[np.int64]
+    truth_counts: NDArray[np.bool_]
+    counts: NDArray[np.bool_]
+
+    def within(self, low_m: float, high_m: float) -> ClassMatches:
+        """The same matching, scored only from low_m to below high_m from the ego vehicle.
+
+        A true positive counts where its ground truth is, a false positive where it is itself, so that no pair is split.
+        """
+        sides = (self.ground_truth, self.predictions)
+        return self._scored(*((side.ranges_m >= low_m) & (side.ranges_m < high_m) for side in sides))
+
+    def visible(self, low: float, high: float) -> ClassMatches:
+        """The same matching, scored only for ground truth with a visibility from low to below high, or up to 1.
+
+        A false positive has no visibility and counts nowhere.
+        """
+        visibility = self.ground_truth.column("visibilities")
+        inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
+        return self._scored(inside, np.zeros(len(self.predictions), dtype=bool))
+
+    def _scored(self, truths: NDArray[np.bool_], false_positives: NDArray[np.bool_]) -> ClassMatches:
+        """The same matching, scored only for these ground truths and false positives.
+
+        truths: (G,). false_positives: (P,), which predictions count where they match nothing.
+        """
+        counts = np.broadcast_to(false_positives, self.matched.shape).copy()
+        is_match = self.matched >= 0
+        counts[is_match] = truths[self.matched[is_match]]
+        return replace(self, truth_counts=truths, counts=counts)
+
+
+def match_class(
+    name: str, ground_truth: ScoredBoxes, predictions: ScoredBoxes, config: DetectionConfig
+) -> ClassMatches:
+    """Match the boxes of one class that are inside the range of the class."""
+    limit = config.class_ranges_m[name]
+    truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
+    predicted = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
+    predicted = predicted[descending_scores(predicted.column("scores"))]
+    matched = match_greedily(truth, predicted, config.distances_m)
+    return ClassMatches(name, truth, predicted, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Diagnosis of a calibration: what is wrong with a camera rig, and drawings that show it. `CheckOptions`.
 
-check_calibration    reads a calibration or a sequence, runs all checks; the result is written, printed, or used
+check_calibration    reads a calibration or a sequence, runs all checks, also of times; the result is written or used
 rig_report           coverage of the BEV grid, the rig next to nuScenes', and the terminal's text
-sequence_checks      all checks of a sequence: the rig in their order, ego-motion, times of images; those before a run
+sequence_checks      all checks of a sequence: the rig in their order, and ego-motion; those before a run
 rig_checks           mounting, names and lenses of cameras; the bev frame
 mistakes             units, inverted transforms, quaternion order, axes: explanations of implausible poses
 drawings             cameras.png, coverage.png and recording.rrd

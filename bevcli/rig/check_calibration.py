@@ -1,8 +1,11 @@
-"""`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
+"""`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found.
+
+The times of the images are checked here.
+"""
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.parsing.files import is_there
 from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, with_findings
-from bevcli.rig.sequence_checks import check_camera_times, check_scenes
+from bevcli.rig.sequence_checks import check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native.folder import FolderSequence
@@ -25,6 +28,10 @@ from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.writing import write_whole
+
+OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
+OFFSET_ERROR_S = 0.5
+JITTER_WARNING_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -195,3 +202,29 @@ def _missing_images(frame: Frame) -> tuple[Finding, ...]:
 
 def _pixels(frame: Frame) -> dict[str, NDArray[np.uint8]]:
     return {name: image.pixels_bgr for name, image in frame.images.items()}
+
+
+def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence[int | None]]) -> tuple[Finding, ...]:
+    """Findings about the timestamps of images, at most one a camera.
+
+    frame_ns: F frame timestamps, nanoseconds. camera_ns: by camera, the timestamps of its F images; None without image.
+    An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
+    """
+    return tuple(filter(None, (_check_times_of(name, frame_ns, times) for name, times in camera_ns.items())))
+
+
+def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | None]) -> Finding | None:
+    offsets = np.array([time - frame for time, frame in zip(times, frame_ns, strict=True) if time is not None]) / 1e9
+    if len(offsets) == 0:
+        message = "has no image in any frame"
+        return Finding("camera-without-images", "warning", name, message, "0", f"{len(times)}", "check its image paths")
+    offset, jitter = float(np.median(offsets)), float(np.std(offsets))
+    found = f"{offset * 1e3:+.0f} ms, standard deviation {jitter * 1e3:.0f} ms"
+    advice = "give the timestamp of each image, or assign this camera's images to other frames"
+    if abs(offset) > OFFSET_ERROR_S:
+        message, expected = "its images are far from the frame timestamps", f"within {OFFSET_ERROR_S * 1e3:g} ms"
+        return Finding("time-offset", "error", name, message, found, expected, advice)
+    if abs(offset) > OFFSET_WARNING_S or jitter > JITTER_WARNING_S:
+        message, expected = "its images deviate from the frame timestamps", f"within {OFFSET_WARNING_S * 1e3:g} ms"
+        return Finding("time-offset", "warning", name, message, found, expected, advice)
+    return None

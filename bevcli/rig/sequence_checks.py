@@ -1,11 +1,11 @@
-"""All checks of a sequence: its rig, in their order, ego-motion (units, jumps, axes) and times of the images.
+"""All checks of a sequence: its rig, in their order, and ego-motion (units, jumps, axes).
 
 `CheckedDrive` runs the cheap ones before a run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -31,9 +31,6 @@ FORWARD_DEG = 45.0
 MOST_STEPS = 0.8  # share of the steps that counts as the whole drive
 MIN_DISTANCE_M = 5.0  # on shorter drives the direction of motion is not checked
 JUMP_FACTOR = 5.0  # a step this much faster than the median is a jump
-OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
-OFFSET_ERROR_S = 0.5
-JITTER_WARNING_S = 0.05
 CHECKED_POSES = 5000  # before a run: of a longer drive, every second, third, … pose is checked
 
 
@@ -178,15 +175,6 @@ def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[F
     return tuple(f for part in rows if len(part) > 1 for f in check_ego_motion(ego_motion.of_rows(part)))
 
 
-def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence[int | None]]) -> tuple[Finding, ...]:
-    """Findings about the timestamps of images, at most one a camera.
-
-    frame_ns: F frame timestamps, nanoseconds. camera_ns: by camera, the timestamps of its F images; None without image.
-    An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
-    """
-    return tuple(filter(None, (_check_times_of(name, frame_ns, times) for name, times in camera_ns.items())))
-
-
 def _units(drive: _Drive) -> Finding | None:
     """Translations in millimetres or timestamps in another unit than nanoseconds make every step too fast."""
     median = float(np.median(drive.speeds))
@@ -253,20 +241,3 @@ def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> list[Finding]:
     found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(drive.speeds[moving]):.1f} m/s"
     message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
     return [rig_error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)]
-
-
-def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | None]) -> Finding | None:
-    offsets = np.array([time - frame for time, frame in zip(times, frame_ns, strict=True) if time is not None]) / 1e9
-    if len(offsets) == 0:
-        message = "has no image in any frame"
-        return Finding("camera-without-images", "warning", name, message, "0", f"{len(times)}", "check its image paths")
-    offset, jitter = float(np.median(offsets)), float(np.std(offsets))
-    found = f"{offset * 1e3:+.0f} ms, standard deviation {jitter * 1e3:.0f} ms"
-    advice = "give the timestamp of each image, or assign this camera's images to other frames"
-    if abs(offset) > OFFSET_ERROR_S:
-        message, expected = "its images are far from the frame timestamps", f"within {OFFSET_ERROR_S * 1e3:g} ms"
-        return Finding("time-offset", "error", name, message, found, expected, advice)
-    if abs(offset) > OFFSET_WARNING_S or jitter > JITTER_WARNING_S:
-        message, expected = "its images deviate from the frame timestamps", f"within {OFFSET_WARNING_S * 1e3:g} ms"
-        return Finding("time-offset", "warning", name, message, found, expected, advice)
-    return None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.detection import DetectionScores, evaluate_detections
-from bevcli.evaluation.matching import DetectionConfig, descending_scores, gather, match_greedily
+from bevcli.evaluation.detection import DetectionScores, evaluate_detections, gather
+from bevcli.evaluation.matching import DetectionConfig, descending_scores, match_greedily
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid, rotation_about_z
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from mistakes import MOTION_MISTAKES, drive, motion_of
 
-from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
+from bevcli.rig.check_calibration import check_camera_times
+from bevcli.rig.sequence_checks import check_ego_motion
 from bevcli.sequences.native.tables import read_ego_motion
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevcli.evaluation.detection import DetectionScores
+from bevcli.evaluation.detection import ClassMatches, DetectionScores, with_all_columns
 from bevcli.evaluation.evaluate import FrameScores, SegmentationScores
-from bevcli.evaluation.matching import ClassMatches, DetectionConfig, ScoredBoxes, with_all_columns
+from bevcli.evaluation.matching import DetectionConfig, ScoredBoxes
 from bevcli.geometry.boxes import Boxes3D
 
 

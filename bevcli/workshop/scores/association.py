@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from bevcli.errors import InputError
-from bevcli.evaluation.matching import gather
+from bevcli.evaluation.detection import gather
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.detection import RECALLS, ClassMatches, ClassScores, DetectionScores
 from bevcli.evaluation.evaluate import Scores
 from bevcli.evaluation.inputs import FramePairs
-from bevcli.evaluation.matching import ERRORS, ClassMatches, ScoredBoxes
+from bevcli.evaluation.matching import ERRORS, ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.writing import whole_file
 
