@@ -29,7 +29,7 @@ from bevcli.writing import whole_file
 COLUMNS = ("frame", "scene", "timestamp_ns", "frame_of_reference", *TABLE_COLUMNS)
 NAMES = ("scene", "class", *(column.key for column in OPTIONAL_COLUMNS.values() if column.values == "text"))
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
-TRACKED = tuple(name for name, one in NUSCENES_CLASSES.items() if one.tracked)
+TRACKED = tuple(name for name, kind in NUSCENES_CLASSES.items() if kind.tracked)
 # The keys that the submissions for a task do not share, and the columns of `Boxes3D` that they hold.
 DETECTION_COLUMNS = {"detection_name": "classes", "detection_score": "scores", "attribute_name": "attributes"}
 TRACKING_COLUMNS = {"tracking_id": "instances", "tracking_name": "classes", "tracking_score": "track_scores"}

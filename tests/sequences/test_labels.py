@@ -19,7 +19,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
-from bevcli.workshop.formats.labels import WithLabels, _labelled_places, read_labels
+from bevcli.workshop.formats.labels import WithLabels, _labelled_frames, read_labels
 from bevcli.workshop.formats.output import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
@@ -114,8 +114,8 @@ def test_frames_without_a_row_are_empty_or_unlabelled(
 
 def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
     stamps = tuple(replace(Drive().stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
-    assert sorted(_labelled_places(stamps, {3, 9, 18}, None)) == [3, 9, 18]
-    assert sorted(_labelled_places(stamps, {1, 4, 10}, None)) == [1, 4, 7, 10]
+    assert sorted(_labelled_frames(stamps, {3, 9, 18}, None)) == [3, 9, 18]
+    assert sorted(_labelled_frames(stamps, {1, 4, 10}, None)) == [1, 4, 7, 10]
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> Lis
     boxes = _read_annotations(path / ANNOTATIONS, motion, own, names) if annotated else {}
     entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
     times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
-    truth = {place: boxes[time] for place, time in enumerate(times) if time in boxes}
+    truth = {index: boxes[time] for index, time in enumerate(times) if time in boxes}
     notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
     files = tuple(sorted((*path.glob("*.feather"), *path.glob("calibration/*.feather"))))
     return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
@@ -249,9 +249,9 @@ def _entries(
 
 
 def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
-    found = {}
+    sources = {}
     for name, times in images.items():
         nearest = int(times[np.abs(times - time).argmin()]) if len(times) else None
         if nearest is not None and abs(nearest - time) <= NEAR_NS:
-            found[name] = ImageSource(folder / name / f"{nearest}.jpg", nearest)
-    return found
+            sources[name] = ImageSource(folder / name / f"{nearest}.jpg", nearest)
+    return sources

@@ -46,8 +46,8 @@ def convert(
         open_writer(out, sequence, written) as writer,
         Progress(count, "frames", sequence.notes) as progress,
     ):
-        for place in range(count):
-            frame = sequence.load(place)
+        for index in range(count):
+            frame = sequence.load(index)
             for camera, reason in frame.dropped.items():
                 progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
             gaps += len(frame.dropped)

@@ -83,7 +83,7 @@ class Record:
     def numbers(self, names: tuple[str, ...], default: float | None = None) -> Array:
         """(N,) members that are finite numbers. A missing one is `default`; with None it raises InputError."""
         values = [self._member(name) if default is None or name in self.value else default for name in names]
-        if any(type(one) not in (int, float) or not abs(one) < LARGEST_NUMBER for one in values):
+        if any(type(value) not in (int, float) or not abs(value) < LARGEST_NUMBER for value in values):
             raise InputError(f"{self.where}: expected finite numbers {', '.join(names)}, found {values!r:.80}")
         return np.array(values, dtype=np.float64)
 
@@ -315,18 +315,18 @@ def _read_truth(
     path: Path, scene: Record, samples: Iterable[Sample], class_map: Mapping[str, str], file_of: FileOf
 ) -> dict[int, Boxes3D]:
     """The boxes in the world frame of each sample that has a point cloud with boxes."""
-    found, times = {}, []
+    boxes_of, times = {}, []
     classes: dict[int, str] | None = None
-    for place, sample in enumerate(samples):
+    for index, sample in enumerate(samples):
         for cloud in (datum for datum in sample.data if not datum.is_image):
             annotations = cloud.content.record("annotations")
             if BOXES_3D in annotations.value:
                 classes = _read_ontology(path, scene, class_map) if classes is None else classes
                 boxes_file = file_of(annotations, BOXES_3D)
-                found[place] = _read_boxes(boxes_file, cloud.world_from_sensor.matrix, classes)
+                boxes_of[index] = _read_boxes(boxes_file, cloud.world_from_sensor.matrix, classes)
                 times.append(sample.time_ns)
                 break
-    return dict(zip(found, with_track_velocities(list(found.values()), times), strict=True))
+    return dict(zip(boxes_of, with_track_velocities(list(boxes_of.values()), times), strict=True))
 
 
 def _scene_file(path: Path) -> Path:
@@ -357,6 +357,6 @@ def _read_boxes(path: Path, world_from_sensor: Array, classes: Mapping[int, str]
         np.array([yaw_of_rotation(pose[:3, :3]) for pose in world_from_box]),
         np.full((len(boxes), 2), np.nan),
         np.array([classes.get(number, f"class {number}") for number in ids], dtype=np.str_),
-        instances=np.array([str(one or "") for one in things], dtype=np.str_),
+        instances=np.array([str(thing or "") for thing in things], dtype=np.str_),
         num_points=np.array([record.integer("num_points", 0) for record in records], dtype=np.int64),
     )

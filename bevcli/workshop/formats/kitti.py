@@ -244,7 +244,7 @@ def cuboid_of(
     about x, y and z, radians: Rx Ry Rz. size: (3,) length, width and height, metres.
     """
     numbers = position, rotation, size
-    if [len(each) for each in numbers] != [3, 3, 3] or not np.isfinite(numbers).all():
+    if [len(triple) for triple in numbers] != [3, 3, 3] or not np.isfinite(numbers).all():
         raise InputError(f"{where}: expected three numbers each of position, rotation and size")
     (sx, sy, sz), (cx, cy, cz) = np.sin(rotation), np.cos(rotation)
     yaw = np.arctan2(cx * sz + sx * sy * cz, cy * cz)
@@ -327,7 +327,9 @@ def _frame(path: Path, item: _Item, classes: list[str]) -> tuple[Moment, list[Cu
     where = f"{path}: item {item.id:.40}"
     if item.attr.frame is None:
         raise InputError(f'{where}: "attr" has no "frame", the index of the frame')
-    return (item.attr.frame, None), [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
+    return (item.attr.frame, None), [
+        _cuboid(where, drawn, classes) for drawn in item.annotations if drawn.type == CUBOID
+    ]
 
 
 def _cuboid(where: str, drawn: _Annotation, classes: list[str]) -> Cuboid:

@@ -84,11 +84,11 @@ class LabelFormat:
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     """The labels of a file of any known format. rig: of the drive. Raises InputError."""
-    known: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
-    found = next((form for form in known if form.recognises(path)), None)
-    if found is None:
-        raise InputError(f"{path}: is no file of labels (expected {' or '.join(form.name for form in known)})")
-    labels = found.read(path, rig, options)
+    formats: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
+    form = next((form for form in formats if form.recognises(path)), None)
+    if form is None:
+        raise InputError(f"{path}: is no file of labels (expected {' or '.join(form.name for form in formats)})")
+    labels = form.read(path, rig, options)
     frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
@@ -113,8 +113,8 @@ class WithLabels(DerivedSequence):
             raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
         boxes, note = _with_velocities(sequence, _in_world(sequence, labels, path))
         unlisted = "unlabelled" if labels.lists_empty else options.unlisted_frames
-        labelled = _labelled_places(sequence.stamps, boxes, unlisted)
-        self._listed, self._boxes = len(boxes), {place: Boxes3D.empty() for place in labelled} | boxes
+        labelled = _labelled_frames(sequence.stamps, boxes, unlisted)
+        self._listed, self._boxes = len(boxes), {index: Boxes3D.empty() for index in labelled} | boxes
         notes = (*labels.notes, *note, self._summary())
         self.notes = (*sequence.notes, *(f"{path}: {text}" for text in notes))
 
@@ -142,13 +142,13 @@ class WithLabels(DerivedSequence):
         return "; ".join(parts)
 
 
-def _labelled_places(stamps: Items[FrameStamp], listed: Collection[int], unlisted: UnlistedFrames | None) -> set[int]:
-    """The places of labelled frames, with or without boxes.
+def _labelled_frames(stamps: Items[FrameStamp], listed: Collection[int], unlisted: UnlistedFrames | None) -> set[int]:
+    """The indices, in the drive, of labelled frames, with or without boxes.
 
     If a file lists no two successive frames, the labelling tool was given every n-th frame of a scene: the largest n
     that all listed frames fit. Otherwise every frame is labelled.
 
-    listed: the places that the file has. unlisted: the user's choice for the others; None to decide as above.
+    listed: the indices that the file has. unlisted: the user's choice for the others; None to decide as above.
     """
     scenes = list(scenes_of(stamps))
     if unlisted == "unlabelled":
@@ -157,37 +157,37 @@ def _labelled_places(stamps: Items[FrameStamp], listed: Collection[int], unliste
         return set(range(len(stamps)))
     labelled: set[int] = set()
     for scene in scenes:
-        found = [number for number, place in enumerate(scene) if place in listed]
-        step = math.gcd(*(other - one for one, other in pairwise(found))) or len(scene)
-        labelled.update(scene[found[0] % step :: step] if found else ())
+        in_scene = [number for number, index in enumerate(scene) if index in listed]
+        step = math.gcd(*(later - earlier for earlier, later in pairwise(in_scene))) or len(scene)
+        labelled.update(scene[in_scene[0] % step :: step] if in_scene else ())
     return labelled
 
 
 def _in_world(sequence: Sequence, labels: Labels, path: Path) -> dict[int, Boxes3D]:
-    """The boxes in the world frame, by place of the frame in the drive."""
+    """The boxes in the world frame, by index of the frame in the drive."""
     times = np.array([stamp.timestamp_ns for stamp in sequence.stamps], dtype=np.int64)
-    places = {stamp.index: place for place, stamp in enumerate(sequence.stamps)}
-    found: dict[int, Boxes3D] = {}
+    index_of = {stamp.index: index for index, stamp in enumerate(sequence.stamps)}
+    boxes_of: dict[int, Boxes3D] = {}
     for labelled in labels.frames:
-        place = _place(labelled, times, places)
-        if place is None:
+        index = _index(labelled, times, index_of)
+        if index is None:
             raise InputError(
-                f"{path}: {_words(labelled)} is not in the drive (expected indices {min(places)} to {max(places)}, "
+                f"{path}: {_words(labelled)} is not in the drive (expected indices {min(index_of)} to {max(index_of)}, "
                 f"times {times.min()} to {times.max()} ns): are these the labels of this drive?"
             )
-        if place in found:
+        if index in boxes_of:
             raise InputError(f"{path}: {_words(labelled)}: its frame of the drive has labels already")
         boxes = labelled.boxes
         if labels.frame_of_reference != "world" and len(boxes):
-            frame = sequence.ground_truth_frame(place)
+            frame = sequence.ground_truth_frame(index)
             boxes = boxes.transformed(frame.rig.ego_from_bev) if labels.frame_of_reference == "bev" else boxes
             boxes = boxes.transformed(frame.world_from_ego.matrix)
-        found[place] = boxes
-    return found
+        boxes_of[index] = boxes
+    return boxes_of
 
 
 def _with_velocities(sequence: Sequence, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
-    """The boxes by place, with the velocities of their tracks if none is known, and a note."""
+    """The boxes by index, with the velocities of their tracks if none is known, and a note."""
     together = Boxes3D.concatenate(boxes.values())
     if not len(together) or np.isfinite(together.velocities).any():
         return boxes, ()
@@ -195,16 +195,16 @@ def _with_velocities(sequence: Sequence, boxes: dict[int, Boxes3D]) -> tuple[dic
         needed = "a column `instance`" if together.instances is None else "ego-motion"
         return boxes, (f"the velocities of the boxes are not known ({needed} would give them): no box code is trained",)
     filled: dict[int, Boxes3D] = {}
-    for _, scene in groupby(sorted(boxes), key=lambda place: sequence.stamps[place].scene):
-        places = list(scene)
-        times = [sequence.stamps[place].timestamp_ns for place in places]
-        filled |= zip(places, with_track_velocities([boxes[place] for place in places], times), strict=True)
+    for _, scene in groupby(sorted(boxes), key=lambda index: sequence.stamps[index].scene):
+        indices = list(scene)
+        times = [sequence.stamps[index].timestamp_ns for index in indices]
+        filled |= zip(indices, with_track_velocities([boxes[index] for index in indices], times), strict=True)
     return filled, ("velocities follow from the tracks",)
 
 
-def _place(labelled: LabelledFrame, times: np.ndarray, places: Mapping[int, int]) -> int | None:
+def _index(labelled: LabelledFrame, times: np.ndarray, index_of: Mapping[int, int]) -> int | None:
     if labelled.timestamp_ns is None:
-        return None if labelled.index is None else places.get(labelled.index)
+        return None if labelled.index is None else index_of.get(labelled.index)
     nearest = int(np.abs(times - labelled.timestamp_ns).argmin())
     return nearest if abs(int(times[nearest]) - labelled.timestamp_ns) <= NEAREST_NS else None
 
@@ -228,21 +228,21 @@ def read_csv_labels(path: Path) -> Labels:
     The separator is a comma, a semicolon or a tab; with semicolons or tabs, numbers may have decimal commas. A byte
     order mark and CRLF are accepted. All of this is detected, and said in the notes.
     """
-    text, found = _text(path)
+    text, marks = _text(path)
     separator = max(",;\t", key=text.partition("\n")[0].count)
     columns, rows = _rows(path, text, separator)
-    found += [f"columns separated by {SEPARATORS[separator]}"] if separator in SEPARATORS else []
+    marks += [f"columns separated by {SEPARATORS[separator]}"] if separator in SEPARATORS else []
     if separator != "," and any("," in row.cells["x"] for row in rows):
-        found.append("decimal commas")
+        marks.append("decimal commas")
         for row in rows:
             row.cells.update((name, row.cells[name].replace(",", ".")) for name in (*NUMBERS, *OPTIONAL_NUMBERS))
-    notes = [f"found {', '.join(found)}"] if found else []
+    notes = [f"found {', '.join(marks)}"] if marks else []
     others = [name for name in columns if name not in ("class", *NUMBERS, *OPTIONAL, *UNUSED)]
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
     if "frame_of_reference" not in columns:
         notes.append('there is no column frame_of_reference: the boxes are taken to be in the "ego" frame')
     moments, boxes = _moments(path, rows), _boxes(rows, columns)
-    frames = tuple(LabelledFrame(*moment, boxes[places]) for moment, places in moments.items())
+    frames = tuple(LabelledFrame(*moment, boxes[numbers]) for moment, numbers in moments.items())
     return Labels(_frame_of_reference(path, rows), frames, lists_empty=False, notes=tuple(notes))
 
 
@@ -253,8 +253,8 @@ def _text(path: Path) -> tuple[str, list[str]]:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f'{path}: is not UTF-8: save it as "CSV UTF-8"') from None
-    found = ["a byte order mark"] if content.startswith(codecs.BOM_UTF8) else []
-    return text, found + (["lines that end with CRLF"] if "\r\n" in text else [])
+    marks = ["a byte order mark"] if content.startswith(codecs.BOM_UTF8) else []
+    return text, marks + (["lines that end with CRLF"] if "\r\n" in text else [])
 
 
 def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[CsvRow]]:
@@ -289,13 +289,13 @@ def _check_columns(path: Path, columns: list[str]) -> None:
 
 
 def _moments(path: Path, rows: list[CsvRow]) -> dict[Moment, list[int]]:
-    """Index and time of each frame -> the places of its rows."""
+    """Index and time of each frame -> the numbers of its rows."""
     moments: dict[Moment, list[int]] = {}
-    for place, row in enumerate(rows):
+    for number, row in enumerate(rows):
         index, time = (row.integer(name) if row.cells[name] else None for name in ("frame", "timestamp_ns"))
         if index is None and time is None:
             raise InputError(f"{path}: line {row.line}: has neither frame nor timestamp_ns")
-        moments.setdefault((index, time), []).append(place)
+        moments.setdefault((index, time), []).append(number)
     return moments
 
 

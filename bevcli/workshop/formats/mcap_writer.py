@@ -90,7 +90,7 @@ class Messages:
             return empty if value is None else value
         (inner, element), count = detail
         if int(inner) == NAME:
-            return [self._message(element, one) for one in value or ()]
+            return [self._message(element, item) for item in value or ()]
         if isinstance(value, bytes):
             return np.frombuffer(value, dtype=np.uint8)
         return np.array(np.zeros(count if node == ARRAY else 0) if value is None else value, dtype=element[0])
@@ -193,10 +193,10 @@ class McapWriter:
         """The run's boxes of a frame, in the frame of the scene; none where the run does not have the frame."""
         if self._boxes is None:
             return None
-        found = self._frames.get(frame.stamp)
-        if found is None:
+        predicted = self._frames.get(frame.stamp)
+        if predicted is None:
             return Boxes3D.empty()
-        in_ego = self._boxes.in_ego(found)
+        in_ego = self._boxes.in_ego(predicted)
         return in_ego.transformed(frame.world_from_ego.matrix) if self._has_ego_motion else in_ego
 
     def _add(self, topic: str, kind: str, time_ns: int, fields: Fields) -> None:
@@ -274,18 +274,18 @@ def scene_update(time_ns: int, frame: str, boxes: Boxes3D, colors: Mapping[str, 
 
     colors: of the classes of predictions.
     """
-    entities = [_entity(time_ns, frame, boxes, place, colors) for place in range(len(boxes))]
+    entities = [_entity(time_ns, frame, boxes, index, colors) for index in range(len(boxes))]
     return {"deletions": [{"timestamp": stamp(time_ns), "type": DELETE_ALL}], "entities": entities}
 
 
-def _entity(time_ns: int, frame: str, boxes: Boxes3D, place: int, colors: Mapping[str, Color]) -> Fields:
-    name, score = str(boxes.classes[place]), None if boxes.scores is None else float(boxes.scores[place])
-    identity = "" if boxes.instances is None else str(boxes.instances[place])
+def _entity(time_ns: int, frame: str, boxes: Boxes3D, index: int, colors: Mapping[str, Color]) -> Fields:
+    name, score = str(boxes.classes[index]), None if boxes.scores is None else float(boxes.scores[index])
+    identity = "" if boxes.instances is None else str(boxes.instances[index])
     red, green, blue = GROUND_TRUTH_COLOR if score is None else colors.get(name, OTHER_COLOR)
     color = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": 0.5}
-    center, size, yaw = boxes.centers[place], boxes.sizes_lwh[place], float(boxes.yaws[place])
+    center, size, yaw = boxes.centers[index], boxes.sizes_lwh[index], float(boxes.yaws[index])
     turned = _wxyz([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-    velocity = boxes.velocities[place]
+    velocity = boxes.velocities[index]
     facts = {"class": name, "track": identity, "score": "" if score is None else f"{score:.4f}"}
     facts |= {"vx": f"{velocity[0]:.3f}", "vy": f"{velocity[1]:.3f}"} if np.isfinite(velocity).all() else {}
     label = {
@@ -298,7 +298,7 @@ def _entity(time_ns: int, frame: str, boxes: Boxes3D, place: int, colors: Mappin
     return {
         "timestamp": stamp(time_ns),
         "frame_id": frame,
-        "id": str(place),  # identities may repeat: duplicates have those of their object
+        "id": str(index),  # identities may repeat: duplicates have those of their object
         "metadata": [{"key": key, "value": value} for key, value in facts.items() if value],
         "cubes": [{"pose": {"position": _xyz(center), "orientation": turned}, "size": _xyz(size), "color": color}],
         "texts": [label],

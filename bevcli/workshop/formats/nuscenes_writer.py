@@ -187,9 +187,9 @@ class NewTables:
     def finish(self, map_file: str) -> None:
         """Add the rows that need all samples. map_file: image of the map."""
         for row in self.rows["instance"]:
-            found = self._objects[row["token"]]
-            row["nbr_annotations"] = len(found)
-            row["first_annotation_token"], row["last_annotation_token"] = found[0]["token"], found[-1]["token"]
+            boxes = self._objects[row["token"]]
+            row["nbr_annotations"] = len(boxes)
+            row["first_annotation_token"], row["last_annotation_token"] = boxes[0]["token"], boxes[-1]["token"]
         for number, level in enumerate(VISIBILITIES, 1):
             self._share("visibility", str(number), level=level, description="visible share in percent")
         log = self._share("log", token("log", self._log), logfile="", vehicle="", date_captured="", location=self._log)
@@ -202,7 +202,9 @@ class NewTables:
 
     def _add_sensors(self, scene: str, rig: CameraRig) -> None:
         sensors: list[tuple[str, str, Array, list[Any]]] = [(LIDAR, "lidar", rig.ego_from_bev, [])]
-        sensors += [(one.name, "camera", one.ego_from_camera, one.intrinsics.tolist()) for one in rig.cameras]
+        sensors += [
+            (camera.name, "camera", camera.ego_from_camera, camera.intrinsics.tolist()) for camera in rig.cameras
+        ]
         for channel, modality, ego_from_sensor, intrinsics in sensors:
             sensor = self._share("sensor", token("sensor", channel), channel=channel, modality=modality)
             own, pose = token("calibrated", scene, channel), _pose_of(Pose.from_matrix(ego_from_sensor))

@@ -214,9 +214,9 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
 
 def _pose(translation: Any, rotation: Any) -> Pose | None:
     quaternion = np.array([rotation.w, rotation.x, rotation.y, rotation.z], dtype=np.float64)
-    place = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
+    position = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     norm = float(np.linalg.norm(quaternion))
-    return Pose(place, quaternion / norm) if 0.9 < norm < 1.1 and (abs(place) < FARTHEST).all() else None
+    return Pose(position, quaternion / norm) if 0.9 < norm < 1.1 and (abs(position) < FARTHEST).all() else None
 
 
 def _matrix(values: Any, rows: int, columns: int) -> Array:

@@ -272,18 +272,18 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameE
     }
     topics = {camera.camera: camera.images for camera in cameras}
     entries: list[images.FrameEntry] = []
-    for place, time in enumerate(times[leading].tolist()):
+    for number, time in enumerate(times[leading].tolist()):
         if entries and time <= entries[-1].stamp.timestamp_ns:
             continue  # a message that was recorded twice
         sources: dict[str, images.Source] = {}
         dropped = {}
         for name, own in times.items():
-            index = place if name == leading else _nearest(own, time)
+            index = number if name == leading else _nearest(own, time)
             if abs(int(own[index]) - time) > 0.501 * periods[name]:
                 dropped[name] = f"{topics[name]} has no image within {periods[name] / 2e6:.0f} ms of {time} ns"
             else:
                 sources[name] = makers[name](index, int(own[index]))
-        origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][place]}"
+        origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][number]}"
         entries.append(images.FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
     return tuple(entries)
 

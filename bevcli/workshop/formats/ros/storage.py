@@ -63,12 +63,12 @@ class McapFile:
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
         # Where the records of chunks without compression start: of these, single messages are read.
-        plain = [one.chunk_start_offset for one in self._chunk_indexes if not one.compression]
+        plain = [chunk.chunk_start_offset for chunk in self._chunk_indexes if not chunk.compression]
         self._starts = {NO_CHUNK: 0, **{start: start + RECORD_HEAD.size + PLAIN_CHUNK_HEAD for start in plain}}
         self.topics = {
-            one.topic: Topic(one.topic, schema.name, one.message_encoding, schema.encoding, schema.data)
-            for one in self._channels.values()
-            if (schema := self._schemas.get(one.schema_id))
+            channel.topic: Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, schema.data)
+            for channel in self._channels.values()
+            if (schema := self._schemas.get(channel.schema_id))
         }
         self._references = cache(self._read_references)
 

@@ -167,9 +167,9 @@ def _motion(samples: Sequence[tuple[int, Pose]]) -> EgoMotion:
     translations = np.stack([pose.translation for _, pose in samples])
     quaternions = np.stack([pose.quaternion for _, pose in samples])
     kept = [0]
-    for place, time in enumerate(times.tolist()):
+    for index, time in enumerate(times.tolist()):
         if time - times[kept[-1]] >= KINEMATICS_STEP_NS:
-            kept.append(place)
+            kept.append(index)
     seconds = (times - times[0]) / 1e9
     kinematics = (
         np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1)
@@ -234,14 +234,14 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
         if not motion.first_ns <= time <= motion.last_ns:
             continue
         fix = bag.message(topics[0], index)
-        position = np.array([fix.latitude, fix.longitude], dtype=np.float64)
+        degrees = np.array([fix.latitude, fix.longitude], dtype=np.float64)
         is_valid = getattr(getattr(fix, "status", None), "status", 0) >= 0
-        if not (is_valid and np.isfinite(position).all() and np.any(position)):
+        if not (is_valid and np.isfinite(degrees).all() and np.any(degrees)):
             continue
-        place = motion.pose_at(time).translation
-        if np.linalg.norm(place[:2]) > MAX_OFFSET_M:
+        position = motion.pose_at(time).translation
+        if np.linalg.norm(position[:2]) > MAX_OFFSET_M:
             return None
-        latitude, longitude = GeoOrigin(*position.tolist()).latitude_longitude(-place)
+        latitude, longitude = GeoOrigin(*degrees.tolist()).latitude_longitude(-position)
         return GeoOrigin(float(latitude), float(longitude))
     return None
 
@@ -352,7 +352,7 @@ class VehicleReader:
         path = list(self._tree.up(ego_frame))
         if self._stated.world_frame in path:
             path = path[: path.index(self._stated.world_frame) + 1]
-        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
+        moving = [index for index, frame in enumerate(path[:-1]) if frame in self._moving]
         # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
         path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
         return path if len(path) == len(moving) + 1 else path[:1]
