@@ -41,8 +41,8 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.box_formats": {
         "csv": "bevcli.evaluation.box_format:CSV",
         "json": "bevcli.evaluation.box_format:JSON",
-        "nuscenes": "bevcli.evaluation.box_format:DETECTION",
-        "nuscenes-tracking": "bevcli.evaluation.box_format:TRACKING",
+        "nuscenes": "bevcli.evaluation.submission:DETECTION",
+        "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
     },
     "bevcli.commands": {
         "eval": "bevcli.cli.commands:evaluate",

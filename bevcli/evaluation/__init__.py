@@ -10,7 +10,8 @@ Metrics; they read no files:
     matching            parameters of the score, and greedy matching of boxes
 
 Output:
-    box_format          formats that boxes are exported in; nuScenes submissions are read too
+    box_format          formats that boxes are exported in
+    submission          nuScenes submissions, which are read too
 """
 
 from dataclasses import dataclass

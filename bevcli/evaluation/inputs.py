@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import is_submission, read_submission
+from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import FrameStamp, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev

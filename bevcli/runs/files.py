@@ -7,13 +7,13 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import OutputError
-from bevcli.evaluation.box_format import CsvWriter, SubmissionWriter
+from bevcli.evaluation.box_format import CsvWriter
 from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
@@ -27,6 +27,9 @@ from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.writing import whole_file, write_whole
+
+if TYPE_CHECKING:
+    from bevcli.evaluation.submission import SubmissionWriter
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
@@ -190,6 +193,8 @@ class RunFiles:
         return file
 
     def _open_submission(self) -> SubmissionWriter:
+        from bevcli.evaluation.submission import SubmissionWriter  # nuScenes drives only
+
         return self._open(SUBMISSION, SubmissionWriter)
 
     def _check_that_files_exist(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import SubmissionWriter, is_submission, read_submission, write_submission
+from bevcli.evaluation.submission import SubmissionWriter, is_submission, read_submission, write_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
