@@ -1,6 +1,5 @@
 """Classes of objects: how each is scored, tracked, drawn and exported. A model names its own; nuScenes has ten."""
 
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -76,19 +75,6 @@ NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
         ObjectClass("pedestrian", 40.0, 2.0, True, _WALKING, (), kitti="Pedestrian", color=(70, 222, 190)),
         _static("traffic_cone", "TrafficCone", (245, 222, 90), "orient_err", "vel_err", "attr_err"),
     )
-}
-# Mean length, width and height of their boxes in nuScenes, metres.
-NUSCENES_SIZES: Mapping[str, tuple[float, float, float]] = {
-    "car": (4.6, 1.95, 1.72),
-    "truck": (6.93, 2.51, 2.84),
-    "construction_vehicle": (6.37, 2.73, 3.19),
-    "bus": (10.5, 2.94, 3.47),
-    "trailer": (12.29, 2.9, 3.87),
-    "barrier": (0.5, 2.53, 0.98),
-    "motorcycle": (2.11, 0.77, 1.47),
-    "bicycle": (1.7, 0.6, 1.28),
-    "pedestrian": (0.73, 0.67, 1.77),
-    "traffic_cone": (0.41, 0.41, 1.07),
 }
 VEHICLE_CLASSES = tuple(name for name, each in NUSCENES_CLASSES.items() if each.vehicle)
 
@@ -177,16 +163,6 @@ def without_meshes(settings: Mapping[str, ClassSettings]) -> dict[str, ClassSett
     """The settings that mean the same on every machine; a class with none of them is left out."""
     portable = {name: replace(one, mesh=None) for name, one in settings.items()}
     return {name: one for name, one in portable.items() if one != ClassSettings()}
-
-
-def class_of_size(length: float, width: float, height: float) -> str:
-    """The nuScenes class whose boxes are most alike to one of this size, in metres, by the ratios of their sides."""
-    size = length, width, height
-
-    def difference(name: str) -> float:
-        return sum(abs(math.log(a / b)) for a, b in zip(NUSCENES_SIZES[name], size, strict=True))
-
-    return min(NUSCENES_SIZES, key=difference)
 
 
 def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:

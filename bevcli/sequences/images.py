@@ -18,9 +18,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.files import MIB, open_regular, plain_name, read_bytes
-from bevcli.parsing.images import decode_image, media_type_of, size_of_image
-from bevcli.sequences.files.class_names import count_classes
+from bevcli.parsing.files import MIB, decode_image, media_type_of, open_regular, plain_name, read_bytes, size_of_image
+from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.waiting import result_within
 

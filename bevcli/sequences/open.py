@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
-from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.format import drives_in, format_of, is_drive, own_options
 from bevcli.sequences.options import SequenceOptions
 

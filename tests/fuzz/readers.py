@@ -142,7 +142,7 @@ def _bag(name: str) -> Callable[[Path], None]:
 
 
 def _classes(folder: Path) -> None:
-    from bevcli.sequences.files.class_names import read_class_map
+    from bevcli.sequences.files.boxes_file import read_class_map
 
     read_class_map(folder / "classes.toml")
 

@@ -1,7 +1,11 @@
-"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame."""
+"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame.
+
+ClassNames: the class names of data sets, compared without case and renamed by a class map.
+"""
 
 import math
 import operator
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,13 +21,12 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.parsing.documents import without_garbage_collection
-from bevcli.sequences.files.class_names import ClassNames
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, without_garbage_collection
+from bevcli.parsing.files import read_text
 from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FUTURE_DECIMALS = 3  # millimetres
-_OWN_NAMES = ClassNames()
 _Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
 _Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
@@ -40,6 +43,85 @@ FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
+
+
+class ClassNames:
+    """Maps the class names of a file to known classes.
+
+    A name that differs from a known class only in case becomes that class. Other names stay as they are.
+
+    renames: names of the file (in any case) -> known classes. classes: the known ones. Raises InputError for a target
+    that is not known.
+    """
+
+    def __init__(
+        self, renames: Mapping[str, str] | None = None, classes: Iterable[str] = tuple(NUSCENES_CLASSES)
+    ) -> None:
+        self.known = tuple(classes)
+        self._by_name: dict[str, str] = {name: name for name in self.known}
+        self._by_lower_case = {name.lower(): name for name in reversed(self.known)}
+        known = dict(self._by_lower_case)
+        for name, target in (renames or {}).items():
+            if target.lower() not in known:
+                raise InputError(
+                    f'`class_map` {name}={target}: "{target}" is not a class (expected one of {", ".join(self.known)})'
+                )
+            exact = target if target in self.known else known[target.lower()]
+            self._by_lower_case[name.lower()] = self._by_name[name] = exact
+
+    @staticmethod
+    def of_format(table: Mapping[str, str], renames: Mapping[str, str]) -> "ClassNames":
+        """The names of a format that has names of its own. table: its names -> nuScenes' classes.
+
+        A name that the user renames keeps its name, so that `renames` finds it.
+        """
+        renamed = {name.lower() for name in renames}
+        return ClassNames({name: one for name, one in table.items() if name.lower() not in renamed})
+
+    def __getitem__(self, name: str) -> str:
+        found = self._by_name.get(name)
+        if found is None:
+            found = self._by_name[name] = self._by_lower_case.get(name.lower(), name)
+        return found
+
+    def renamed(self, boxes: Boxes3D) -> Boxes3D:
+        """The boxes with the names of known classes."""
+        names = {name: self[name] for name in np.unique(boxes.classes).tolist()}
+        if all(name == new for name, new in names.items()):
+            return boxes
+        return replace(boxes, classes=np.array([names[name] for name in boxes.classes.tolist()]))
+
+    def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
+        """A note about boxes whose class is not known, if there are any.
+
+        counts: number of boxes by the file's names. where: the file or the side that has them. use: what is not done
+        with them.
+        """
+        others = {name: count for name, count in counts.items() if self[name] not in self.known}
+        if not others:
+            return ()
+        named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
+        return (
+            f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
+            f'(`class_map` "{min(others)}={self.known[0]}" renames a class)',
+        )
+
+
+def read_class_map(path: Path) -> dict[str, str]:
+    """A class map in TOML, one `"Name in the file" = "class"` a line. Raises InputError if it is not one."""
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    for name, target in stated.items():
+        if not isinstance(target, str):
+            raise InputError(f'{path}: {name}: expected the name of a class, such as "truck", found {target!r:.40}')
+    return stated
+
+
+def count_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
+    """Number of boxes by class."""
+    return Counter(name for boxes in frames for name in boxes.classes.tolist())
+
+
+_OWN_NAMES = ClassNames()
 
 
 class _FixedMembers(Struct, forbid_unknown_fields=True):

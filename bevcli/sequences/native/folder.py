@@ -8,8 +8,10 @@ offset_ns = 25000000             # its first image is this much later than start
 rate_hz = 24.0
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,12 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.documents import TOML_BYTES, CsvRow, parse_toml, read_csv
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
-from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
-from bevcli.sequences.files.class_names import count_classes
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import true_results
@@ -40,12 +42,13 @@ from bevcli.sequences.images import (
     read_frame,
     rotation_notes,
 )
-from bevcli.sequences.native.tables import read_ego_motion, read_frames_table
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
 FILE_NAME = "timing.toml"
+VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
+NO_IMAGE = "no image in frames.csv"
 # A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
 SMALLEST_TIMESTAMP = 10**13
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
@@ -171,6 +174,50 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
                 )
+
+
+def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:
+    """Read frames.csv. A camera's cell is a path relative to the table's folder, or `video#index`.
+
+    Raises InputError for an invalid column or cell, a camera without a column, or times that do not increase in a
+    scene.
+    """
+    times = [f"{name}.timestamp_ns" for name in cameras]
+    rows = read_csv(path, ("frame", "timestamp_ns"), ("scene", *cameras, *times))
+    for name in cameras:
+        if name not in rows[0].cells:
+            raise InputError(
+                f"{path}: camera {name}: its column is missing (expected, because the calibration has the camera): "
+                f'add a column "{name}" (cells may be empty), or remove the camera from the calibration'
+            )
+    lines: dict[int, int] = {}  # of frames, by index
+    entries = []
+    for row in rows:
+        stamp = FrameStamp(row.integer("frame"), row.cells.get("scene", ""), row.integer("timestamp_ns"))
+        if stamp.index < 0 or stamp.index in lines:
+            found = f"is also on line {lines[stamp.index]}" if stamp.index in lines else "is negative"
+            raise row.error("frame", f"{stamp.index} {found} (expected a unique integer, 0 or more)")
+        lines[stamp.index] = row.line
+        sources = {name: _source(row, name, stamp.timestamp_ns) for name in cameras if row.cells[name]}
+        dropped = {name: NO_IMAGE for name in cameras if not row.cells[name]}
+        entries.append(FrameEntry(stamp, sources, dropped, f"{path}: line {row.line}"))
+    for earlier, entry in pairwise(entries):
+        before, stamp = earlier.stamp, entry.stamp
+        if before.scene == stamp.scene and stamp.timestamp_ns <= before.timestamp_ns:
+            raise InputError(
+                f"{entry.origin}: timestamp_ns {stamp.timestamp_ns} is not later than the previous frame's "
+                f"({before.timestamp_ns}): sort the frames by time, or give them different scenes"
+            )
+    return tuple(entries)
+
+
+def _source(row: CsvRow, camera: str, frame_ns: int) -> ImageSource:
+    time_column = f"{camera}.timestamp_ns"
+    timestamp_ns = row.integer(time_column) if row.cells.get(time_column) else frame_ns
+    video = VIDEO_CELL.fullmatch(row.cells[camera])
+    if video:
+        return ImageSource(row.path.parent / video["path"], timestamp_ns, int(video["index"]))
+    return ImageSource(row.path.parent / row.cells[camera], timestamp_ns)
 
 
 Found = tuple[tuple[FrameEntry, ...], tuple[str, ...]]  # frames, and a note

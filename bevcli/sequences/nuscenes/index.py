@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
-from bevcli.sequences.nuscenes.format import versions_in
+from bevcli.sequences.nuscenes import versions_in
 
 Ints = NDArray[np.int64]
 

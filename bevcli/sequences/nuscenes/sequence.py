@@ -17,7 +17,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import true_results
 from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import (
     NUSCENES,
     Dialect,

@@ -17,8 +17,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_eg
 from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
+from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.workshop.formats.dgp import CLASS_OF_CATEGORY

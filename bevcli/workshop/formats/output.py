@@ -12,7 +12,7 @@ import cv2
 
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import load_form
-from bevcli.sequences.options import WriteOptions
+from bevcli.workshop.formats import WriteOptions
 from bevcli.writing import remove_parts, whole_folder, write_whole
 
 if TYPE_CHECKING:

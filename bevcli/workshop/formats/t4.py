@@ -56,8 +56,8 @@ def open_t4(path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
     lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableSequence`.
     """
-    from bevcli.sequences.files.class_names import ClassNames
-    from bevcli.sequences.nuscenes.format import NuScenesOptions
+    from bevcli.sequences.files.boxes_file import ClassNames
+    from bevcli.sequences.nuscenes import NuScenesOptions
     from bevcli.sequences.nuscenes.index import Dialect
     from bevcli.sequences.nuscenes.sequence import TableSequence
 

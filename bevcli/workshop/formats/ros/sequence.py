@@ -21,8 +21,7 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DriveFacts, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.parsing.files import is_there
-from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
 from bevcli.sequences.images import (
