@@ -89,11 +89,8 @@ class EgoMotion:
         """Acceleration, angular rate and velocity at a time, interpolated linearly. Raises InputError as `pose_at`."""
         row, fraction = self._locate(timestamp_ns)
         later = min(row + 1, len(self.timestamps_ns) - 1)
-
-        def mix(column: Array) -> Array:
-            return column[row] + fraction * (column[later] - column[row])
-
-        return Kinematics(mix(self.accelerations), mix(self.angular_rates), mix(self.velocities))
+        columns = self.accelerations, self.angular_rates, self.velocities
+        return Kinematics(*(column[row] + fraction * (column[later] - column[row]) for column in columns))
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
         times, first, last = self.timestamps_ns, self.first_ns, self.last_ns

@@ -39,24 +39,12 @@ class ObjectClass:
     mesh: str = ""
 
 
-def _vehicle(
-    name: str, kitti: str, gate_m: float, color: Color, still: str = "vehicle.parked", *, tracked: bool = True
-) -> ObjectClass:
-    attributes = ("vehicle.moving", still)
-    return ObjectClass(name, 50.0, gate_m, tracked, attributes, (), vehicle=True, kitti=kitti, color=color)
-
-
-def _cycle(name: str, kitti: str, gate_m: float, color: Color) -> ObjectClass:
-    attributes = ("cycle.with_rider", "cycle.without_rider")
-    return ObjectClass(name, 40.0, gate_m, True, attributes, (), vehicle=True, kitti=kitti, color=color)
-
-
-def _static(name: str, kitti: str, color: Color, *undefined_errors: str) -> ObjectClass:
-    symmetric = "orient_err" not in undefined_errors
-    return ObjectClass(name, 30.0, 1.0, False, ("", ""), undefined_errors, symmetric, kitti=kitti, color=color)
-
-
+_VEHICLE = ObjectClass("", 50.0, attributes=("vehicle.moving", "vehicle.parked"), undefined_errors=(), vehicle=True)
+_CYCLE = replace(_VEHICLE, range_m=40.0, attributes=("cycle.with_rider", "cycle.without_rider"))
+_BUS = replace(_VEHICLE, attributes=("vehicle.moving", "vehicle.stopped"))
 _WALKING = ("pedestrian.moving", "pedestrian.standing")
+_BARRIER = ObjectClass("", 30.0, 1.0, False, undefined_errors=("vel_err", "attr_err"), symmetric=True)
+_CONE = ObjectClass("", 30.0, 1.0, False, undefined_errors=("orient_err", "vel_err", "attr_err"))
 
 # The ten detection classes of nuScenes, in the order of the published models' class scores. Ranges, tracked classes and
 # undefined errors are those of its devkit (detection_cvpr_2019, tracking_nips_2019). A standing bus is "stopped", not
@@ -64,16 +52,18 @@ _WALKING = ("pedestrian.moving", "pedestrian.standing")
 NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
     each.name: each
     for each in (
-        _vehicle("car", "Car", 3.0, (255, 158, 44)),
-        _vehicle("truck", "Truck", 3.0, (186, 222, 92)),
-        _vehicle("construction_vehicle", "ConstructionVehicle", 4.0, (205, 155, 110), tracked=False),
-        _vehicle("bus", "Bus", 5.0, (240, 108, 190), "vehicle.stopped"),
-        _vehicle("trailer", "Trailer", 4.0, (110, 190, 120)),
-        _static("barrier", "Barrier", (150, 160, 175), "vel_err", "attr_err"),
-        _cycle("motorcycle", "Motorcycle", 4.0, (178, 130, 255)),
-        _cycle("bicycle", "Cyclist", 2.5, (96, 165, 255)),
+        replace(_VEHICLE, name="car", gate_m=3.0, kitti="Car", color=(255, 158, 44)),
+        replace(_VEHICLE, name="truck", gate_m=3.0, kitti="Truck", color=(186, 222, 92)),
+        replace(
+            _VEHICLE, name="construction_vehicle", tracked=False, kitti="ConstructionVehicle", color=(205, 155, 110)
+        ),
+        replace(_BUS, name="bus", gate_m=5.0, kitti="Bus", color=(240, 108, 190)),
+        replace(_VEHICLE, name="trailer", kitti="Trailer", color=(110, 190, 120)),
+        replace(_BARRIER, name="barrier", kitti="Barrier", color=(150, 160, 175)),
+        replace(_CYCLE, name="motorcycle", kitti="Motorcycle", color=(178, 130, 255)),
+        replace(_CYCLE, name="bicycle", gate_m=2.5, kitti="Cyclist", color=(96, 165, 255)),
         ObjectClass("pedestrian", 40.0, 2.0, True, _WALKING, (), kitti="Pedestrian", color=(70, 222, 190)),
-        _static("traffic_cone", "TrafficCone", (245, 222, 90), "orient_err", "vel_err", "attr_err"),
+        replace(_CONE, name="traffic_cone", kitti="TrafficCone", color=(245, 222, 90)),
     )
 }
 VEHICLE_CLASSES = tuple(name for name, each in NUSCENES_CLASSES.items() if each.vehicle)

@@ -196,10 +196,14 @@ def size_of_image(encoded: bytes) -> tuple[int, int] | None:
             return None
         width, height = struct.unpack(">II", encoded[16:24])
         return width, height
-    return _jpeg_size(encoded) if kind == "image/jpeg" else _other_size(encoded)
-
-
-def _other_size(encoded: bytes) -> tuple[int, int] | None:
+    if kind == "image/jpeg":
+        for marker, offset in _jpeg_markers(encoded):
+            if marker in _FRAMES and offset + 7 <= len(encoded):
+                height, width = struct.unpack(">HH", encoded[offset + 3 : offset + 7])
+                return width, height
+            if marker in _FRAMES or marker == _PIXELS:
+                break
+        return None
     from PIL import Image
 
     try:
@@ -215,16 +219,6 @@ def _jpeg_markers(encoded: bytes) -> Iterator[tuple[int, int]]:
     while found := _MARKER.search(encoded, offset):
         yield encoded[found.end() - 1], found.end()
         offset = found.end() + int.from_bytes(encoded[found.end() : found.end() + 2], "big")
-
-
-def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
-    for marker, offset in _jpeg_markers(encoded):
-        if marker in _FRAMES and offset + 7 <= len(encoded):
-            height, width = struct.unpack(">HH", encoded[offset + 3 : offset + 7])
-            return width, height
-        if marker in _FRAMES or marker == _PIXELS:
-            return None
-    return None
 
 
 def _is_cut_short(encoded: bytes) -> bool:

@@ -11,7 +11,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import defaults, gather
+from bevcli.options import defaults
 from bevcli.parsing.files import is_there
 from bevcli.registry import entries, load
 from bevcli.sequences.options import FormatOptions, SequenceOptions
@@ -146,13 +146,6 @@ def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator
                 yield path
             elif depth > 1:
                 yield from _drives_below(path, known, depth - 1)
-
-
-def own_options(path: Path, chosen: Format, values: dict[str, Any]) -> FormatOptions:
-    """The own options of a path's format. Raises as `check_options`."""
-    check_options(values, [chosen], f"{path}: is {chosen.name}")
-    own = defaults(chosen.options)
-    return gather(chosen.options, None, {name: value for name, value in values.items() if name in own})
 
 
 def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
@@ -216,7 +216,16 @@ class ImageReader:
 
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:
         if isinstance(source, ImageSource):
-            self._check_place(source)
+            if self._inside is not None:
+                try:
+                    path = os.path.realpath(source.path)
+                except ValueError:  # a null byte
+                    raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
+                if os.path.commonpath((path, self._inside)) != self._inside:
+                    raise InputError(
+                        f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
+                        "`allow_outside=True` to read it"
+                    )
             is_file = source.video_index is None
             image = self._read_file(source, camera) if is_file else self._read_video(source, camera.name)
         else:
@@ -225,19 +234,6 @@ class ImageReader:
         self._check_size(source, camera, (width, height))
         self._fitting.add(camera.name)
         return image
-
-    def _check_place(self, source: ImageSource) -> None:
-        if self._inside is None:
-            return
-        try:
-            path = os.path.realpath(source.path)
-        except ValueError:  # a null byte
-            raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
-        if os.path.commonpath((path, self._inside)) != self._inside:
-            raise InputError(
-                f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
-                "`allow_outside=True` to read it"
-            )
 
     def _check_size(self, source: Source, camera: Camera, size: tuple[int, int]) -> None:
         """Raises InputError for a wrong size of a camera's first image, UnreadableImage for that of a later one."""
@@ -298,40 +294,6 @@ class FrameEntry:
     sources: Mapping[str, Source]
     dropped: Mapping[str, str]
     origin: str
-
-
-def read_frame(
-    entry: FrameEntry,
-    rig: CameraRig,
-    reader: ImageReader,
-    motion: EgoMotion | None,
-    ground_truth: Boxes3D | None = None,
-    ground_truth_map: BevMap | None = None,
-) -> Frame:
-    """The frame of an entry, with decoded images. Without motion, poses are the identity, and the vehicle is at rest.
-
-    Raises InputError as `ImageReader.read`, and for a time that the motion does not cover.
-    """
-    images, dropped = reader.read(entry.sources, rig, entry.dropped)
-    frame_ns = entry.stamp.timestamp_ns
-    times = dict.fromkeys(rig.names, frame_ns)
-    times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
-    times |= {name: image.timestamp_ns for name, image in images.items()}
-
-    def pose_at(time: int) -> Pose:
-        return Pose.identity() if motion is None else motion.pose_at(time)
-
-    return Frame(
-        stamp=entry.stamp,
-        rig=rig,
-        images=images,
-        world_from_ego=pose_at(frame_ns),
-        world_from_ego_at={name: pose_at(time) for name, time in times.items()},
-        kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
-        dropped=dropped,
-        ground_truth=ground_truth,
-        ground_truth_map=ground_truth_map,
-    )
 
 
 def leads_out(path: Path, folder: Path) -> bool:
@@ -398,5 +360,25 @@ class ListedSequence(Sequence):
         return self._frame(place, self._entries[place])
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
-        """The frame at a place, of its entry or of one without images."""
-        return read_frame(entry, self._rigs[place], self._images, self.ego_motion, self._truth.get(place))
+        """The frame at a place, of its entry or of one without images.
+
+        Without ego-motion, poses are the identity, and the vehicle is at rest.
+        Raises InputError as `ImageReader.read`, and for a time that the ego-motion does not cover.
+        """
+        rig, motion, frame_ns = self._rigs[place], self.ego_motion, entry.stamp.timestamp_ns
+        images, dropped = self._images.read(entry.sources, rig, entry.dropped)
+        times = dict.fromkeys(rig.names, frame_ns)
+        times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
+        times |= {name: image.timestamp_ns for name, image in images.items()}
+        at_times = [frame_ns, *times.values()]
+        poses = [Pose.identity() if motion is None else motion.pose_at(time) for time in at_times]
+        return Frame(
+            stamp=entry.stamp,
+            rig=rig,
+            images=images,
+            world_from_ego=poses[0],
+            world_from_ego_at=dict(zip(times, poses[1:], strict=True)),
+            kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
+            dropped=dropped,
+            ground_truth=self._truth.get(place),
+        )

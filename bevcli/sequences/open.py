@@ -14,7 +14,7 @@ from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
 from bevcli.sequences.files.boxes_file import ClassNames
-from bevcli.sequences.format import drives_in, format_of, is_drive, own_options
+from bevcli.sequences.format import check_options, drives_in, format_of, is_drive
 from bevcli.sequences.options import SequenceOptions
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
@@ -53,7 +53,9 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     if options.scene is not None and (drive := _drive_of(path, options.scene)):
         path, options = drive, replace(options, scene=None)
     chosen = format_of(path)
-    own = own_options(path, chosen, changes)
+    check_options(changes, [chosen], f"{path}: is {chosen.name}")
+    known = defaults(chosen.options)
+    own = gather(chosen.options, None, {name: value for name, value in changes.items() if name in known})
     sequence = chosen.open(path, options, own)
     check_time_unit(sequence, path)
     if options.ground_truth:
@@ -198,7 +200,18 @@ def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
         slowest = min(slowest, ratio)
         chosen = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
         kept += [indices[position] for position in chosen]
-    return select(sequence, kept, tuple(_rate_notes(len(stamps), len(kept), slowest, rate_hz)))
+    notes = []
+    if len(kept) < len(stamps):
+        notes.append(
+            f"{len(kept)} of {len(stamps)} frames are used, at about {rate_hz:g} frames per second "
+            '(`rate_hz="all"` uses every frame)'
+        )
+    if slowest < SLOWEST_RATIO:
+        notes.append(
+            f"the input has {slowest * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "
+            "velocities will be less accurate and history less useful"
+        )
+    return select(sequence, kept, tuple(notes))
 
 
 def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
@@ -226,16 +239,3 @@ def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
     later = np.clip(np.searchsorted(seconds, ticks), 1, len(seconds) - 1)
     earlier = later - 1
     return np.unique(np.where(ticks - seconds[earlier] <= seconds[later] - ticks, earlier, later))
-
-
-def _rate_notes(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> Iterator[str]:
-    if kept < total:
-        yield (
-            f"{kept} of {total} frames are used, at about {rate_hz:g} frames per second "
-            '(`rate_hz="all"` uses every frame)'
-        )
-    if slowest_ratio < SLOWEST_RATIO:
-        yield (
-            f"the input has {slowest_ratio * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "
-            "velocities will be less accurate and history less useful"
-        )

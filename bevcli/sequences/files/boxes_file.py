@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.parsing.documents import TOML_BYTES, parse_toml, without_garbage_collection
@@ -161,25 +161,35 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     except msgspec.ValidationError:
         index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
         raise InputError(f"{where}: box {index}: {mistake}") from None
+    columns: dict[str, NDArray[Any] | None] = {}
+    for name, column in OPTIONAL_COLUMNS.items():
+        values = [getattr(row, column.key) for row in rows]
+        given = [column.unknown if value is UNSET or value is None else value for value in values]
+        columns[name] = None if values.count(UNSET) == len(values) else np.array(given)
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
         yaws=np.array([row.yaw for row in rows]),
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
-        **{name: _column(rows, column) for name, column in OPTIONAL_COLUMNS.items()},
-        **_futures(rows, where),
+        **columns,
+        **(_futures(rows, where) if any(row.futures for row in rows) else {}),
     )
     without = [index for index, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
         raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
-    for name, column in OPTIONAL_COLUMNS.items():
-        shares = getattr(boxes, name)
-        if column.values == "share" and shares is not None:
-            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, column.key, "0 to 1")
-    for key, values in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
-        _require(np.isfinite(values), values, where, key, "finite numbers")
-    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, where, "size_lwh", "numbers above 0")
+    sizes = boxes.sizes_lwh
+    checks: list[tuple[str, Array, NDArray[np.bool_], str]] = [
+        (column.key, shares, ((shares >= 0) & (shares <= 1)) | np.isnan(shares), "0 to 1")
+        for name, column in OPTIONAL_COLUMNS.items()
+        if column.values == "share" and (shares := columns[name]) is not None
+    ]
+    for key, values in (("center", boxes.centers), ("size_lwh", sizes), ("yaw", boxes.yaws)):
+        checks.append((key, values, np.isfinite(values), "finite numbers"))
+    for key, values, good, expected in (*checks, ("size_lwh", sizes, sizes > 0, "numbers above 0")):
+        if not good.all():
+            index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+            raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
     return boxes
 
 
@@ -199,11 +209,19 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
     objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     for name, column in OPTIONAL_COLUMNS.items():
         values = getattr(boxes, name)
-        if values is not None:
-            for box, value, is_known in zip(objects, values.tolist(), _is_known(values, column).tolist(), strict=True):
-                if is_known:
-                    box[column.key] = value
-    _add_futures(objects, boxes)
+        if values is None:
+            continue
+        if column.values == "score":
+            known = np.ones(len(values), dtype=bool)  # written always, so that NaN is an error
+        elif column.values == "count":
+            known = values >= 0  # two unknown numbers may add up to -2
+        else:
+            known = ~np.isnan(values) if column.values == "share" else values != column.unknown
+        for box, value, is_known in zip(objects, values.tolist(), known.tolist(), strict=True):
+            if is_known:
+                box[column.key] = value
+    if boxes.futures is not None:
+        _add_futures(objects, boxes, boxes.futures)
     return objects
 
 
@@ -230,35 +248,10 @@ def _description(kind: Any) -> str:
     return str(notes[0].description)
 
 
-def _column(rows: Sequence[Any], column: Column) -> NDArray[Any] | None:
-    """An optional column; None where no box has it."""
-    values = [getattr(row, column.key) for row in rows]
-    if values.count(UNSET) == len(values):
-        return None
-    return np.array([column.unknown if value is UNSET or value is None else value for value in values])
-
-
-def _is_known(values: NDArray[Any], column: Column) -> NDArray[np.bool_]:
-    """(N,) for which boxes an optional column is written. Scores always are, so that NaN is an error."""
-    if column.values == "score":
-        return np.ones(len(values), dtype=bool)
-    if column.values == "count":
-        return values >= 0  # two unknown numbers may add up to -2
-    return ~np.isnan(values) if column.values == "share" else values != column.unknown
-
-
-def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
-    if not good.all():
-        index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-        raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {column[index].tolist()}")
-
-
-def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
+def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D, futures: Array) -> None:
     """Add futures to N JSON objects: M modes of T steps, each x and y, null if unknown; and the times of the steps."""
-    if boxes.futures is None:
-        return
     for index, box in enumerate(objects):
-        future = boxes.futures[index]  # (M, T, 3)
+        future = futures[index]  # (M, T, 3)
         if not np.isfinite(future[..., 1:]).any():
             continue
         box["future_times_s"] = future[0, :, 0].tolist()
@@ -269,10 +262,8 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
 
 
 def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
-    """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
+    """The columns `futures` and `future_scores` of Boxes3D, of rows of which one or more have futures."""
     having = {index: row for index, row in enumerate(rows) if row.futures}
-    if not having:
-        return {}
     first = next(iter(having.values()))
     modes, steps = len(first.futures or ()), len(first.future_times_s)
     futures, scores = np.full((len(rows), modes, steps, 3), np.nan), np.full((len(rows), modes), np.nan)
@@ -351,13 +342,20 @@ def read_boxes(
         reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
         names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
         frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
-    _check_unique(path, frames)
+    moments: set[tuple[str, int]] = set()
+    for stamp in (frame.stamp for frame in frames):
+        moment = (stamp.scene, stamp.timestamp_ns)
+        if moment in moments:
+            raise InputError(
+                f'{path}: frame {stamp.index}: scene "{moment[0]}" has two frames at {moment[1]} ns: remove one'
+            )
+        moments.add(moment)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
         reference,
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
-        _others(content, _FILE_KEYS),
+        {key: value for key, value in content.items() if key not in _FILE_KEYS},
         stated,
     )
 
@@ -433,20 +431,5 @@ def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_name
         stamp,
         None if stated is None else pose_from_json(stated, "world_from_ego", where),
         boxes_from_json(row["boxes"], where, class_names),
-        _others(row, _FRAME_KEYS),
+        {key: value for key, value in row.items() if key not in _FRAME_KEYS},
     )
-
-
-def _others(row: dict[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
-    return {key: value for key, value in row.items() if key not in known}
-
-
-def _check_unique(path: Path, frames: tuple[FrameBoxes, ...]) -> None:
-    seen: set[tuple[str, int]] = set()
-    for frame in frames:
-        moment = (frame.stamp.scene, frame.stamp.timestamp_ns)
-        if moment in seen:
-            raise InputError(
-                f'{path}: frame {frame.stamp.index}: scene "{moment[0]}" has two frames at {moment[1]} ns: remove one'
-            )
-        seen.add(moment)

@@ -15,6 +15,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
+from bevcli.writing import output_errors
 
 PARTIAL = ".partial"
 LARGEST_BYTES = 4 << 30
@@ -36,14 +37,12 @@ class GrowingFile:
         """Creates the file, or cuts it to `resume_at` bytes and goes on there. Raises OutputError."""
         self.path, self.name = path, path if name is None else name
         self.size = 0
-        try:
+        with output_errors(self.name):
             # Unbuffered: a piece is in the file at once.
             self._file = path.open("wb" if resume_at is None else "r+b", buffering=0)
             if resume_at is not None:
                 self._file.truncate(resume_at)
                 self.size = self._file.seek(resume_at)
-        except OSError as error:
-            raise self._failure(error) from None
 
     def append(self, content: bytes | memoryview) -> None:
         """Writes a piece. Raises OutputError; the file then is as before."""
@@ -55,7 +54,7 @@ class GrowingFile:
             with contextlib.suppress(OSError):
                 self._file.truncate(self.size)
                 self._file.seek(self.size)
-            raise self._failure(error) from None
+            raise OutputError(f"{self.name}: cannot be written ({error.strerror})") from None
         self.size += len(content)
 
     def close(self) -> None:
@@ -71,9 +70,6 @@ class GrowingFile:
     def is_deleted(self) -> bool:
         """True if somebody has deleted the file while it is written."""
         return os.fstat(self._file.fileno()).st_nlink == 0
-
-    def _failure(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.name}: cannot be written ({error.strerror})")
 
 
 def partial_path(path: Path) -> Path:
@@ -124,7 +120,8 @@ class IncrementalJson(GrowingFile):
         """
         partial = partial_path(path)
         if resume_at is not None and not partial.exists() and path.exists():
-            _rename(path, partial)
+            with output_errors(partial):
+                os.replace(path, partial)
         super().__init__(partial, resume_at, name=path)
         self._tail = f"\n{tail}\n".encode()
         if resume_at is None:
@@ -156,14 +153,8 @@ class IncrementalJson(GrowingFile):
             self.append(self._tail)
         finally:
             super().close()
-        _rename(self.path, self.name)
-
-
-def _rename(path: Path, to: Path) -> None:
-    try:
-        os.replace(path, to)
-    except OSError as error:
-        raise OutputError(f"{to}: cannot be written ({error.strerror})") from None
+        with output_errors(self.name):
+            os.replace(self.path, self.name)
 
 
 class FileOfFrames(IncrementalJson):

@@ -21,7 +21,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.documents import TOML_BYTES, CsvRow, parse_toml, read_csv
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, read_csv
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
@@ -39,7 +39,6 @@ from bevcli.sequences.images import (
     bev_frame_notes,
     count_and_rate,
     leads_out,
-    read_frame,
     rotation_notes,
 )
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
@@ -82,24 +81,18 @@ class FolderSequence(ListedSequence):
         if not common.allow_outside:
             _check_paths(path, entries)
         file = own.ego_motion_file or path / "ego_motion.csv"
-        motion, motion_notes = _read_motion(file, common.ego_motion)
-        if motion is not None:
-            advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-            _check_coverage(file, motion, entries, advice)
-        self._read_truth(path, is_read=common.ground_truth)
+        advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
+        motion, motion_notes = _read_motion(file, common.ego_motion, entries, advice)
+        boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
+        self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
+        self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
+        self._true_results = true_results("native", path) if has_truth else ()
+        self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
-        turned = rotation_notes(sorted({source.path for source in sources if source.video_index is not None}))
-        notes = (*bev_frame_notes(rig), *notes, *motion_notes, *turned)
+        videos = sorted({source.path for source in sources if source.video_index is not None})
+        notes = (*bev_frame_notes(rig), *notes, *motion_notes, *(rotation_notes(videos) if videos else ()))
         super().__init__(path, common, rig, entries, motion, notes=notes)
         self.facts = facts
-
-    def _read_truth(self, path: Path, *, is_read: bool) -> None:
-        """Read ground_truth.json and files of further results; maps are read frame by frame. Each may be missing."""
-        boxes, maps = path / BOXES_FILE, path / MAPS_FOLDER
-        self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
-        self._true_results = true_results("native", path) if is_read else ()
-        self._maps = open_maps(maps) if is_read and maps.is_dir() else None
-        self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
 
     @property
     def class_counts(self) -> Mapping[str, int]:
@@ -114,7 +107,7 @@ class FolderSequence(ListedSequence):
         index, time = entry.stamp.index, entry.stamp.timestamp_ns
         boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
         bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
-        frame = read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
+        frame = replace(super()._frame(place, entry), ground_truth=boxes, ground_truth_map=bev_map)
         if not self.has_ego_motion:
             return frame
         results = (result for of_frame in self._true_results if (result := of_frame(frame)) is not None)
@@ -149,21 +142,21 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
                 )
 
 
-def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple[str, ...]]:
+def _read_motion(
+    file: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...], advice: str
+) -> tuple[EgoMotion | None, tuple[str, ...]]:
+    """The poses, None without any, and notes. advice: for frames at times that the poses do not cover."""
     if use == "static":
         unread = f" ({file.name} is not read)" if is_there(file) else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
-    if is_there(file):
-        return read_ego_motion(file), ()
-    if use == "required":
+    if not is_there(file) and use == "required":
         raise InputError(
             f"{file}: the file is missing (expected the vehicle's poses): add it, "
             'pass `ego_motion="static"` if the vehicle stands, or pass `temporal=False` to run without history'
         )
-    return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
-
-
-def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...], advice: str) -> None:
+    if not is_there(file):
+        return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
+    motion = read_ego_motion(file)
     first, last = motion.first_ns, motion.last_ns
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
@@ -174,6 +167,7 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
                 )
+    return motion, ()
 
 
 def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:
@@ -198,7 +192,13 @@ def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry,
             found = f"is also on line {lines[stamp.index]}" if stamp.index in lines else "is negative"
             raise row.error("frame", f"{stamp.index} {found} (expected a unique integer, 0 or more)")
         lines[stamp.index] = row.line
-        sources = {name: _source(row, name, stamp.timestamp_ns) for name in cameras if row.cells[name]}
+        sources: dict[str, ImageSource] = {}
+        for name in (name for name in cameras if row.cells[name]):
+            column = f"{name}.timestamp_ns"
+            timestamp_ns = row.integer(column) if row.cells.get(column) else stamp.timestamp_ns
+            video = VIDEO_CELL.fullmatch(row.cells[name])
+            file, index = (video["path"], int(video["index"])) if video else (row.cells[name], None)
+            sources[name] = ImageSource(path.parent / file, timestamp_ns, index)
         dropped = {name: NO_IMAGE for name in cameras if not row.cells[name]}
         entries.append(FrameEntry(stamp, sources, dropped, f"{path}: line {row.line}"))
     for earlier, entry in pairwise(entries):
@@ -209,15 +209,6 @@ def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry,
                 f"({before.timestamp_ns}): sort the frames by time, or give them different scenes"
             )
     return tuple(entries)
-
-
-def _source(row: CsvRow, camera: str, frame_ns: int) -> ImageSource:
-    time_column = f"{camera}.timestamp_ns"
-    timestamp_ns = row.integer(time_column) if row.cells.get(time_column) else frame_ns
-    video = VIDEO_CELL.fullmatch(row.cells[camera])
-    if video:
-        return ImageSource(row.path.parent / video["path"], timestamp_ns, int(video["index"]))
-    return ImageSource(row.path.parent / row.cells[camera], timestamp_ns)
 
 
 Found = tuple[tuple[FrameEntry, ...], tuple[str, ...]]  # frames, and a note
