@@ -23,7 +23,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, Obje
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.parsing.documents import TOML_BYTES, parse_toml, without_garbage_collection
 from bevcli.parsing.files import read_text
-from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FUTURE_DECIMALS = 3  # millimetres
@@ -339,7 +339,8 @@ def read_boxes(
     """
     with without_garbage_collection():
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
-        reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
+        reference, rows = content["frame_of_reference"], content["frames"]
+        stated = _stated_classes(content, path) if "classes" in content else None
         names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
         frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
     moments: set[tuple[str, int]] = set()
@@ -360,10 +361,8 @@ def read_boxes(
     )
 
 
-def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectClass] | None:
-    """The classes in "classes" and "class_settings" of a boxes file; None without them. Raises InputError."""
-    if "classes" not in content:
-        return None
+def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectClass]:
+    """The classes in "classes" and "class_settings" of a boxes file. Raises InputError."""
     try:
         names = msgspec.convert(content["classes"], tuple[str, ...])
         settings = msgspec.convert(content.get("class_settings", {}), dict[str, ClassSettings])
@@ -377,7 +376,7 @@ def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
     return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))
 
 
-class BoxesWriter(FileOfFrames):
+class BoxesWriter(IncrementalJson):
     """Writes a boxes file frame by frame.
 
     The file gets its name when the writer is closed; until then `read_boxes` reads all finished frames from its partial
@@ -400,7 +399,7 @@ class BoxesWriter(FileOfFrames):
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        super().__init__(path, head, resume_at)
+        super().__init__(path, head, "frames", resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame. Its boxes must be in the file's frame of reference."""

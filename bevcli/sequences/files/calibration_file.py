@@ -188,8 +188,21 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     if len(sizes) < 2 or intrinsics is None or ego_from_camera is None:
         return None
     width, height = sizes
-    if not _is_plausible(intrinsics, width, height, report):
-        return None
+    low, high = FOCAL_RANGE
+    for axis, (letter, size) in enumerate((("x", width), ("y", height))):
+        focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
+        if not low * size <= focal <= high * size:
+            report.error(
+                "intrinsics-absurd", "intrinsics", "has an implausible focal length",
+                expected=f"{low * size:g} to {high * size:g} px for a size of {size}", found=f"f{letter} {focal:g}",
+                advice="give it in pixels, not in millimetres",
+            )  # fmt: skip
+            return None
+        if not -2 * size <= center <= 3 * size:
+            expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
+            message = "has its principal point far outside the image"
+            report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
+            return None
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
@@ -242,23 +255,3 @@ def _parse_distortion(value: object, report: Report) -> Distortion | None:
         return None
     coefficients = parse_numbers(value, "coefficients", (count,), report.within("distortion"))
     return None if coefficients is None else Distortion(model, tuple(map(float, coefficients)))
-
-
-def _is_plausible(intrinsics: Array, width: int, height: int, report: Report) -> bool:
-    """Check focal length and principal point against the size of the image."""
-    low, high = FOCAL_RANGE
-    for axis, (letter, size) in enumerate((("x", width), ("y", height))):
-        focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
-        if not low * size <= focal <= high * size:
-            report.error(
-                "intrinsics-absurd", "intrinsics", "has an implausible focal length",
-                expected=f"{low * size:g} to {high * size:g} px for a size of {size}", found=f"f{letter} {focal:g}",
-                advice="give it in pixels, not in millimetres",
-            )  # fmt: skip
-            return False
-        if not -2 * size <= center <= 3 * size:
-            expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
-            message = "has its principal point far outside the image"
-            report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
-            return False
-    return True

@@ -1,6 +1,5 @@
 """ego_motion.csv: strict CSV, with error messages that name line and column."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.documents import CsvRow, read_csv
+from bevcli.parsing.documents import read_csv
 
 TRANSLATION = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -37,23 +36,17 @@ def read_ego_motion(path: Path) -> EgoMotion:
             raise row.error("qw..qz", message)
         stamps.append(time)
         normed.append(quaternion / norm)
-    times, translations, quaternions = np.array(stamps, dtype=np.int64), _columns(rows, TRANSLATION), np.stack(normed)
-    derived = derive_kinematics(times, translations, quaternions)
-    stated = [_group(rows, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
-    kinematics = [from_poses if own is None else own for own, from_poses in zip(stated, derived, strict=True)]
-    return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=stated[2] is not None)
-
-
-def _columns(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array:
-    return np.array([[row.number(name) for name in names] for row in rows])
-
-
-def _group(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array | None:
-    """(T, 3) of three columns, None if the table has none of them. Raises InputError if it has only some."""
-    there = [name for name in names if name in rows[0].cells]
-    if there and len(there) < len(names):
-        raise InputError(
-            f"{rows[0].path}: expected all of the columns {', '.join(names)} or none (found only {', '.join(there)}): "
-            "add the others, or remove all to derive them from the poses"
-        )
-    return _columns(rows, names) if there else None
+    translations = np.array([[row.number(name) for name in TRANSLATION] for row in rows])
+    times, quaternions = np.array(stamps, dtype=np.int64), np.stack(normed)
+    kinematics = list(derive_kinematics(times, translations, quaternions))
+    for index, names in enumerate((ACCELERATION, ANGULAR_RATE, VELOCITY)):
+        there = [name for name in names if name in rows[0].cells]
+        if there and len(there) < len(names):
+            raise InputError(
+                f"{path}: expected all of the columns {', '.join(names)} or none (found only {', '.join(there)}): "
+                "add the others, or remove all to derive them from the poses"
+            )
+        if there:
+            kinematics[index] = np.array([[row.number(name) for name in names] for row in rows])
+    is_stated = VELOCITY[0] in rows[0].cells
+    return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=is_stated)

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -65,7 +64,17 @@ def open_maps(path: Path) -> MapFolder:
                 f'{legend_path}: "{key}" must be two numbers, smaller first, in metres; found {value!r:.60}'
             )
         ranges.append((float(numbers[0]), float(numbers[1])))
-    return MapFolder(path, *ranges, _classes(legend, legend_path))
+    value = legend.get("classes")
+    bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
+    names = value.values() if isinstance(value, dict) else ()
+    texts = {text for text in names if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
+    if not isinstance(value, dict) or not value or not value.keys() <= bits.keys() or len(texts) != len(value):
+        raise InputError(
+            f'{legend_path}: "classes" must name bits, such as {{"1": "drivable_road", "2": "lane_boundary"}}: powers '
+            f"of two up to {max(bits.values())}, each name once; found {value!r:.80}"
+        )
+    classes = {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}
+    return MapFolder(path, *ranges, classes)
 
 
 def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
@@ -91,17 +100,3 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
 def map_path(folder: Path, frame: int) -> Path:
     """The file of a frame's map in a folder of maps."""
     return folder / f"{frame:06d}.png"
-
-
-def _classes(legend: dict[str, Any], path: Path) -> dict[str, int]:
-    """Class -> its bit, by rising bit."""
-    value = legend.get("classes")
-    bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
-    names = value.values() if isinstance(value, dict) else ()
-    texts = {text for text in names if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
-    if not isinstance(value, dict) or not value or not value.keys() <= bits.keys() or len(texts) != len(value):
-        raise InputError(
-            f'{path}: "classes" must name bits, such as {{"1": "drivable_road", "2": "lane_boundary"}}: powers of two '
-            f"up to {max(bits.values())}, each name once; found {value!r:.80}"
-        )
-    return {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}

@@ -1,6 +1,6 @@
 """The native sequence folder: one drive with calibration, images or videos, ego-motion and ground truth.
 
-folder: FolderSequence, the folder as a Sequence, also without frames.csv.
+folder: FolderSequence, the folder as a Sequence. unlisted: its frames where it has no frames.csv.
 """
 
 from bevcli.sequences.format import Format

@@ -25,17 +25,16 @@ from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_
 from bevcli.printing import one_line
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
 from bevcli.sequences.images import (
-    MOST_PIXELS,
+    DECODE_FLAGS,
     FrameEntry,
     ListedSequence,
     MessageSource,
     Source,
     UnreadableImage,
-    VideoReader,
     bev_frame_notes,
-    decode,
 )
 from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.format import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
@@ -118,7 +117,7 @@ def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
     if pixels is not None and pixels.ndim == 2:
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         return cv2.cvtColor(pixels, RAW_ENCODINGS[encoding][2] or 0).astype(np.uint8, copy=False), False
-    pixels = decode(data)
+    pixels = decode_image(data, DECODE_FLAGS, MOST_PIXELS)
     if pixels is None or not (after.strip() and encoding.startswith("rgb")):
         return pixels, True
     return pixels[..., ::-1].copy(), False
