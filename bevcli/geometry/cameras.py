@@ -231,8 +231,8 @@ def _undistorted(bent: Array, distortion: Distortion) -> Array:
 
     OpenCV's solution alone is off by some pixels at strong distortion, so it is refined.
     """
-    found = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
-    rays = np.asarray(found, dtype=np.float64).reshape(bent.shape)
+    solved = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
+    rays = np.asarray(solved, dtype=np.float64).reshape(bent.shape)
     for _ in range(REFINEMENTS):
         rays = rays + (bent - distort(rays, distortion))
     error = np.abs(distort(rays, distortion) - bent).max(-1, keepdims=True)

@@ -50,8 +50,8 @@ _CONE = ObjectClass("", 30.0, 1.0, False, undefined_errors=("orient_err", "vel_e
 # undefined errors are those of its devkit (detection_cvpr_2019, tracking_nips_2019). A standing bus is "stopped", not
 # "parked", as in the original BEVFormer. No class is red: red marks a miss or a false positive.
 NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
-    each.name: each
-    for each in (
+    object_class.name: object_class
+    for object_class in (
         replace(_VEHICLE, name="car", gate_m=3.0, kitti="Car", color=(255, 158, 44)),
         replace(_VEHICLE, name="truck", gate_m=3.0, kitti="Truck", color=(186, 222, 92)),
         replace(
@@ -66,7 +66,7 @@ NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
         replace(_CONE, name="traffic_cone", kitti="TrafficCone", color=(245, 222, 90)),
     )
 }
-VEHICLE_CLASSES = tuple(name for name, each in NUSCENES_CLASSES.items() if each.vehicle)
+VEHICLE_CLASSES = tuple(name for name, object_class in NUSCENES_CLASSES.items() if object_class.vehicle)
 
 
 @dataclass(frozen=True)
@@ -142,26 +142,26 @@ def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) 
         raise ValueError(f'class_settings: "{min(unknown)}" is not among the classes ({", ".join(given)})')
     made: dict[str, ObjectClass] = {}
     for name in given:
-        one = settings.get(name, ClassSettings()).resolve(name)
-        taken = any(other.color == one.color for other in made.values())
+        resolved = settings.get(name, ClassSettings()).resolve(name)
+        taken = any(other.color == resolved.color for other in made.values())
         stated = name in settings and settings[name].color is not None
-        made[name] = replace(one, color=None) if taken and not stated else one
+        made[name] = replace(resolved, color=None) if taken and not stated else resolved
     return made
 
 
 def without_meshes(settings: Mapping[str, ClassSettings]) -> dict[str, ClassSettings]:
     """The settings that mean the same on every machine; a class with none of them is left out."""
-    portable = {name: replace(one, mesh=None) for name, one in settings.items()}
-    return {name: one for name, one in portable.items() if one != ClassSettings()}
+    portable = {name: replace(own, mesh=None) for name, own in settings.items()}
+    return {name: own for name, own in portable.items() if own != ClassSettings()}
 
 
 def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
     """True for the ten classes with nuScenes' own settings: scores are then comparable to nuScenes'."""
-    return {name: _scoring(one) for name, one in classes.items()} == {
-        name: _scoring(one) for name, one in NUSCENES_CLASSES.items()
+    return {name: _scoring(kind) for name, kind in classes.items()} == {
+        name: _scoring(kind) for name, kind in NUSCENES_CLASSES.items()
     }
 
 
-def _scoring(one: ObjectClass) -> ObjectClass:
+def _scoring(kind: ObjectClass) -> ObjectClass:
     """The class without what changes no score."""
-    return replace(one, color=None, kitti="", gate_m=1.0, mesh="")
+    return replace(kind, color=None, kitti="", gate_m=1.0, mesh="")

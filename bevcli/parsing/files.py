@@ -183,9 +183,9 @@ def size_of_image(encoded: bytes) -> tuple[int, int] | None:
 def _jpeg_markers(encoded: bytes) -> Iterator[tuple[int, int]]:
     """Each marker of a JPEG that has a length, or is the end, and the offset behind it."""
     offset = 2
-    while found := _MARKER.search(encoded, offset):
-        yield encoded[found.end() - 1], found.end()
-        offset = found.end() + int.from_bytes(encoded[found.end() : found.end() + 2], "big")
+    while marker := _MARKER.search(encoded, offset):
+        yield encoded[marker.end() - 1], marker.end()
+        offset = marker.end() + int.from_bytes(encoded[marker.end() : marker.end() + 2], "big")
 
 
 def _is_cut_short(encoded: bytes) -> bool:

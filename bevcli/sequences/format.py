@@ -57,20 +57,19 @@ class Format:
         return opener(path, common, own)
 
 
-def formats() -> tuple[Format, ...]:
-    """All formats, in the order of their registered names. Those that cannot be imported are left out."""
-    return _loaded()[0]
+def formats(broken: list[BevcliError] | None = None) -> tuple[Format, ...]:
+    """All formats, in the order of their registered names.
 
-
-def _loaded() -> tuple[tuple[Format, ...], tuple[BevcliError, ...]]:
-    """The formats, and the errors of those that cannot be imported: a package of somebody else may be broken."""
-    found, broken = [], []
+    Those that cannot be imported are left out, as a package of somebody else may be broken. broken: gets their errors.
+    """
+    loaded: list[Format] = []
     for name in entries(GROUP):
         try:
-            found.append(load(GROUP, name))
+            loaded.append(load(GROUP, name))
         except BevcliError as error:
-            broken.append(error)
-    return tuple(found), tuple(broken)
+            if broken is not None:
+                broken.append(error)
+    return tuple(loaded)
 
 
 def option_classes() -> list[type[FormatOptions]]:
@@ -80,8 +79,8 @@ def option_classes() -> list[type[FormatOptions]]:
 
 def format_of(path: Path) -> Format:
     """The format of a path. Raises InputError if it is missing, or is no drive, or has two formats."""
-    known, broken = _loaded()
-    known = tuple(sorted(known, key=lambda form: form.precedence))  # in messages, the most general one comes first
+    broken: list[BevcliError] = []
+    known = sorted(formats(broken), key=lambda form: form.precedence)  # in messages, the most general one comes first
     if not path.exists():
         raise InputError(f"{path}: is missing (expected {_either([form.name for form in known])})")
     matching = [form for form in known if form.recognises(path)]
@@ -130,9 +129,9 @@ def drives_in(root: Path) -> dict[str, Path]:
     The name of a drive is that of its folder or file; with the folders above it where two have the same.
     """
     known = formats()
-    found = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
-    names = Counter(path.name for path in found.values())
-    return {name if names[path.name] > 1 else path.name: path for name, path in found.items()}
+    drives = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
+    names = Counter(path.name for path in drives.values())
+    return {name if names[path.name] > 1 else path.name: path for name, path in drives.items()}
 
 
 def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator[Path]:
@@ -156,8 +155,8 @@ def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: st
     """
     own = {name for form in chosen for name in defaults(form.options)}
     for name in (name for name in values if name not in own):
-        known, broken = _loaded()
-        having = [form for form in known if name in defaults(form.options)]
+        broken: list[BevcliError] = []
+        having = [form for form in formats(broken) if name in defaults(form.options)]
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0].options)[name]:

@@ -54,8 +54,8 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         path, options = drive, replace(options, scene=None)
     chosen = format_of(path)
     check_options(changes, [chosen], f"{path}: is {chosen.name}")
-    known = defaults(chosen.options)
-    own = gather(chosen.options, None, {name: value for name, value in changes.items() if name in known})
+    own_defaults = defaults(chosen.options)
+    own = gather(chosen.options, None, {name: value for name, value in changes.items() if name in own_defaults})
     sequence = chosen.open(path, options, own)
     check_time_unit(sequence, path)
     if options.ground_truth:
@@ -142,7 +142,7 @@ def check_time_unit(sequence: Sequence, source: object) -> None:
     if period < SHORTEST_PERIODS_NS[0]:
         # In place of nanoseconds, or of microseconds as in nuScenes' tables.
         units = {10**3: "microseconds or milliseconds", 10**6: "milliseconds or seconds", 10**9: "seconds"}
-        factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)
+        factor = next((multiple for multiple in units if period * multiple >= SHORTEST_PERIODS_NS[1]), 10**9)
         raise InputError(
             f"{source}: the timestamps are {factor} times too small (in {units[factor]}?): the frames are {period:.0f} "
             f"ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
@@ -164,8 +164,8 @@ def select_scene(sequence: Sequence, scene: str) -> Sequence:
     indices = [index for index, stamp in enumerate(sequence.stamps) if stamp.scene == scene]
     if not indices:
         names = sorted({stamp.scene for stamp in sequence.stamps} - {""})
-        found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "no scenes"
-        raise InputError(f'{sequence.name}: has no scene "{scene}" (found {found})')
+        scenes = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "no scenes"
+        raise InputError(f'{sequence.name}: has no scene "{scene}" (found {scenes})')
     return select(sequence, indices)
 
 

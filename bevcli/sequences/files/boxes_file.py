@@ -76,13 +76,13 @@ class ClassNames:
         A name that the user renames keeps its name, so that `renames` finds it.
         """
         renamed = {name.lower() for name in renames}
-        return ClassNames({name: one for name, one in table.items() if name.lower() not in renamed})
+        return ClassNames({name: target for name, target in table.items() if name.lower() not in renamed})
 
     def __getitem__(self, name: str) -> str:
-        found = self._by_name.get(name)
-        if found is None:
-            found = self._by_name[name] = self._by_lower_case.get(name.lower(), name)
-        return found
+        exact = self._by_name.get(name)
+        if exact is None:
+            exact = self._by_name[name] = self._by_lower_case.get(name.lower(), name)
+        return exact
 
     def renamed(self, boxes: Boxes3D) -> Boxes3D:
         """The boxes with the names of known classes."""
@@ -212,13 +212,13 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         if values is None:
             continue
         if column.values == "score":
-            known = np.ones(len(values), dtype=bool)  # written always, so that NaN is an error
+            written = np.ones(len(values), dtype=bool)  # written always, so that NaN is an error
         elif column.values == "count":
-            known = values >= 0  # two unknown numbers may add up to -2
+            written = values >= 0  # two unknown numbers may add up to -2
         else:
-            known = ~np.isnan(values) if column.values == "share" else values != column.unknown
-        for box, value, is_known in zip(objects, values.tolist(), known.tolist(), strict=True):
-            if is_known:
+            written = ~np.isnan(values) if column.values == "share" else values != column.unknown
+        for box, value, is_written in zip(objects, values.tolist(), written.tolist(), strict=True):
+            if is_written:
                 box[column.key] = value
     if boxes.futures is not None:
         _add_futures(objects, boxes, boxes.futures)

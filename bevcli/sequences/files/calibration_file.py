@@ -127,7 +127,7 @@ def _parse_geo_origin(value: object, report: Report) -> GeoOrigin | None:
         expected = '{"latitude": 48.137, "longitude": 11.575, "heading_deg": 90}'
         report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
         return None
-    inside, stated = report.within("geo_origin"), {"heading_deg": EAST_DEG, **value}
+    inside, stated = replace(report, prefix="geo_origin."), {"heading_deg": EAST_DEG, **value}
     degrees: list[float] = []
     for name, limit in ORIGIN_LIMITS.items():
         number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), inside)
@@ -253,5 +253,5 @@ def _parse_distortion(value: object, report: Report) -> Distortion | None:
         return None
     if model == "none":
         return None
-    coefficients = parse_numbers(value, "coefficients", (count,), report.within("distortion"))
+    coefficients = parse_numbers(value, "coefficients", (count,), replace(report, prefix="distortion."))
     return None if coefficients is None else Distortion(model, tuple(map(float, coefficients)))

@@ -167,13 +167,13 @@ def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -
     """
     missing = f'the file is missing (expected {kind}, "format": "{form}")'
     content = read_entries(path, missing=missing)
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if found != form:
-        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {found!r:.40}')
+    stated = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if stated != form:
+        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {stated!r:.40}')
     reference = content.get("frame_of_reference")
     if reference not in references:
-        known = f"{', '.join(references[:-1])} or {references[-1]}"
-        raise InputError(f'{path}: "frame_of_reference" must be {known}, found {reference!r:.40}')
+        expected = f"{', '.join(references[:-1])} or {references[-1]}"
+        raise InputError(f'{path}: "frame_of_reference" must be {expected}, found {reference!r:.40}')
     if not isinstance(content.get("frames"), list):
         raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
     return content

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,16 +25,12 @@ class Report:
     Attributes:
         camera: the camera that the fields belong to, None for the whole file.
         prefix: path of the enclosing keys, such as "ego_from_camera.".
-        findings: the findings so far; reports made by `within` share the list.
+        findings: the findings so far; copies made by `replace` share the list.
     """
 
     camera: str | None = None
     prefix: str = ""
     findings: list[Finding] = field(default_factory=list)
-
-    def within(self, name: str) -> Self:
-        """A report on the fields inside the field `name` that adds to the same findings."""
-        return replace(self, prefix=f"{self.prefix}{name}.")
 
     def error(
         self, code: str, name: str, message: str, *, expected: str = "", found: object = "", advice: str = ""
@@ -106,11 +102,18 @@ def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Arra
     if not isinstance(value, dict):
         report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
         return None
-    inside = report.within(name)
+    inside = replace(report, prefix=f"{name}.")
     translation, rotation = parse_numbers(value, "translation", (3,), inside), None
     if "rotation" not in value:
         quaternion = parse_numbers(value, "rotation_wxyz", (4,), inside)
-        rotation = None if quaternion is None else _rotation_of(quaternion, inside)
+        norm = 0.0 if quaternion is None else float(np.linalg.norm(quaternion))
+        if quaternion is not None and abs(norm - 1) > TOLERANCE:
+            inside.error(
+                "quaternion-norm", "rotation_wxyz", "is not a rotation: its norm is not 1",
+                expected="1 ± 0.001", found=f"{norm:.6g}",
+                advice="check for missing or rounded digits; the order is w, x, y, z",
+            )  # fmt: skip
+        rotation = None if quaternion is None or norm <= TOLERANCE else rotation_from_quaternion(quaternion)
     elif "rotation_wxyz" in value:
         inside.error("rotation-twice", "rotation", 'is given in addition to "rotation_wxyz"', expected="one of them")
     else:
@@ -139,19 +142,6 @@ def pose_from_json(value: Any, name: str, where: str) -> Pose:
 def pose_to_json(pose: Pose) -> dict[str, list[float]]:
     """The pose in JSON, as `pose_from_json` reads it."""
     return {"translation": pose.translation.tolist(), "rotation_wxyz": pose.quaternion.tolist()}
-
-
-def _rotation_of(quaternion: Array, report: Report) -> Array | None:
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > TOLERANCE:
-        report.error(
-            "quaternion-norm", "rotation_wxyz", "is not a rotation: its norm is not 1",
-            expected="1 ± 0.001", found=f"{norm:.6g}",
-            advice="check for missing or rounded digits; the order is w, x, y, z",
-        )  # fmt: skip
-        if norm <= TOLERANCE:
-            return None
-    return rotation_from_quaternion(quaternion)
 
 
 def _nearest_rotation(matrix: Array, report: Report) -> Array | None:

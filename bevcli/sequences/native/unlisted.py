@@ -140,25 +140,25 @@ def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> 
 def _numbered(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: the folder is missing (the calibration has the camera {folder.name})")
-    found: dict[int, Path] = {}
+    images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if not (path.stem.isascii() and path.stem.isdigit()):
             raise InputError(f"{path}: the name is not a number (expected a time or an index): list it in frames.csv")
-        if int(path.stem) in found:
-            raise InputError(f"{path}: {found[int(path.stem)].name} has the same number: remove one")
-        found[int(path.stem)] = path
-    if not found:
+        if int(path.stem) in images:
+            raise InputError(f"{path}: {images[int(path.stem)].name} has the same number: remove one")
+        images[int(path.stem)] = path
+    if not images:
         raise InputError(f"{folder}: the folder has no images (expected files ending in {', '.join(IMAGE_SUFFIXES)})")
-    return found
+    return images
 
 
 def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> list[int]:
     """The sorted image numbers, which must be the same for every camera."""
     everywhere = sorted(set().union(*images.values()))
-    for name, found in images.items():
-        missing = [number for number in everywhere if number not in found]
+    for name, numbered in images.items():
+        missing = [number for number in everywhere if number not in numbered]
         if missing:
             raise InputError(
                 f"{folder / 'images' / name}: {len(missing)} images are missing that other cameras have, the first "
@@ -189,9 +189,9 @@ def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> Found:
 
 
 def _video_of(folder: Path, camera: str, timing: Timing) -> CameraVideo:
-    found = [path for path in sorted(folder.glob(f"{camera}.*")) if path.suffix.lower() in VIDEO_SUFFIXES]
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found) or "none"
+    videos = [path for path in sorted(folder.glob(f"{camera}.*")) if path.suffix.lower() in VIDEO_SUFFIXES]
+    if len(videos) != 1:
+        names = ", ".join(path.name for path in videos) or "none"
         raise InputError(f"{folder}: camera {camera}: expected one video, such as {camera}.mp4, found {names}")
-    count, rate_hz = count_and_rate(found[0])
-    return CameraVideo(found[0], count, timing.start_ns, timing.rate_hz or rate_hz)
+    count, rate_hz = count_and_rate(videos[0])
+    return CameraVideo(videos[0], count, timing.start_ns, timing.rate_hz or rate_hz)
