@@ -35,8 +35,8 @@ OWN: dict[Group, dict[str, str]] = {
         "constant_parts BEVFormerV2": "bevcli.model.bevformer_v2.constant_parts:fix_attentions",
     },
     "bevcli.sequences": {
-        "native": "bevcli.sequences.native.format:FORMAT",
-        "nuscenes": "bevcli.sequences.nuscenes.format:FORMAT",
+        "native": "bevcli.sequences.native:FORMAT",
+        "nuscenes": "bevcli.sequences.nuscenes:FORMAT",
     },
     "bevcli.box_formats": {
         "csv": "bevcli.evaluation.box_format:CSV",

@@ -22,8 +22,8 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nu
 from bevcli.options import defaults
 from bevcli.printing import aligned, counted
 from bevcli.registry import entries, load
-from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.files.boxes_file import ClassNames, count_classes
+from bevcli.sequences.nuscenes import NuScenesOptions
 
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "

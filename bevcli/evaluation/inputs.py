@@ -14,11 +14,10 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
-from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.boxes_file import BoxesFile, ClassNames, FrameBoxes, read_boxes
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
-from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence

@@ -1,6 +1,5 @@
 """nuScenes submissions for detection (results_nusc.json) and tracking (tracking_nusc.json): written, and read."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,6 @@ TRACKED = tuple(name for name, kind in NUSCENES_CLASSES.items() if kind.tracked)
 DETECTION_COLUMNS = {"detection_name": "classes", "detection_score": "scores", "attribute_name": "attributes"}
 TRACKING_COLUMNS = {"tracking_id": "instances", "tracking_name": "classes", "tracking_score": "track_scores"}
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
-_TAIL = "}}"
 _PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
 
 
@@ -38,7 +36,7 @@ class SubmissionWriter(IncrementalJson):
 
     def __init__(self, path: Path, resume_at: int | None = None, *, tracking: bool = False) -> None:
         self._boxes = tracking_submission_boxes if tracking else submission_boxes
-        super().__init__(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
+        super().__init__(path, {"meta": META}, "results", resume_at, "{}")
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
@@ -124,7 +122,7 @@ def read_submission(path: Path) -> BoxesFile:
 
     A submission has no scenes, timestamps and ego poses.
     """
-    content = read_entries(path, _TAIL)
+    content = read_entries(path, "{}")
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(f'{path}: "results" must be an object of sample tokens, as in a nuScenes submission')

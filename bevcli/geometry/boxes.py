@@ -1,6 +1,6 @@
 """Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from math import nan
 from typing import Annotated, Any, Literal
@@ -199,23 +199,3 @@ def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64],
     with np.errstate(divide="ignore", invalid="ignore"):
         velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
     return np.where(known[:, None], velocities, np.nan)
-
-
-def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int]) -> list[Boxes3D]:
-    """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`; "" is none.
-
-    timestamps_ns: (T,) increasing.
-    """
-    together = Boxes3D.concatenate(frames)
-    if together.instances is None:
-        return list(frames)
-    counts = [len(boxes) for boxes in frames]
-    seconds = np.repeat((np.asarray(timestamps_ns) - timestamps_ns[0]) * 1e-9, counts)
-    order = np.lexsort((seconds, together.instances))
-    names = together.instances[order]
-    same = (names[1:] == names[:-1]) & (names[1:] != "")
-    first, last = np.arange(len(order)), np.arange(len(order))
-    first[order[1:][same]], last[order[:-1][same]] = order[:-1][same], order[1:][same]
-    velocities = velocities_between(together.centers, seconds, first, last)[:, :2]
-    parts = np.split(velocities, np.cumsum(counts)[:-1])
-    return [replace(boxes, velocities=own) for boxes, own in zip(frames, parts, strict=True)]

@@ -175,20 +175,6 @@ class CameraRig:
         return next(camera for camera in self.cameras if camera.name == name)
 
 
-def same_rig(one: CameraRig, other: CameraRig) -> bool:
-    """True if all names and numbers of two rigs are equal."""
-    return (
-        one.names == other.names
-        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
-        and all(
-            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
-            and np.array_equal(a.intrinsics, b.intrinsics)
-            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(one.cameras, other.cameras, strict=True)
-        )
-    )
-
-
 def default_ego_from_bev() -> Array:
     """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, origin at (0.94, 0, 1.84) m in ego."""
     return rigid((0.94, 0.0, 1.84), [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -245,8 +231,8 @@ def _undistorted(bent: Array, distortion: Distortion) -> Array:
 
     OpenCV's solution alone is off by some pixels at strong distortion, so it is refined.
     """
-    found = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
-    rays = np.asarray(found, dtype=np.float64).reshape(bent.shape)
+    solved = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
+    rays = np.asarray(solved, dtype=np.float64).reshape(bent.shape)
     for _ in range(REFINEMENTS):
         rays = rays + (bent - distort(rays, distortion))
     error = np.abs(distort(rays, distortion) - bent).max(-1, keepdims=True)

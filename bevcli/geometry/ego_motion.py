@@ -70,7 +70,7 @@ class EgoMotion:
 
     def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
         """The poses and kinematics of some rows, by their increasing indices."""
-        columns = [each.name for each in fields(self) if each.name != "velocities_are_stated"]
+        columns = [column.name for column in fields(self) if column.name != "velocities_are_stated"]
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     def pose_at(self, timestamp_ns: int) -> Pose:
@@ -89,11 +89,8 @@ class EgoMotion:
         """Acceleration, angular rate and velocity at a time, interpolated linearly. Raises InputError as `pose_at`."""
         row, fraction = self._locate(timestamp_ns)
         later = min(row + 1, len(self.timestamps_ns) - 1)
-
-        def mix(column: Array) -> Array:
-            return column[row] + fraction * (column[later] - column[row])
-
-        return Kinematics(mix(self.accelerations), mix(self.angular_rates), mix(self.velocities))
+        columns = self.accelerations, self.angular_rates, self.velocities
+        return Kinematics(*(column[row] + fraction * (column[later] - column[row]) for column in columns))
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
         times, first, last = self.timestamps_ns, self.first_ns, self.last_ns
@@ -124,7 +121,7 @@ def motion_of_keyframes(keyframes: PoseTable, others: PoseTable) -> EgoMotion:
     times, first = np.unique(np.concatenate([key_times, others[0]]), return_index=True)
     translations, quaternions = (np.concatenate([keyframes[k], others[k]])[first] for k in (1, 2))
     derived = [rough.kinematics_at(int(time)) for time in np.clip(times, key_times[0], key_times[-1])]
-    kinematics = zip(*(vars(one).values() for one in derived), strict=True)
+    kinematics = zip(*(vars(at_time).values() for at_time in derived), strict=True)
     return EgoMotion(times, translations, quaternions, *map(np.stack, kinematics))
 
 
@@ -150,7 +147,7 @@ def derive_kinematics(
     rates = np.stack(
         [skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0], skew[:, 1, 0] - skew[:, 0, 1]], axis=-1
     )
-    accelerations, velocities = (np.einsum("tji,tj->ti", rotations, each) for each in (acceleration, velocity))
+    accelerations, velocities = (np.einsum("tji,tj->ti", rotations, vectors) for vectors in (acceleration, velocity))
     return accelerations, rates / 2, velocities
 
 
@@ -172,7 +169,7 @@ class RecentPoses:
 
     def with_pose(self, timestamp_ns: int, pose: Pose) -> "RecentPoses":
         """The poses with a later one."""
-        recent = (one for one in self._kept if timestamp_ns - one[0] <= self.LONGEST_NS)
+        recent = (earlier for earlier in self._kept if timestamp_ns - earlier[0] <= self.LONGEST_NS)
         return RecentPoses((*recent, (timestamp_ns, pose)))
 
     def kinematics(self) -> Kinematics:

@@ -1,6 +1,5 @@
 """Classes of objects: how each is scored, tracked, drawn and exported. A model names its own; nuScenes has ten."""
 
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -40,57 +39,34 @@ class ObjectClass:
     mesh: str = ""
 
 
-def _vehicle(
-    name: str, kitti: str, gate_m: float, color: Color, still: str = "vehicle.parked", *, tracked: bool = True
-) -> ObjectClass:
-    attributes = ("vehicle.moving", still)
-    return ObjectClass(name, 50.0, gate_m, tracked, attributes, (), vehicle=True, kitti=kitti, color=color)
-
-
-def _cycle(name: str, kitti: str, gate_m: float, color: Color) -> ObjectClass:
-    attributes = ("cycle.with_rider", "cycle.without_rider")
-    return ObjectClass(name, 40.0, gate_m, True, attributes, (), vehicle=True, kitti=kitti, color=color)
-
-
-def _static(name: str, kitti: str, color: Color, *undefined_errors: str) -> ObjectClass:
-    symmetric = "orient_err" not in undefined_errors
-    return ObjectClass(name, 30.0, 1.0, False, ("", ""), undefined_errors, symmetric, kitti=kitti, color=color)
-
-
+_VEHICLE = ObjectClass("", 50.0, attributes=("vehicle.moving", "vehicle.parked"), undefined_errors=(), vehicle=True)
+_CYCLE = replace(_VEHICLE, range_m=40.0, attributes=("cycle.with_rider", "cycle.without_rider"))
+_BUS = replace(_VEHICLE, attributes=("vehicle.moving", "vehicle.stopped"))
 _WALKING = ("pedestrian.moving", "pedestrian.standing")
+_BARRIER = ObjectClass("", 30.0, 1.0, False, undefined_errors=("vel_err", "attr_err"), symmetric=True)
+_CONE = ObjectClass("", 30.0, 1.0, False, undefined_errors=("orient_err", "vel_err", "attr_err"))
 
 # The ten detection classes of nuScenes, in the order of the published models' class scores. Ranges, tracked classes and
 # undefined errors are those of its devkit (detection_cvpr_2019, tracking_nips_2019). A standing bus is "stopped", not
 # "parked", as in the original BEVFormer. No class is red: red marks a miss or a false positive.
 NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
-    each.name: each
-    for each in (
-        _vehicle("car", "Car", 3.0, (255, 158, 44)),
-        _vehicle("truck", "Truck", 3.0, (186, 222, 92)),
-        _vehicle("construction_vehicle", "ConstructionVehicle", 4.0, (205, 155, 110), tracked=False),
-        _vehicle("bus", "Bus", 5.0, (240, 108, 190), "vehicle.stopped"),
-        _vehicle("trailer", "Trailer", 4.0, (110, 190, 120)),
-        _static("barrier", "Barrier", (150, 160, 175), "vel_err", "attr_err"),
-        _cycle("motorcycle", "Motorcycle", 4.0, (178, 130, 255)),
-        _cycle("bicycle", "Cyclist", 2.5, (96, 165, 255)),
+    object_class.name: object_class
+    for object_class in (
+        replace(_VEHICLE, name="car", gate_m=3.0, kitti="Car", color=(255, 158, 44)),
+        replace(_VEHICLE, name="truck", gate_m=3.0, kitti="Truck", color=(186, 222, 92)),
+        replace(
+            _VEHICLE, name="construction_vehicle", tracked=False, kitti="ConstructionVehicle", color=(205, 155, 110)
+        ),
+        replace(_BUS, name="bus", gate_m=5.0, kitti="Bus", color=(240, 108, 190)),
+        replace(_VEHICLE, name="trailer", kitti="Trailer", color=(110, 190, 120)),
+        replace(_BARRIER, name="barrier", kitti="Barrier", color=(150, 160, 175)),
+        replace(_CYCLE, name="motorcycle", kitti="Motorcycle", color=(178, 130, 255)),
+        replace(_CYCLE, name="bicycle", gate_m=2.5, kitti="Cyclist", color=(96, 165, 255)),
         ObjectClass("pedestrian", 40.0, 2.0, True, _WALKING, (), kitti="Pedestrian", color=(70, 222, 190)),
-        _static("traffic_cone", "TrafficCone", (245, 222, 90), "orient_err", "vel_err", "attr_err"),
+        replace(_CONE, name="traffic_cone", kitti="TrafficCone", color=(245, 222, 90)),
     )
 }
-# Mean length, width and height of their boxes in nuScenes, metres.
-NUSCENES_SIZES: Mapping[str, tuple[float, float, float]] = {
-    "car": (4.6, 1.95, 1.72),
-    "truck": (6.93, 2.51, 2.84),
-    "construction_vehicle": (6.37, 2.73, 3.19),
-    "bus": (10.5, 2.94, 3.47),
-    "trailer": (12.29, 2.9, 3.87),
-    "barrier": (0.5, 2.53, 0.98),
-    "motorcycle": (2.11, 0.77, 1.47),
-    "bicycle": (1.7, 0.6, 1.28),
-    "pedestrian": (0.73, 0.67, 1.77),
-    "traffic_cone": (0.41, 0.41, 1.07),
-}
-VEHICLE_CLASSES = tuple(name for name, each in NUSCENES_CLASSES.items() if each.vehicle)
+VEHICLE_CLASSES = tuple(name for name, object_class in NUSCENES_CLASSES.items() if object_class.vehicle)
 
 
 @dataclass(frozen=True)
@@ -166,36 +142,26 @@ def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) 
         raise ValueError(f'class_settings: "{min(unknown)}" is not among the classes ({", ".join(given)})')
     made: dict[str, ObjectClass] = {}
     for name in given:
-        one = settings.get(name, ClassSettings()).resolve(name)
-        taken = any(other.color == one.color for other in made.values())
+        resolved = settings.get(name, ClassSettings()).resolve(name)
+        taken = any(other.color == resolved.color for other in made.values())
         stated = name in settings and settings[name].color is not None
-        made[name] = replace(one, color=None) if taken and not stated else one
+        made[name] = replace(resolved, color=None) if taken and not stated else resolved
     return made
 
 
 def without_meshes(settings: Mapping[str, ClassSettings]) -> dict[str, ClassSettings]:
     """The settings that mean the same on every machine; a class with none of them is left out."""
-    portable = {name: replace(one, mesh=None) for name, one in settings.items()}
-    return {name: one for name, one in portable.items() if one != ClassSettings()}
-
-
-def class_of_size(length: float, width: float, height: float) -> str:
-    """The nuScenes class whose boxes are most alike to one of this size, in metres, by the ratios of their sides."""
-    size = length, width, height
-
-    def difference(name: str) -> float:
-        return sum(abs(math.log(a / b)) for a, b in zip(NUSCENES_SIZES[name], size, strict=True))
-
-    return min(NUSCENES_SIZES, key=difference)
+    portable = {name: replace(own, mesh=None) for name, own in settings.items()}
+    return {name: own for name, own in portable.items() if own != ClassSettings()}
 
 
 def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
     """True for the ten classes with nuScenes' own settings: scores are then comparable to nuScenes'."""
-    return {name: _scoring(one) for name, one in classes.items()} == {
-        name: _scoring(one) for name, one in NUSCENES_CLASSES.items()
+    return {name: _scoring(kind) for name, kind in classes.items()} == {
+        name: _scoring(kind) for name, kind in NUSCENES_CLASSES.items()
     }
 
 
-def _scoring(one: ObjectClass) -> ObjectClass:
+def _scoring(kind: ObjectClass) -> ObjectClass:
     """The class without what changes no score."""
-    return replace(one, color=None, kitti="", gate_m=1.0, mesh="")
+    return replace(kind, color=None, kitti="", gate_m=1.0, mesh="")

@@ -268,14 +268,6 @@ def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = 
     if not lines:
         raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
     columns = [name_of(cell.strip()) for cell in lines[0][1]]
-    _check_columns(path, columns, required, optional)
-    rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
-    if not rows:
-        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
-    return rows
-
-
-def _check_columns(path: Path, columns: list[str], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
     missing = [name for name in required if name not in columns]
     if missing and len(columns) == 1:
         for character, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
@@ -288,11 +280,15 @@ def _check_columns(path: Path, columns: list[str], required: tuple[str, ...], op
             raise InputError(f'{path}: unknown column "{name}" (known: {", ".join((*required, *optional))})')
         if columns.count(name) > 1:
             raise InputError(f'{path}: column "{name}" appears twice in the header')
-
-
-def _row(path: Path, columns: list[str], line: int, cells: list[str]) -> CsvRow:
-    if any("\0" in cell for cell in cells):
-        raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
-    if len(cells) != len(columns):
-        raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
-    return CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})
+    rows: list[CsvRow] = []
+    for line, cells in lines[1:]:
+        if any("\0" in cell for cell in cells):
+            raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
+        if len(cells) != len(columns):
+            raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
+        rows.append(
+            CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})
+        )
+    if not rows:
+        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
+    return tuple(rows)

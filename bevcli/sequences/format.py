@@ -11,7 +11,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import defaults, gather
+from bevcli.options import defaults
 from bevcli.parsing.files import is_there
 from bevcli.registry import entries, load
 from bevcli.sequences.options import FormatOptions, SequenceOptions
@@ -57,20 +57,19 @@ class Format:
         return opener(path, common, own)
 
 
-def formats() -> tuple[Format, ...]:
-    """All formats, in the order of their registered names. Those that cannot be imported are left out."""
-    return _loaded()[0]
+def formats(broken: list[BevcliError] | None = None) -> tuple[Format, ...]:
+    """All formats, in the order of their registered names.
 
-
-def _loaded() -> tuple[tuple[Format, ...], tuple[BevcliError, ...]]:
-    """The formats, and the errors of those that cannot be imported: a package of somebody else may be broken."""
-    found, broken = [], []
+    Those that cannot be imported are left out, as a package of somebody else may be broken. broken: gets their errors.
+    """
+    loaded: list[Format] = []
     for name in entries(GROUP):
         try:
-            found.append(load(GROUP, name))
+            loaded.append(load(GROUP, name))
         except BevcliError as error:
-            broken.append(error)
-    return tuple(found), tuple(broken)
+            if broken is not None:
+                broken.append(error)
+    return tuple(loaded)
 
 
 def option_classes() -> list[type[FormatOptions]]:
@@ -80,8 +79,8 @@ def option_classes() -> list[type[FormatOptions]]:
 
 def format_of(path: Path) -> Format:
     """The format of a path. Raises InputError if it is missing, or is no drive, or has two formats."""
-    known, broken = _loaded()
-    known = tuple(sorted(known, key=lambda form: form.precedence))  # in messages, the most general one comes first
+    broken: list[BevcliError] = []
+    known = sorted(formats(broken), key=lambda form: form.precedence)  # in messages, the most general one comes first
     if not path.exists():
         raise InputError(f"{path}: is missing (expected {_either([form.name for form in known])})")
     matching = [form for form in known if form.recognises(path)]
@@ -130,9 +129,9 @@ def drives_in(root: Path) -> dict[str, Path]:
     The name of a drive is that of its folder or file; with the folders above it where two have the same.
     """
     known = formats()
-    found = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
-    names = Counter(path.name for path in found.values())
-    return {name if names[path.name] > 1 else path.name: path for name, path in found.items()}
+    drives = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
+    names = Counter(path.name for path in drives.values())
+    return {name if names[path.name] > 1 else path.name: path for name, path in drives.items()}
 
 
 def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator[Path]:
@@ -148,13 +147,6 @@ def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator
                 yield from _drives_below(path, known, depth - 1)
 
 
-def own_options(path: Path, chosen: Format, values: dict[str, Any]) -> FormatOptions:
-    """The own options of a path's format. Raises as `check_options`."""
-    check_options(values, [chosen], f"{path}: is {chosen.name}")
-    own = defaults(chosen.options)
-    return gather(chosen.options, None, {name: value for name, value in values.items() if name in own})
-
-
 def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: str) -> None:
     """Check that formats have the options that are given. Values that are the default are accepted for every format.
 
@@ -163,8 +155,8 @@ def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: st
     """
     own = {name for form in chosen for name in defaults(form.options)}
     for name in (name for name in values if name not in own):
-        known, broken = _loaded()
-        having = [form for form in known if name in defaults(form.options)]
+        broken: list[BevcliError] = []
+        having = [form for form in formats(broken) if name in defaults(form.options)]
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0].options)[name]:

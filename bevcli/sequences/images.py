@@ -1,123 +1,38 @@
 """A listed frame -> a Frame: its images, read from files or videos and decoded in parallel, and its poses."""
 
-import contextlib
+from __future__ import annotations
+
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.files import MIB, open_regular, plain_name, read_bytes
-from bevcli.parsing.images import decode_image, media_type_of, size_of_image
-from bevcli.sequences.files.class_names import count_classes
+from bevcli.parsing.files import MIB, decode_image, media_type_of, read_bytes, size_of_image
+from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.waiting import result_within
 
-# Where the beginning of a file shows its container: offset and bytes. The last row is that of streams in bags.
-CONTAINERS = (
-    (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
-    (0, b"\x1a\x45\xdf\xa3"), (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"),
-)  # fmt: skip
-MOST_PIXELS = 1 << 26  # of an image in a video or a bag
-SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
+if TYPE_CHECKING:
+    from bevcli.sequences.videos import VideoReader
+
 DECODING_THREADS = 6
 READING_TIMEOUT_S = 120.0
 LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
 # The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
 DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
-
-
-class VideoReader:
-    """Reads the images of one video by index. In order, each image is decoded once; going back reopens the video."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._capture: cv2.VideoCapture | None = None
-        self._at = -1  # index of the image in `_pixels`
-        self._pixels: NDArray[np.uint8] | None = None
-        self._end: int | None = None  # number of images, known once the end was reached
-
-    def read(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR of image `index`, from 0.
-
-        Raises InputError if the file is missing, is not a video, or does not have the image.
-        """
-        if self._end is not None and index >= self._end:
-            raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
-        if self._capture is None or index < self._at:
-            self._capture, self._at, self._pixels = open_capture(self.path), -1, None
-        if index == self._at and self._pixels is not None:
-            return self._pixels
-        while self._at < index:
-            grabbed = False
-            with contextlib.suppress(cv2.error):  # a damaged stream
-                grabbed = self._capture.grab()
-            if not grabbed:
-                self._end, self._capture = self._at + 1, None
-                raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
-            self._at += 1
-        with contextlib.suppress(cv2.error):
-            readable, pixels = self._capture.retrieve()
-            if readable:
-                self._pixels = pixels.astype(np.uint8, copy=False)
-                return self._pixels
-        raise InputError(f"{self.path}: image {index} cannot be decoded")
-
-
-def open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a video. Raises InputError if it is missing or OpenCV cannot read it."""
-    with open_regular(path, missing="is missing") as file:
-        start = file.read(12)
-    # FFmpeg recognises playlists too, which could lead it to other files and to servers.
-    if not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
-        raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
-    try:
-        with plain_name(path) as name:
-            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
-    except cv2.error:
-        capture = cv2.VideoCapture()
-    if not capture.isOpened():
-        raise InputError(f"{path} cannot be opened as a video (expected a codec such as H.264 or FFV1)")
-    # The calibration is that of the pixels as they are stored, and versions of OpenCV differ in whether they turn them.
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    width, height = (capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    if not 0 < width * height <= MOST_PIXELS:
-        capture.release()
-        raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
-    return capture
-
-
-def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:
-    """A note on each video with a tag by which players turn its images. Videos that cannot be read have none."""
-    for path in paths:
-        with contextlib.suppress(InputError):
-            degrees = open_capture(path).get(cv2.CAP_PROP_ORIENTATION_META)
-            if degrees % 360:
-                yield f"{path}: has a rotation tag ({degrees:.0f} degrees): its images are read as they are stored"
-
-
-def count_and_rate(path: Path) -> tuple[int, float]:
-    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
-    capture = open_capture(path)
-    count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
-    capture.release()
-    if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
-        raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
-    return int(count), rate
 
 
 @dataclass(frozen=True)
@@ -217,7 +132,16 @@ class ImageReader:
 
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:
         if isinstance(source, ImageSource):
-            self._check_place(source)
+            if self._inside is not None:
+                try:
+                    path = os.path.realpath(source.path)
+                except ValueError:  # a null byte
+                    raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
+                if os.path.commonpath((path, self._inside)) != self._inside:
+                    raise InputError(
+                        f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
+                        "`allow_outside=True` to read it"
+                    )
             is_file = source.video_index is None
             image = self._read_file(source, camera) if is_file else self._read_video(source, camera.name)
         else:
@@ -226,19 +150,6 @@ class ImageReader:
         self._check_size(source, camera, (width, height))
         self._fitting.add(camera.name)
         return image
-
-    def _check_place(self, source: ImageSource) -> None:
-        if self._inside is None:
-            return
-        try:
-            path = os.path.realpath(source.path)
-        except ValueError:  # a null byte
-            raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
-        if os.path.commonpath((path, self._inside)) != self._inside:
-            raise InputError(
-                f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
-                "`allow_outside=True` to read it"
-            )
 
     def _check_size(self, source: Source, camera: Camera, size: tuple[int, int]) -> None:
         """Raises InputError for a wrong size of a camera's first image, UnreadableImage for that of a later one."""
@@ -261,13 +172,15 @@ class ImageReader:
         if size is None:
             raise UnreadableImage(f"{source.path} is not a complete image (expected a JPEG or PNG)")
         self._check_size(source, camera, size)
-        pixels = decode(encoded, size[0] * size[1])
+        pixels = decode_image(encoded, DECODE_FLAGS, size[0] * size[1])
         if pixels is None:
             raise UnreadableImage(f"{source.path} is not a complete image")
         media_type = media_type_of(encoded)
         return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
     def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
+        from bevcli.sequences.videos import VideoReader
+
         reader = self._videos.get(camera)
         if reader is None or reader.path != source.path:
             reader = self._videos[camera] = VideoReader(source.path)
@@ -276,12 +189,6 @@ class ImageReader:
             return CameraImage(source.timestamp_ns, reader.read(source.video_index))
         except InputError as error:
             raise UnreadableImage(str(error)) from None
-
-
-def decode(encoded: bytes, most_pixels: int = MOST_PIXELS) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 BGR of an image file; None for another format, a damaged one, or one of more pixels (64 MP)."""
-    pixels = decode_image(encoded, DECODE_FLAGS, most_pixels)
-    return None if pixels is None else pixels.astype(np.uint8, copy=False)
 
 
 @dataclass(frozen=True)
@@ -299,40 +206,6 @@ class FrameEntry:
     sources: Mapping[str, Source]
     dropped: Mapping[str, str]
     origin: str
-
-
-def read_frame(
-    entry: FrameEntry,
-    rig: CameraRig,
-    reader: ImageReader,
-    motion: EgoMotion | None,
-    ground_truth: Boxes3D | None = None,
-    ground_truth_map: BevMap | None = None,
-) -> Frame:
-    """The frame of an entry, with decoded images. Without motion, poses are the identity, and the vehicle is at rest.
-
-    Raises InputError as `ImageReader.read`, and for a time that the motion does not cover.
-    """
-    images, dropped = reader.read(entry.sources, rig, entry.dropped)
-    frame_ns = entry.stamp.timestamp_ns
-    times = dict.fromkeys(rig.names, frame_ns)
-    times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
-    times |= {name: image.timestamp_ns for name, image in images.items()}
-
-    def pose_at(time: int) -> Pose:
-        return Pose.identity() if motion is None else motion.pose_at(time)
-
-    return Frame(
-        stamp=entry.stamp,
-        rig=rig,
-        images=images,
-        world_from_ego=pose_at(frame_ns),
-        world_from_ego_at={name: pose_at(time) for name, time in times.items()},
-        kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
-        dropped=dropped,
-        ground_truth=ground_truth,
-        ground_truth_map=ground_truth_map,
-    )
 
 
 def leads_out(path: Path, folder: Path) -> bool:
@@ -399,5 +272,25 @@ class ListedSequence(Sequence):
         return self._frame(place, self._entries[place])
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
-        """The frame at a place, of its entry or of one without images."""
-        return read_frame(entry, self._rigs[place], self._images, self.ego_motion, self._truth.get(place))
+        """The frame at a place, of its entry or of one without images.
+
+        Without ego-motion, poses are the identity, and the vehicle is at rest.
+        Raises InputError as `ImageReader.read`, and for a time that the ego-motion does not cover.
+        """
+        rig, motion, frame_ns = self._rigs[place], self.ego_motion, entry.stamp.timestamp_ns
+        images, dropped = self._images.read(entry.sources, rig, entry.dropped)
+        times = dict.fromkeys(rig.names, frame_ns)
+        times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
+        times |= {name: image.timestamp_ns for name, image in images.items()}
+        at_times = [frame_ns, *times.values()]
+        poses = [Pose.identity() if motion is None else motion.pose_at(time) for time in at_times]
+        return Frame(
+            stamp=entry.stamp,
+            rig=rig,
+            images=images,
+            world_from_ego=poses[0],
+            world_from_ego_at=dict(zip(times, poses[1:], strict=True)),
+            kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
+            dropped=dropped,
+            ground_truth=self._truth.get(place),
+        )

@@ -13,8 +13,8 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
-from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.format import drives_in, format_of, is_drive, own_options
+from bevcli.sequences.files.boxes_file import ClassNames
+from bevcli.sequences.format import check_options, drives_in, format_of, is_drive
 from bevcli.sequences.options import SequenceOptions
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
@@ -53,7 +53,9 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     if options.scene is not None and (drive := _drive_of(path, options.scene)):
         path, options = drive, replace(options, scene=None)
     chosen = format_of(path)
-    own = own_options(path, chosen, changes)
+    check_options(changes, [chosen], f"{path}: is {chosen.name}")
+    own_defaults = defaults(chosen.options)
+    own = gather(chosen.options, None, {name: value for name, value in changes.items() if name in own_defaults})
     sequence = chosen.open(path, options, own)
     check_time_unit(sequence, path)
     if options.ground_truth:
@@ -140,7 +142,7 @@ def check_time_unit(sequence: Sequence, source: object) -> None:
     if period < SHORTEST_PERIODS_NS[0]:
         # In place of nanoseconds, or of microseconds as in nuScenes' tables.
         units = {10**3: "microseconds or milliseconds", 10**6: "milliseconds or seconds", 10**9: "seconds"}
-        factor = next((one for one in units if period * one >= SHORTEST_PERIODS_NS[1]), 10**9)
+        factor = next((multiple for multiple in units if period * multiple >= SHORTEST_PERIODS_NS[1]), 10**9)
         raise InputError(
             f"{source}: the timestamps are {factor} times too small (in {units[factor]}?): the frames are {period:.0f} "
             f"ns apart (expected {SHORTEST_PERIODS_NS[0]} or more): multiply all times"
@@ -162,8 +164,8 @@ def select_scene(sequence: Sequence, scene: str) -> Sequence:
     indices = [index for index, stamp in enumerate(sequence.stamps) if stamp.scene == scene]
     if not indices:
         names = sorted({stamp.scene for stamp in sequence.stamps} - {""})
-        found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "no scenes"
-        raise InputError(f'{sequence.name}: has no scene "{scene}" (found {found})')
+        scenes = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "no scenes"
+        raise InputError(f'{sequence.name}: has no scene "{scene}" (found {scenes})')
     return select(sequence, indices)
 
 
@@ -198,7 +200,18 @@ def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
         slowest = min(slowest, ratio)
         chosen = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
         kept += [indices[position] for position in chosen]
-    return select(sequence, kept, tuple(_rate_notes(len(stamps), len(kept), slowest, rate_hz)))
+    notes = []
+    if len(kept) < len(stamps):
+        notes.append(
+            f"{len(kept)} of {len(stamps)} frames are used, at about {rate_hz:g} frames per second "
+            '(`rate_hz="all"` uses every frame)'
+        )
+    if slowest < SLOWEST_RATIO:
+        notes.append(
+            f"the input has {slowest * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "
+            "velocities will be less accurate and history less useful"
+        )
+    return select(sequence, kept, tuple(notes))
 
 
 def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
@@ -226,16 +239,3 @@ def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
     later = np.clip(np.searchsorted(seconds, ticks), 1, len(seconds) - 1)
     earlier = later - 1
     return np.unique(np.where(ticks - seconds[earlier] <= seconds[later] - ticks, earlier, later))
-
-
-def _rate_notes(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> Iterator[str]:
-    if kept < total:
-        yield (
-            f"{kept} of {total} frames are used, at about {rate_hz:g} frames per second "
-            '(`rate_hz="all"` uses every frame)'
-        )
-    if slowest_ratio < SLOWEST_RATIO:
-        yield (
-            f"the input has {slowest_ratio * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "
-            "velocities will be less accurate and history less useful"
-        )

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
 from bevcli.options import option, options, parse_pairs
-from bevcli.registry import entries
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
 # static: the vehicle stands, and the ego-motion is not read.
 EgoMotionUse = Literal["required", "optional", "static"]
-UnlistedFrames = Literal["empty", "unlabelled"]
 
 
 def parse_frames(text: str) -> slice:
@@ -46,7 +44,7 @@ def parse_rate(text: str) -> float | Literal["all"]:
 
 def parse_class_map(texts: list[str]) -> dict[str, str]:
     """A class map from texts NAME=CLASS and names of TOML files. Raises ValueError, InputError for a file."""
-    from bevcli.sequences.files.class_names import read_class_map
+    from bevcli.sequences.files.boxes_file import read_class_map
 
     files = [text for text in texts if text.endswith(".toml") and "=" not in text]
     pairs = parse_pairs([text for text in texts if text not in files], "NAME=CLASS or FILE.toml")
@@ -125,50 +123,6 @@ class SequenceOptions(ClassOptions):
         """The options for a run of a model: its rate and classes, and ego-motion only where history needs it."""
         use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
-
-
-@options("Input")
-class LabelOptions:
-    """Ground truth from a file of labels."""
-
-    labels: Path | None = option(
-        reads="path",
-        default=None,
-        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, "
-        "KITTI labels or tracklets, or CVAT's cuboids.",
-        metavar="FILE",
-    )
-    unlisted_frames: UnlistedFrames | None = option(
-        default=None,
-        help="Frames without a row in a table of labels are empty, or not labelled. Default: empty, unless no two "
-        "successive frames have rows; then only every n-th frame is labelled.",
-    )
-    labels_camera: str | None = option(
-        default=None,
-        help="The camera in whose frame KITTI labels are. Default: the one that looks most directly ahead.",
-        metavar="NAME",
-    )
-
-
-@options()
-class WriteOptions:
-    """The options of a drive that is written."""
-
-    form: str = option(
-        default="native",
-        help="native: a sequence folder. nuscenes: a nuScenes root. mcap: one file for Foxglove and ROS 2, with boxes. "
-        "Or the format of an installed package.",
-        flag="--format",
-        metavar="NAME",
-        complete=lambda incomplete: list(entries("bevcli.drive_writers")),
-    )
-    force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
-    boxes: Path | None = option(
-        reads="path", default=None, help="mcap: also write the boxes of this run (a folder or predictions.json)."
-    )
-    score: float = option(
-        default=0.25, help="mcap: leave out boxes of the run scored below this.", minimum=0, maximum=1
-    )
 
 
 @options("Input")

@@ -20,8 +20,7 @@ from bevcli.errors import InputError
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, color_of_hex
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import plain_name
-from bevcli.parsing.images import decode_image
+from bevcli.parsing.files import decode_image, plain_name
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
 from bevcli.recording.colors import Color, class_colors, map_colors

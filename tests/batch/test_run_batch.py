@@ -18,7 +18,7 @@ from small_fleet import make_job, results_of, write_drive, write_fleet
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.runs.run_into_folder import run_into_folder
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
 from bevcli.workshop.batch.job import find_drives

@@ -12,7 +12,7 @@ from bags import drive_messages, odometry, write_mcap
 from command_line import command
 
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 LATEST_NS = 1_500_000_000

@@ -35,7 +35,7 @@ def _drive(folder: Path) -> None:
 
 
 def _unlisted(folder: Path) -> None:
-    from bevcli.sequences.native.folder import find_frames
+    from bevcli.sequences.native.unlisted import find_frames
 
     find_frames(folder / "drive", ("CAM_FRONT", "CAM_BACK"))
 
@@ -142,7 +142,7 @@ def _bag(name: str) -> Callable[[Path], None]:
 
 
 def _classes(folder: Path) -> None:
-    from bevcli.sequences.files.class_names import read_class_map
+    from bevcli.sequences.files.boxes_file import read_class_map
 
     read_class_map(folder / "classes.toml")
 

@@ -28,7 +28,7 @@ from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.runs.state import RunState, save_state
 from bevcli.runs.summary import Counts
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.training.files import save_checkpoint
 

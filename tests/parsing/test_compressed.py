@@ -12,9 +12,8 @@ import lz4.frame
 import zstandard
 
 from bevcli.errors import InputError
-from bevcli.parsing.files import decompressed
 from bevcli.workshop.formats import is_ros_bag
-from bevcli.workshop.formats.ros.messages import Topic, decoder
+from bevcli.workshop.formats.ros.messages import Topic, decoder, decompressed
 from bevcli.workshop.formats.ros.storage import SqliteFile
 
 COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}

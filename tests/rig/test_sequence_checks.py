@@ -6,7 +6,7 @@ from mistakes import MOTION_MISTAKES, drive, motion_of
 
 from bevcli.rig.check_calibration import check_camera_times
 from bevcli.rig.sequence_checks import check_ego_motion
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 
 
 @pytest.mark.parametrize("start_yaw", [0.0, 0.7, 2.0, -3.0])

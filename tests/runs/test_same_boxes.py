@@ -11,7 +11,7 @@ from bags import drive_messages, write_mcap
 
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 

@@ -15,7 +15,7 @@ from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import BevMap
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import WriteOptions
+from bevcli.workshop.formats import WriteOptions
 from bevcli.workshop.formats.output import NativeWriter, open_writer
 
 

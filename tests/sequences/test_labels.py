@@ -17,7 +17,7 @@ from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.options import LabelOptions, UnlistedFrames
+from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
 from bevcli.workshop.formats.labels import WithLabels, _labelled_frames, read_labels
 from bevcli.workshop.formats.output import NativeWriter

@@ -14,8 +14,7 @@ from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.evaluation.inputs import open_ground_truth
 from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
-from bevcli.sequences.nuscenes import tables
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions, tables
 from bevcli.sequences.nuscenes.index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence, read_can_bus
 from bevcli.sequences.nuscenes.tables import build_index

@@ -21,7 +21,7 @@ from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import DerivedSequence, Frame, Sequence
-from bevcli.geometry.boxes import Boxes3D, with_track_velocities
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse
@@ -31,6 +31,7 @@ from bevcli.registry import load
 from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats.labels import with_track_velocities
 
 FORMATS: dict[str, Format] = {name: load("bevcli.sequences", name) for name in WRITTEN}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}

@@ -34,7 +34,7 @@ from bevcli.frame import CameraImage, Sequence
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose, rotation_about_z
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 

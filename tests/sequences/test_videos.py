@@ -9,8 +9,8 @@ import pytest
 from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
-from bevcli.sequences.images import VideoReader
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.videos import VideoReader
 
 
 def write_video(path, images, rate, codec="FFV1"):

@@ -9,7 +9,7 @@ import pytest
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
-from bevcli.sequences.files.class_names import count_classes
+from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.output import NativeWriter

@@ -8,7 +8,7 @@ from memory_drive import MemorySequence
 
 from bevcli.registry import load
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import WriteOptions
+from bevcli.workshop.formats import WriteOptions
 from bevcli.workshop.formats.output import GROUP, open_writer
 from bevcli.workshop.vad.map_lines import MapLines
 

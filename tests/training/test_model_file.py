@@ -14,14 +14,16 @@ from small_fleet import write_fleet
 
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, InputError
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, class_of_size
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import BevFrameConfig
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.model_file import (
+    NUSCENES_SIZES,
     PRESETS,
     Cost,
     _toml,
+    class_of_size,
     fitting_batch,
     look_at,
     model_table,

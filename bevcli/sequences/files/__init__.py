@@ -1,9 +1,9 @@
 """Readers and writers of single files that several formats and commands share.
 
-boxes_file: ground_truth.json and predictions.json.
-incremental_json: a file that only grows, and a JSON file that is written entry by entry.
+calibration_file, kalibr_ros: the rig, of calibration.json and of the intrinsics of Kalibr and ROS.
+ego_motion_file: the vehicle's poses, of ego_motion.csv. A reader of another file of cameras or of poses belongs here.
+boxes_file: ground_truth.json and predictions.json, and the class names of data sets.
 map_folder: BEV maps, one PNG per frame.
-calibration_file: calibration.json.
-kalibr_ros: Kalibr and ROS intrinsics that replace calibration.json.
+incremental_json: a file that only grows, and a JSON file that is written entry by entry.
 json_fields: checked numbers and rigid transforms in JSON, with findings.
 """

@@ -1,7 +1,11 @@
-"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame."""
+"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame.
+
+ClassNames: the class names of data sets, compared without case and renamed by a class map.
+"""
 
 import math
 import operator
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,16 +18,15 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.parsing.documents import without_garbage_collection
-from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, without_garbage_collection
+from bevcli.parsing.files import read_text
+from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FUTURE_DECIMALS = 3  # millimetres
-_OWN_NAMES = ClassNames()
 _Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
 _Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
@@ -40,6 +43,85 @@ FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
+
+
+class ClassNames:
+    """Maps the class names of a file to known classes.
+
+    A name that differs from a known class only in case becomes that class. Other names stay as they are.
+
+    renames: names of the file (in any case) -> known classes. classes: the known ones. Raises InputError for a target
+    that is not known.
+    """
+
+    def __init__(
+        self, renames: Mapping[str, str] | None = None, classes: Iterable[str] = tuple(NUSCENES_CLASSES)
+    ) -> None:
+        self.known = tuple(classes)
+        self._by_name: dict[str, str] = {name: name for name in self.known}
+        self._by_lower_case = {name.lower(): name for name in reversed(self.known)}
+        known = dict(self._by_lower_case)
+        for name, target in (renames or {}).items():
+            if target.lower() not in known:
+                raise InputError(
+                    f'`class_map` {name}={target}: "{target}" is not a class (expected one of {", ".join(self.known)})'
+                )
+            exact = target if target in self.known else known[target.lower()]
+            self._by_lower_case[name.lower()] = self._by_name[name] = exact
+
+    @staticmethod
+    def of_format(table: Mapping[str, str], renames: Mapping[str, str]) -> "ClassNames":
+        """The names of a format that has names of its own. table: its names -> nuScenes' classes.
+
+        A name that the user renames keeps its name, so that `renames` finds it.
+        """
+        renamed = {name.lower() for name in renames}
+        return ClassNames({name: target for name, target in table.items() if name.lower() not in renamed})
+
+    def __getitem__(self, name: str) -> str:
+        exact = self._by_name.get(name)
+        if exact is None:
+            exact = self._by_name[name] = self._by_lower_case.get(name.lower(), name)
+        return exact
+
+    def renamed(self, boxes: Boxes3D) -> Boxes3D:
+        """The boxes with the names of known classes."""
+        names = {name: self[name] for name in np.unique(boxes.classes).tolist()}
+        if all(name == new for name, new in names.items()):
+            return boxes
+        return replace(boxes, classes=np.array([names[name] for name in boxes.classes.tolist()]))
+
+    def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
+        """A note about boxes whose class is not known, if there are any.
+
+        counts: number of boxes by the file's names. where: the file or the side that has them. use: what is not done
+        with them.
+        """
+        others = {name: count for name, count in counts.items() if self[name] not in self.known}
+        if not others:
+            return ()
+        named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
+        return (
+            f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
+            f'(`class_map` "{min(others)}={self.known[0]}" renames a class)',
+        )
+
+
+def read_class_map(path: Path) -> dict[str, str]:
+    """A class map in TOML, one `"Name in the file" = "class"` a line. Raises InputError if it is not one."""
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    for name, target in stated.items():
+        if not isinstance(target, str):
+            raise InputError(f'{path}: {name}: expected the name of a class, such as "truck", found {target!r:.40}')
+    return stated
+
+
+def count_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
+    """Number of boxes by class."""
+    return Counter(name for boxes in frames for name in boxes.classes.tolist())
+
+
+_OWN_NAMES = ClassNames()
 
 
 class _FixedMembers(Struct, forbid_unknown_fields=True):
@@ -79,25 +161,35 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     except msgspec.ValidationError:
         index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
         raise InputError(f"{where}: box {index}: {mistake}") from None
+    columns: dict[str, NDArray[Any] | None] = {}
+    for name, column in OPTIONAL_COLUMNS.items():
+        values = [getattr(row, column.key) for row in rows]
+        given = [column.unknown if value is UNSET or value is None else value for value in values]
+        columns[name] = None if values.count(UNSET) == len(values) else np.array(given)
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
         yaws=np.array([row.yaw for row in rows]),
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
-        **{name: _column(rows, column) for name, column in OPTIONAL_COLUMNS.items()},
-        **_futures(rows, where),
+        **columns,
+        **(_futures(rows, where) if any(row.futures for row in rows) else {}),
     )
     without = [index for index, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
         raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
-    for name, column in OPTIONAL_COLUMNS.items():
-        shares = getattr(boxes, name)
-        if column.values == "share" and shares is not None:
-            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, column.key, "0 to 1")
-    for key, values in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
-        _require(np.isfinite(values), values, where, key, "finite numbers")
-    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, where, "size_lwh", "numbers above 0")
+    sizes = boxes.sizes_lwh
+    checks: list[tuple[str, Array, NDArray[np.bool_], str]] = [
+        (column.key, shares, ((shares >= 0) & (shares <= 1)) | np.isnan(shares), "0 to 1")
+        for name, column in OPTIONAL_COLUMNS.items()
+        if column.values == "share" and (shares := columns[name]) is not None
+    ]
+    for key, values in (("center", boxes.centers), ("size_lwh", sizes), ("yaw", boxes.yaws)):
+        checks.append((key, values, np.isfinite(values), "finite numbers"))
+    for key, values, good, expected in (*checks, ("size_lwh", sizes, sizes > 0, "numbers above 0")):
+        if not good.all():
+            index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+            raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
     return boxes
 
 
@@ -117,11 +209,19 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
     objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     for name, column in OPTIONAL_COLUMNS.items():
         values = getattr(boxes, name)
-        if values is not None:
-            for box, value, is_known in zip(objects, values.tolist(), _is_known(values, column).tolist(), strict=True):
-                if is_known:
-                    box[column.key] = value
-    _add_futures(objects, boxes)
+        if values is None:
+            continue
+        if column.values == "score":
+            written = np.ones(len(values), dtype=bool)  # written always, so that NaN is an error
+        elif column.values == "count":
+            written = values >= 0  # two unknown numbers may add up to -2
+        else:
+            written = ~np.isnan(values) if column.values == "share" else values != column.unknown
+        for box, value, is_written in zip(objects, values.tolist(), written.tolist(), strict=True):
+            if is_written:
+                box[column.key] = value
+    if boxes.futures is not None:
+        _add_futures(objects, boxes, boxes.futures)
     return objects
 
 
@@ -148,35 +248,10 @@ def _description(kind: Any) -> str:
     return str(notes[0].description)
 
 
-def _column(rows: Sequence[Any], column: Column) -> NDArray[Any] | None:
-    """An optional column; None where no box has it."""
-    values = [getattr(row, column.key) for row in rows]
-    if values.count(UNSET) == len(values):
-        return None
-    return np.array([column.unknown if value is UNSET or value is None else value for value in values])
-
-
-def _is_known(values: NDArray[Any], column: Column) -> NDArray[np.bool_]:
-    """(N,) for which boxes an optional column is written. Scores always are, so that NaN is an error."""
-    if column.values == "score":
-        return np.ones(len(values), dtype=bool)
-    if column.values == "count":
-        return values >= 0  # two unknown numbers may add up to -2
-    return ~np.isnan(values) if column.values == "share" else values != column.unknown
-
-
-def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
-    if not good.all():
-        index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-        raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {column[index].tolist()}")
-
-
-def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
+def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D, futures: Array) -> None:
     """Add futures to N JSON objects: M modes of T steps, each x and y, null if unknown; and the times of the steps."""
-    if boxes.futures is None:
-        return
     for index, box in enumerate(objects):
-        future = boxes.futures[index]  # (M, T, 3)
+        future = futures[index]  # (M, T, 3)
         if not np.isfinite(future[..., 1:]).any():
             continue
         box["future_times_s"] = future[0, :, 0].tolist()
@@ -187,10 +262,8 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
 
 
 def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
-    """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
+    """The columns `futures` and `future_scores` of Boxes3D, of rows of which one or more have futures."""
     having = {index: row for index, row in enumerate(rows) if row.futures}
-    if not having:
-        return {}
     first = next(iter(having.values()))
     modes, steps = len(first.futures or ()), len(first.future_times_s)
     futures, scores = np.full((len(rows), modes, steps, 3), np.nan), np.full((len(rows), modes), np.nan)
@@ -266,24 +339,30 @@ def read_boxes(
     """
     with without_garbage_collection():
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
-        reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
+        reference, rows = content["frame_of_reference"], content["frames"]
+        stated = _stated_classes(content, path) if "classes" in content else None
         names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
         frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
-    _check_unique(path, frames)
+    moments: set[tuple[str, int]] = set()
+    for stamp in (frame.stamp for frame in frames):
+        moment = (stamp.scene, stamp.timestamp_ns)
+        if moment in moments:
+            raise InputError(
+                f'{path}: frame {stamp.index}: scene "{moment[0]}" has two frames at {moment[1]} ns: remove one'
+            )
+        moments.add(moment)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
         reference,
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
-        _others(content, _FILE_KEYS),
+        {key: value for key, value in content.items() if key not in _FILE_KEYS},
         stated,
     )
 
 
-def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectClass] | None:
-    """The classes in "classes" and "class_settings" of a boxes file; None without them. Raises InputError."""
-    if "classes" not in content:
-        return None
+def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectClass]:
+    """The classes in "classes" and "class_settings" of a boxes file. Raises InputError."""
     try:
         names = msgspec.convert(content["classes"], tuple[str, ...])
         settings = msgspec.convert(content.get("class_settings", {}), dict[str, ClassSettings])
@@ -297,7 +376,7 @@ def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
     return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))
 
 
-class BoxesWriter(FileOfFrames):
+class BoxesWriter(IncrementalJson):
     """Writes a boxes file frame by frame.
 
     The file gets its name when the writer is closed; until then `read_boxes` reads all finished frames from its partial
@@ -320,7 +399,7 @@ class BoxesWriter(FileOfFrames):
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        super().__init__(path, head, resume_at)
+        super().__init__(path, head, "frames", resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame. Its boxes must be in the file's frame of reference."""
@@ -351,20 +430,5 @@ def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_name
         stamp,
         None if stated is None else pose_from_json(stated, "world_from_ego", where),
         boxes_from_json(row["boxes"], where, class_names),
-        _others(row, _FRAME_KEYS),
+        {key: value for key, value in row.items() if key not in _FRAME_KEYS},
     )
-
-
-def _others(row: dict[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
-    return {key: value for key, value in row.items() if key not in known}
-
-
-def _check_unique(path: Path, frames: tuple[FrameBoxes, ...]) -> None:
-    seen: set[tuple[str, int]] = set()
-    for frame in frames:
-        moment = (frame.stamp.scene, frame.stamp.timestamp_ns)
-        if moment in seen:
-            raise InputError(
-                f'{path}: frame {frame.stamp.index}: scene "{moment[0]}" has two frames at {moment[1]} ns: remove one'
-            )
-        seen.add(moment)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import (
     LONGEST_VALUE,
-    Mistake,
     Report,
     parse_numbers,
     parse_transform,
@@ -87,15 +86,24 @@ def draft_calibration(path: Path) -> RigDraft:
         report.missing("format", FORMAT)
     elif document["format"] != FORMAT:
         report.error("wrong-format", "format", "is not supported", expected=FORMAT, found=document["format"])
-    cameras = report.read(_parse_cameras, document) or ()
+    entries, expected = document.get("cameras"), "an object with one entry per camera"
+    drafts: list[Camera | None] = []
+    if entries is None:
+        report.missing("cameras", expected)
+    elif not isinstance(entries, dict) or not entries:
+        report.error("wrong-shape", "cameras", "contains no camera", expected=expected, found=entries)
+    else:
+        drafts = [parse_camera(name, entry, replace(report, camera=name)) for name, entry in entries.items()]
+    cameras = tuple(camera for camera in drafts if camera is not None)
     given = "ego_from_bev" in document
-    stated = report.read(parse_transform, document, "ego_from_bev") if given else None
+    stated = parse_transform(document, "ego_from_bev", report) if given else None
     ego_from_bev = default_ego_from_bev() if stated is None else stated
     rendered = document.get("rendered", False)
     if not isinstance(rendered, bool):
         report.error("wrong-shape", "rendered", "is not true or false", expected="true or false", found=rendered)
-    facts = DriveFacts(rendered is True, report.read(_parse_geo_origin, document))
-    return RigDraft(CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given), tuple(report.findings), facts)
+    geo_origin = None if document.get("geo_origin") is None else _parse_geo_origin(document["geo_origin"], report)
+    rig = CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given)
+    return RigDraft(rig, tuple(report.findings), DriveFacts(rendered is True, geo_origin))
 
 
 def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts(), *, regular: bool = False) -> None:
@@ -114,35 +122,21 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts
     write_whole(path, f"{_lines(document)}\n".encode(), regular=regular)
 
 
-def _parse_cameras(document: Mapping[str, Any], report: Report) -> tuple[Camera, ...]:
-    value, expected = document.get("cameras"), "an object with one entry per camera"
-    if value is None:
-        raise report.missing("cameras", expected)
-    if not isinstance(value, dict) or not value:
-        raise report.error("wrong-shape", "cameras", "contains no camera", expected=expected, found=value)
-    cameras = (report.about(name).read(parse_camera, name, entry) for name, entry in value.items())
-    return tuple(camera for camera in cameras if camera is not None)
-
-
-def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin | None:
-    value = document.get("geo_origin")
-    if value is None:
-        return None
+def _parse_geo_origin(value: object, report: Report) -> GeoOrigin | None:
     if not isinstance(value, dict):
         expected = '{"latitude": 48.137, "longitude": 11.575, "heading_deg": 90}'
-        raise report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
-    within, stated = report.within("geo_origin"), {"heading_deg": EAST_DEG, **value}
-    numbers = [within.read(_parse_degrees, stated, name, limit) for name, limit in ORIGIN_LIMITS.items()]
-    degrees = [number for number in numbers if number is not None]
+        report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
+        return None
+    inside, stated = replace(report, prefix="geo_origin."), {"heading_deg": EAST_DEG, **value}
+    degrees: list[float] = []
+    for name, limit in ORIGIN_LIMITS.items():
+        number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), inside)
+        if number is not None and abs(number[0]) > limit:
+            expected = f"degrees, -{limit:g} to {limit:g}"
+            inside.error("wrong-size", name, "is out of range", expected=expected, found=quoted(stated[name]))
+        elif number is not None:
+            degrees.append(float(number[0]))
     return GeoOrigin(*degrees) if len(degrees) == len(ORIGIN_LIMITS) else None
-
-
-def _parse_degrees(stated: Mapping[str, Any], name: str, limit: float, report: Report) -> float:
-    number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), report)[0]
-    if abs(number) > limit:
-        expected = f"degrees, -{limit:g} to {limit:g}"
-        raise report.error("wrong-size", name, "is out of range", expected=expected, found=quoted(stated[name]))
-    return float(number)
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -167,22 +161,48 @@ def _lines(value: Any, indent: str = "") -> str:
     return "{\n" + ",\n".join(entries) + f"\n{indent}}}"
 
 
-def parse_camera(name: str, value: object, report: Report) -> Camera:
-    """A camera of a calibration. All fields are read, so that all mistakes are reported. Raises Mistake."""
+def parse_camera(name: str, value: object, report: Report) -> Camera | None:
+    """A camera of a calibration. All fields are read, so that all mistakes are reported."""
     if not is_file_name(name):
         expected = "up to 100 letters, digits and signs, no slash"
         name = one_line(name, LONGEST_VALUE)
-        raise report.error("camera-name", name, "is not the name of a camera", expected=expected)
+        report.error("camera-name", name, "is not the name of a camera", expected=expected)
+        return None
     if not isinstance(value, dict):
         expected = "an object with " + ", ".join(KEYS)
-        raise report.error("wrong-shape", name, "is not a camera", expected=expected, found=value)
-    width, height = report.read(_parse_size, value, "width"), report.read(_parse_size, value, "height")
-    intrinsics = report.read(_parse_intrinsics, value)
-    ego_from_camera = report.read(parse_transform, value, "ego_from_camera")
-    distortion = report.read(_parse_distortion, value)
-    if width is None or height is None or intrinsics is None or ego_from_camera is None:
-        raise Mistake
-    _check_plausible(intrinsics, width, height, report)
+        report.error("wrong-shape", name, "is not a camera", expected=expected, found=value)
+        return None
+    sizes: list[int] = []
+    for side in ("width", "height"):
+        size = value.get(side)
+        if size is None:
+            report.missing(side, "the image size in pixels")
+        elif isinstance(size, bool) or not isinstance(size, int) or not 0 < size <= LARGEST_SIZE:
+            expected = f"a positive integer, at most {LARGEST_SIZE}"
+            report.error("wrong-size", side, "is not an image size", expected=expected, found=quoted(size))
+        else:
+            sizes.append(size)
+    intrinsics = _parse_intrinsics(value, report)
+    ego_from_camera = parse_transform(value, "ego_from_camera", report)
+    distortion = None if value.get("distortion") is None else _parse_distortion(value["distortion"], report)
+    if len(sizes) < 2 or intrinsics is None or ego_from_camera is None:
+        return None
+    width, height = sizes
+    low, high = FOCAL_RANGE
+    for axis, (letter, size) in enumerate((("x", width), ("y", height))):
+        focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
+        if not low * size <= focal <= high * size:
+            report.error(
+                "intrinsics-absurd", "intrinsics", "has an implausible focal length",
+                expected=f"{low * size:g} to {high * size:g} px for a size of {size}", found=f"f{letter} {focal:g}",
+                advice="give it in pixels, not in millimetres",
+            )  # fmt: skip
+            return None
+        if not -2 * size <= center <= 3 * size:
+            expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
+            message = "has its principal point far outside the image"
+            report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
+            return None
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
@@ -196,66 +216,42 @@ def is_file_name(name: str) -> bool:
     return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
 
 
-def _parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array:
+def _parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
     """(3, 3) image_from_camera in pixels, upper triangular and not singular."""
     matrix = parse_numbers(camera, "intrinsics", (3, 3), report)
+    if matrix is None:
+        return None
     if not np.allclose(matrix[2], [0, 0, 1], atol=1e-9) or abs(matrix[1, 0]) > 1e-9:
-        raise report.error(
+        report.error(
             "intrinsics-form", "intrinsics", "is not a camera matrix",
             expected="[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]", found=matrix.tolist(),
             advice="write it row by row and scale it so that the last number is 1",
         )  # fmt: skip
+        return None
     fx, fy = matrix[0, 0], matrix[1, 1]
     if min(fx, fy) <= 0:
         message, found = "is singular or mirrors the image", f"fx {fx:g}, fy {fy:g}"
-        raise report.error("intrinsics-singular", "intrinsics", message, expected="fx > 0 and fy > 0", found=found)
+        report.error("intrinsics-singular", "intrinsics", message, expected="fx > 0 and fy > 0", found=found)
+        return None
     return matrix
 
 
-def _parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | None:
-    """The lens distortion. None for a pinhole camera ("none", or no "distortion")."""
-    value = camera.get("distortion")
-    if value is None:
-        return None
+def _parse_distortion(value: object, report: Report) -> Distortion | None:
+    """The lens distortion. None for the model "none", a pinhole camera."""
     models = ("none", *COEFFICIENT_COUNTS)
     model = value.get("model") if isinstance(value, dict) else None
-    if model not in models:
+    if not isinstance(value, dict) or model not in models:
         expected, found = " or ".join(models), value if model is None else model
-        raise report.error("distortion-model", "distortion", "has an unknown model", expected=expected, found=found)
+        report.error("distortion-model", "distortion", "has an unknown model", expected=expected, found=found)
+        return None
     given = value.get("coefficients", [])
     count = len(given) if isinstance(given, list) else 0
     counts = COEFFICIENT_COUNTS.get(model, (0,))
     if count not in counts:
         expected, message = f"{' or '.join(map(str, counts))} for {model}", "has the wrong number of coefficients"
-        raise report.error("distortion-coefficients", "distortion", message, expected=expected, found=f"{count}")
+        report.error("distortion-coefficients", "distortion", message, expected=expected, found=f"{count}")
+        return None
     if model == "none":
         return None
-    coefficients = parse_numbers(value, "coefficients", (count,), report.within("distortion"))
-    return Distortion(model, tuple(map(float, coefficients)))
-
-
-def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int:
-    value = camera.get(name)
-    if value is None:
-        raise report.missing(name, "the image size in pixels")
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= LARGEST_SIZE:
-        expected = f"a positive integer, at most {LARGEST_SIZE}"
-        raise report.error("wrong-size", name, "is not an image size", expected=expected, found=quoted(value))
-    return value
-
-
-def _check_plausible(intrinsics: Array, width: int, height: int, report: Report) -> None:
-    """Check focal length and principal point against the size of the image."""
-    low, high = FOCAL_RANGE
-    for axis, (letter, size) in enumerate((("x", width), ("y", height))):
-        focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
-        if not low * size <= focal <= high * size:
-            raise report.error(
-                "intrinsics-absurd", "intrinsics", "has an implausible focal length",
-                expected=f"{low * size:g} to {high * size:g} px for a size of {size}", found=f"f{letter} {focal:g}",
-                advice="give it in pixels, not in millimetres",
-            )  # fmt: skip
-        if not -2 * size <= center <= 3 * size:
-            expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
-            message = "has its principal point far outside the image"
-            raise report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
+    coefficients = parse_numbers(value, "coefficients", (count,), replace(report, prefix="distortion."))
+    return None if coefficients is None else Distortion(model, tuple(map(float, coefficients)))

@@ -15,10 +15,10 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
+from bevcli.writing import output_errors
 
 PARTIAL = ".partial"
 LARGEST_BYTES = 4 << 30
-_TAIL_OF_FRAMES = "]}"
 
 
 class GrowingFile:
@@ -36,14 +36,12 @@ class GrowingFile:
         """Creates the file, or cuts it to `resume_at` bytes and goes on there. Raises OutputError."""
         self.path, self.name = path, path if name is None else name
         self.size = 0
-        try:
+        with output_errors(self.name):
             # Unbuffered: a piece is in the file at once.
             self._file = path.open("wb" if resume_at is None else "r+b", buffering=0)
             if resume_at is not None:
                 self._file.truncate(resume_at)
                 self.size = self._file.seek(resume_at)
-        except OSError as error:
-            raise self._failure(error) from None
 
     def append(self, content: bytes | memoryview) -> None:
         """Writes a piece. Raises OutputError; the file then is as before."""
@@ -55,7 +53,7 @@ class GrowingFile:
             with contextlib.suppress(OSError):
                 self._file.truncate(self.size)
                 self._file.seek(self.size)
-            raise self._failure(error) from None
+            raise OutputError(f"{self.name}: cannot be written ({error.strerror})") from None
         self.size += len(content)
 
     def close(self) -> None:
@@ -72,9 +70,6 @@ class GrowingFile:
         """True if somebody has deleted the file while it is written."""
         return os.fstat(self._file.fileno()).st_nlink == 0
 
-    def _failure(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.name}: cannot be written ({error.strerror})")
-
 
 def partial_path(path: Path) -> Path:
     """The name of a file while it is written."""
@@ -87,27 +82,26 @@ def existing(path: Path) -> Path:
     return partial if partial.is_file() and not path.exists() else path
 
 
-def read_entries(path: Path, tail: str, *, missing: str = "the file is missing") -> Any:
+def read_entries(path: Path, brackets: str = "[]", *, missing: str = "the file is missing") -> Any:
     """The contents of an incremental JSON file. A partial file gets its tail, and loses an entry that was cut off.
 
-    missing: text of the message for a file that is not there. Raises InputError.
+    brackets: see `IncrementalJson`. missing: text of the message for a file that is not there. Raises InputError.
     """
     file = existing(path)
     content = read_bytes(file, LARGEST_BYTES, missing=missing)
     if file.suffix == PARTIAL:
         if not content:
             raise InputError(f"{file}: is empty: the run ended before its first frame")
-        content = _without_cut_entry(content, tail[:1].encode()) + tail.encode()
+        content = _without_cut_entry(content, brackets.encode()) + f"{brackets[1]}}}".encode()
     return parse_json(content, path)
 
 
-def _without_cut_entry(content: bytes, closing: bytes) -> bytes:
-    """closing: the bracket after the last entry, of a list or of an object."""
+def _without_cut_entry(content: bytes, brackets: bytes) -> bytes:
     lines = content.rstrip(b",\n")
     kept, newline, last = lines.rpartition(b"\n")
     try:
         if newline:
-            json.loads((b"[" if closing == b"]" else b"{") + last + closing)
+            json.loads(brackets[:1] + last + brackets[1:])
     except ValueError:
         return kept.rstrip(b",")
     return lines
@@ -116,20 +110,25 @@ def _without_cut_entry(content: bytes, closing: bytes) -> bytes:
 class IncrementalJson(GrowingFile):
     """Writes entries between a head and a tail, and keeps none of them in memory. `name` exists once it is closed."""
 
-    def __init__(self, path: Path, head: str, tail: str, resume_at: int | None = None) -> None:
-        """Creates the file. Head and tail together must be valid JSON.
+    def __init__(
+        self, path: Path, head: Mapping[str, Any], key: str, resume_at: int | None = None, brackets: str = "[]"
+    ) -> None:
+        """Creates the file: an object with the members of the head, and the entries in a list or object under the key.
 
-        resume_at: the `size` of an earlier writer of this file: keep what it had written then, and go on.
+        resume_at: the `size` of an earlier writer of this file: keep what it had written then, and go on. brackets:
+        around the entries, "[]" or "{}".
         Raises OutputError if the file cannot be written.
         """
+        start = f'{json.dumps(head)[:-1]}, "{key}": {brackets[0]}'.encode()
         partial = partial_path(path)
         if resume_at is not None and not partial.exists() and path.exists():
-            _rename(path, partial)
+            with output_errors(partial):
+                os.replace(path, partial)
         super().__init__(partial, resume_at, name=path)
-        self._tail = f"\n{tail}\n".encode()
+        self._tail = f"\n{brackets[1]}}}\n".encode()
         if resume_at is None:
-            self.append(head.encode())
-        self._separator = ",\n" if self.size > len(head.encode()) else "\n"
+            self.append(start)
+        self._separator = ",\n" if self.size > len(start) else "\n"
 
     def add(self, entry: Any, name: str, key: str | None = None) -> None:
         """Write an entry.
@@ -156,38 +155,25 @@ class IncrementalJson(GrowingFile):
             self.append(self._tail)
         finally:
             super().close()
-        _rename(self.path, self.name)
-
-
-def _rename(path: Path, to: Path) -> None:
-    try:
-        os.replace(path, to)
-    except OSError as error:
-        raise OutputError(f"{to}: cannot be written ({error.strerror})") from None
-
-
-class FileOfFrames(IncrementalJson):
-    """A JSON object that is written frame by frame: the members of a head, and the list "frames"."""
-
-    def __init__(self, path: Path, head: Mapping[str, Any], resume_at: int | None = None) -> None:
-        super().__init__(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL_OF_FRAMES, resume_at)
+        with output_errors(self.name):
+            os.replace(self.path, self.name)
 
 
 def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -> dict[str, Any]:
-    """The contents of a `FileOfFrames`; the partial file of a writer that was killed is read, too.
+    """The contents of an `IncrementalJson` with "frames"; the partial file of a writer that was killed is read, too.
 
     form, references: the format that it must have, and the frames of reference that it may have. kind: of the file, for
     messages. Raises InputError.
     """
     missing = f'the file is missing (expected {kind}, "format": "{form}")'
-    content = read_entries(path, _TAIL_OF_FRAMES, missing=missing)
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if found != form:
-        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {found!r:.40}')
+    content = read_entries(path, missing=missing)
+    stated = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if stated != form:
+        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {stated!r:.40}')
     reference = content.get("frame_of_reference")
     if reference not in references:
-        known = f"{', '.join(references[:-1])} or {references[-1]}"
-        raise InputError(f'{path}: "frame_of_reference" must be {known}, found {reference!r:.40}')
+        expected = f"{', '.join(references[:-1])} or {references[-1]}"
+        raise InputError(f'{path}: "frame_of_reference" must be {expected}, found {reference!r:.40}')
     if not isinstance(content.get("frames"), list):
         raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
     return content

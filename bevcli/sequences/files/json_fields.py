@@ -1,10 +1,9 @@
 """Reads numbers from JSON and collects mistakes as findings: `run` stops at the first, `project-debug` shows all."""
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,80 +18,63 @@ TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1, and of R R�
 _Value = TypeVar("_Value")
 
 
-class Mistake(Exception):
-    """A value that cannot be used. What is wrong with it stands in a report."""
-
-
 @dataclass(frozen=True)
 class Report:
-    """Collects findings while a file is read.
+    """Collects findings while a file is read. A function that reads a value returns None for one that cannot be used.
 
     Attributes:
         camera: the camera that the fields belong to, None for the whole file.
         prefix: path of the enclosing keys, such as "ego_from_camera.".
-        findings: the findings so far; reports made by `about` and `within` share the list.
+        findings: the findings so far; copies made by `replace` share the list.
     """
 
     camera: str | None = None
     prefix: str = ""
     findings: list[Finding] = field(default_factory=list)
 
-    def about(self, camera: str) -> Self:
-        """A report on one camera that adds to the same findings."""
-        return replace(self, camera=camera)
-
-    def within(self, name: str) -> Self:
-        """A report on the fields inside the field `name` that adds to the same findings."""
-        return replace(self, prefix=f"{self.prefix}{name}.")
-
     def error(
         self, code: str, name: str, message: str, *, expected: str = "", found: object = "", advice: str = ""
-    ) -> Mistake:
-        """Add an error about the field `name`. `message` continues a sentence that begins with the name.
-
-        Returns the exception to raise where the value of the field cannot be used.
-        """
+    ) -> None:
+        """Add an error about the field `name`. `message` continues a sentence that begins with the name."""
         text = f'"{self.prefix}{name}" {message}'
         self.findings.append(
             Finding(code, "error", self.camera, text, one_line(found, LONGEST_VALUE), expected, advice)
         )
-        return Mistake()
 
-    def missing(self, name: str, expected: str) -> Mistake:
+    def missing(self, name: str, expected: str) -> None:
         """Add an error for a missing key."""
-        return self.error("missing-key", name, "is missing", expected=expected)
-
-    def read(self, parse: Callable[..., _Value], *arguments: Any) -> _Value | None:
-        """The value that `parse(*arguments, self)` reads; None for one that cannot be used."""
-        with suppress(Mistake):
-            return parse(*arguments, self)
-        return None
+        self.error("missing-key", name, "is missing", expected=expected)
 
 
-def require(parse: Callable[..., _Value], *arguments: Any, where: Path | str, camera: str | None = None) -> _Value:
+def require(
+    parse: Callable[..., _Value | None], *arguments: Any, where: Path | str, camera: str | None = None
+) -> _Value:
     """The value that `parse(*arguments, report)` reads. Raises InputError with the first finding, after `where`."""
     report = Report(camera)
-    value = report.read(parse, *arguments)
+    value = parse(*arguments, report)
     for finding in report.findings:
         raise InputError(f"{where}: {finding.line}")
     assert value is not None
     return value
 
 
-def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array:
-    """The array of finite numbers with this shape under the key `name`. Raises Mistake."""
+def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
+    """The array of finite numbers with this shape under the key `name`."""
     expected = "x".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]} numbers"
     value = owner.get(name)
     if value is None:
-        raise report.missing(name, expected)
+        report.missing(name, expected)
+        return None
     array = array_of_numbers(value)
     if array is None or array.shape != shape:
         message = "is not an array of numbers" if array is None else "has the wrong shape"
         found = quoted(value) if array is None else "x".join(map(str, array.shape)) or value
-        raise report.error("wrong-shape", name, message, expected=expected, found=found)
+        report.error("wrong-shape", name, message, expected=expected, found=found)
+        return None
     if not (np.abs(array) < LARGEST_NUMBER).all():
         expected = "finite numbers below 1e12"
-        raise report.error("not-finite", name, "contains NaN or infinity", expected=expected, found=value)
+        report.error("not-finite", name, "contains NaN or infinity", expected=expected, found=value)
+        return None
     return array
 
 
@@ -105,24 +87,39 @@ def array_of_numbers(value: object) -> Array | None:
     return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else None
 
 
-def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array:
+def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array | None:
     """(4, 4) of {"translation": [x, y, z], "rotation_wxyz": [w, x, y, z] or "rotation": 3x3}, metres.
 
-    An invalid rotation is reported and replaced by the nearest valid one. Raises Mistake if that is not possible.
+    An invalid rotation is reported and replaced by the nearest valid one, where there is one.
 
     owner: the JSON object that holds the transform under the key `name`.
     """
     value = owner.get(name)
     expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
     if value is None:
-        raise report.missing(name, expected)
+        report.missing(name, expected)
+        return None
     if not isinstance(value, dict):
-        raise report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
-    inside = report.within(name)
-    translation, rotation = inside.read(parse_numbers, value, "translation", (3,)), inside.read(_parse_rotation, value)
-    if translation is None or rotation is None:
-        raise Mistake
-    return rigid(translation, rotation)
+        report.error("wrong-shape", name, "is not a transform", expected=expected, found=quoted(value))
+        return None
+    inside = replace(report, prefix=f"{name}.")
+    translation, rotation = parse_numbers(value, "translation", (3,), inside), None
+    if "rotation" not in value:
+        quaternion = parse_numbers(value, "rotation_wxyz", (4,), inside)
+        norm = 0.0 if quaternion is None else float(np.linalg.norm(quaternion))
+        if quaternion is not None and abs(norm - 1) > TOLERANCE:
+            inside.error(
+                "quaternion-norm", "rotation_wxyz", "is not a rotation: its norm is not 1",
+                expected="1 ± 0.001", found=f"{norm:.6g}",
+                advice="check for missing or rounded digits; the order is w, x, y, z",
+            )  # fmt: skip
+        rotation = None if quaternion is None or norm <= TOLERANCE else rotation_from_quaternion(quaternion)
+    elif "rotation_wxyz" in value:
+        inside.error("rotation-twice", "rotation", 'is given in addition to "rotation_wxyz"', expected="one of them")
+    else:
+        matrix = parse_numbers(value, "rotation", (3, 3), inside)
+        rotation = None if matrix is None else _nearest_rotation(matrix, inside)
+    return None if translation is None or rotation is None else rigid(translation, rotation)
 
 
 def transform_to_json(a_from_b: Array) -> dict[str, Any]:
@@ -147,39 +144,17 @@ def pose_to_json(pose: Pose) -> dict[str, list[float]]:
     return {"translation": pose.translation.tolist(), "rotation_wxyz": pose.quaternion.tolist()}
 
 
-def _parse_rotation(pose: Mapping[str, Any], report: Report) -> Array:
-    if "rotation" not in pose:
-        return _rotation_of(parse_numbers(pose, "rotation_wxyz", (4,), report), report)
-    if "rotation_wxyz" in pose:
-        message = 'is given in addition to "rotation_wxyz"'
-        raise report.error("rotation-twice", "rotation", message, expected="one of them")
-    return _nearest_rotation(parse_numbers(pose, "rotation", (3, 3), report), report)
-
-
-def _rotation_of(quaternion: Array, report: Report) -> Array:
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > TOLERANCE:
-        mistake = report.error(
-            "quaternion-norm", "rotation_wxyz", "is not a rotation: its norm is not 1",
-            expected="1 ± 0.001", found=f"{norm:.6g}",
-            advice="check for missing or rounded digits; the order is w, x, y, z",
-        )  # fmt: skip
-        if norm <= TOLERANCE:
-            raise mistake
-    return rotation_from_quaternion(quaternion)
-
-
-def _nearest_rotation(matrix: Array, report: Report) -> Array:
-    """The matrix (3, 3), or the nearest rotation if it is not a rotation. Raises Mistake if it is singular."""
+def _nearest_rotation(matrix: Array, report: Report) -> Array | None:
+    """The matrix (3, 3), or the nearest rotation if it is not a rotation. None if it is singular."""
     deviation = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if deviation > TOLERANCE:
-        mistake = report.error(
+        report.error(
             "rotation-not-orthonormal", "rotation", "is not orthonormal",
             expected="R Rᵀ = identity within 0.001", found=f"off by {deviation:.3g}",
             advice="check for rounded digits, a scale factor, or another matrix in its place",
         )  # fmt: skip
     elif np.linalg.det(matrix) < 0:
-        mistake = report.error(
+        report.error(
             "rotation-left-handed", "rotation", "is left-handed", expected="determinant 1", found="determinant -1",
             advice="an axis is mirrored; camera: x right, y down, z forward; ego: x forward, y left, z up",
         )  # fmt: skip
@@ -187,6 +162,6 @@ def _nearest_rotation(matrix: Array, report: Report) -> Array:
         return matrix
     left, singular_values, right = np.linalg.svd(matrix)
     if singular_values[-1] < TOLERANCE:
-        raise mistake
+        return None
     nearest: Array = left @ right
     return nearest if np.linalg.det(nearest) > 0 else nearest * [-1.0, 1.0, 1.0]

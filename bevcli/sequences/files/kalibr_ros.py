@@ -115,12 +115,12 @@ def lens_fields(model: object, coefficients: object, where: str) -> Fields:
         raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
     if not any(coefficients):
         return {"model": "none"}
-    known = LENS_NAMES.get(str(model).lower() or "plumb_bob")
-    if known is None:
+    lens = LENS_NAMES.get(str(model).lower() or "plumb_bob")
+    if lens is None:
         expected = ", ".join(LENS_NAMES)
         raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {expected})")
-    used = 8 if known == "brown_conrady" and not any(coefficients[8:]) else None  # OpenCV states up to 14, of 0
-    return {"model": known, "coefficients": coefficients[:used]}
+    used = 8 if lens == "brown_conrady" and not any(coefficients[8:]) else None  # OpenCV states up to 14, of 0
+    return {"model": lens, "coefficients": coefficients[:used]}
 
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:

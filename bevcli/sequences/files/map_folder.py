@@ -1,10 +1,9 @@
 """BEV maps in ground_truth_map/ and segmentation/: one PNG per frame, and map.json ("bevcli-map/1")."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +11,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.parsing.documents import read_json
-from bevcli.parsing.files import read_bytes
-from bevcli.parsing.images import decode_image
+from bevcli.parsing.files import decode_image, read_bytes
 from bevcli.writing import write_whole
 
 FORMAT = "bevcli-map/1"
@@ -54,11 +52,29 @@ def open_maps(path: Path) -> MapFolder:
     legend_path = path / LEGEND
     missing = "the file is missing (expected the extent and classes of the maps in this folder)"
     legend = read_json(legend_path, missing=missing)
-    found = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
-    if found != FORMAT:
-        raise InputError(f'{legend_path}: "format" must be "{FORMAT}", found {found!r:.40}')
-    ranges = (_range(legend, "x_range_m", legend_path), _range(legend, "y_range_m", legend_path))
-    return MapFolder(path, *ranges, _classes(legend, legend_path))
+    form = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
+    if form != FORMAT:
+        raise InputError(f'{legend_path}: "format" must be "{FORMAT}", found {form!r:.40}')
+    ranges: list[tuple[float, float]] = []
+    for key in ("x_range_m", "y_range_m"):
+        value = legend.get(key)
+        numbers = value if isinstance(value, list) and all(type(v) in (int, float) for v in value) else []
+        if len(numbers) != 2 or not numbers[0] < numbers[1]:
+            raise InputError(
+                f'{legend_path}: "{key}" must be two numbers, smaller first, in metres; found {value!r:.60}'
+            )
+        ranges.append((float(numbers[0]), float(numbers[1])))
+    value = legend.get("classes")
+    bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
+    names = value.values() if isinstance(value, dict) else ()
+    texts = {text for text in names if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
+    if not isinstance(value, dict) or not value or not value.keys() <= bits.keys() or len(texts) != len(value):
+        raise InputError(
+            f'{legend_path}: "classes" must name bits, such as {{"1": "drivable_road", "2": "lane_boundary"}}: powers '
+            f"of two up to {max(bits.values())}, each name once; found {value!r:.80}"
+        )
+    classes = {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}
+    return MapFolder(path, *ranges, classes)
 
 
 def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
@@ -84,29 +100,3 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
 def map_path(folder: Path, frame: int) -> Path:
     """The file of a frame's map in a folder of maps."""
     return folder / f"{frame:06d}.png"
-
-
-def _range(legend: dict[str, Any], key: str, path: Path) -> tuple[float, float]:
-    value = legend.get(key)
-    numbers = value if isinstance(value, list) and all(type(v) in (int, float) for v in value) else []
-    if len(numbers) != 2 or not numbers[0] < numbers[1]:
-        raise InputError(f'{path}: "{key}" must be two numbers, smaller first, in metres; found {value!r:.60}')
-    return float(numbers[0]), float(numbers[1])
-
-
-def _classes(legend: dict[str, Any], path: Path) -> dict[str, int]:
-    """Class -> its bit, by rising bit."""
-    value = legend.get("classes")
-    bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
-    if not isinstance(value, dict) or not value or not value.keys() <= bits.keys() or not _are_names(value.values()):
-        raise InputError(
-            f'{path}: "classes" must name bits, such as {{"1": "drivable_road", "2": "lane_boundary"}}: powers of two '
-            f"up to {max(bits.values())}, each name once; found {value!r:.80}"
-        )
-    return {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}
-
-
-def _are_names(values: Collection[Any]) -> bool:
-    """True if these are different names of up to LONGEST_NAME printable characters."""
-    texts = {text for text in values if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
-    return len(texts) == len(values)

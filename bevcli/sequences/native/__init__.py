@@ -1,4 +1,19 @@
 """The native sequence folder: one drive with calibration, images or videos, ego-motion and ground truth.
 
-folder: FolderSequence, the folder as a Sequence, also without frames.csv. tables: frames.csv and ego_motion.csv.
+folder: FolderSequence, the folder as a Sequence. unlisted: its frames where it has no frames.csv.
 """
+
+from bevcli.sequences.format import Format
+from bevcli.sequences.options import RigOptions
+
+# Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
+MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
+
+FORMAT = Format(
+    name="a sequence folder",
+    expected="calibration.json, frames.csv, ego_motion.csv, images or videos",
+    recognises=lambda path: any((path / part).exists() for part in MARKERS),
+    opener="bevcli.sequences.native.folder:FolderSequence",
+    options=RigOptions,
+    precedence=-10,
+)

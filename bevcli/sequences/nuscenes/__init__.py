@@ -3,3 +3,50 @@
 sequence: NuScenesSequence, the dataset as a Sequence, and TableSequence, for formats with the same tables.
 index: the contents of tables as arrays, dialects, splits and frames. tables: reads and caches them.
 """
+
+from pathlib import Path
+
+from bevcli.options import option, options
+from bevcli.sequences.format import Format
+from bevcli.sequences.options import FormatOptions
+
+
+@options("Input")
+class NuScenesOptions(FormatOptions):
+    """The part of a nuScenes dataset that is read."""
+
+    version: str | None = option(
+        default=None, help="nuScenes: dataset version, such as v1.0-mini. Default: the only one present."
+    )
+    split: str | None = option(
+        default=None, help="nuScenes: only scenes of this split (train, val, test, mini_train, mini_val)."
+    )
+    sweeps: bool = option(
+        default=False, help="nuScenes: also read the images between keyframes (12 frames per second)."
+    )
+
+    @property
+    def wants_all_frames(self) -> bool:
+        """With sweeps, every frame is kept unless a rate is given."""
+        return self.sweeps
+
+
+def versions_in(root: Path) -> list[str]:
+    """The versions whose tables a folder contains, such as "v1.0-mini" for ROOT/v1.0-mini/scene.json."""
+    return sorted(path.parent.name for path in root.glob("v1.*/scene.json"))
+
+
+def is_nuscenes_root(path: Path) -> bool:
+    """True if a folder contains the tables of a nuScenes version."""
+    return bool(versions_in(path))
+
+
+FORMAT = Format(
+    name="a nuScenes root",
+    expected="v1.0-*/scene.json",
+    recognises=is_nuscenes_root,
+    opener="bevcli.sequences.nuscenes.sequence:NuScenesSequence",
+    options=NuScenesOptions,
+    annotated=True,
+    precedence=20,
+)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
-from bevcli.sequences.nuscenes.format import versions_in
+from bevcli.sequences.nuscenes import versions_in
 
 Ints = NDArray[np.int64]
 
@@ -237,7 +237,7 @@ def tables_of(root: Path, version: str | None) -> Path:
 
 def choose_version(root: object, versions: Sequence[str], version: str | None) -> str:
     """The version with a name, or the only one. root: for messages. Raises InputError as `tables_of`."""
-    chosen = [one for one in versions if version in (None, one)]
+    chosen = [name for name in versions if version in (None, name)]
     if len(chosen) == 1:
         return chosen[0]
     found = ", ".join(versions) or "none"
@@ -327,12 +327,12 @@ def sweep_frames(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int | 
         earlier, sample = time, int(images.samples[row])
         if is_key:
             time = int(index.samples.times_us[sample])
-            found = key_rows[images.samples[key_rows] == sample]
+            image_rows = key_rows[images.samples[key_rows] == sample]
         else:
             time = int(images.times_us[row]) + lag
-            found = _nearest(index, by_camera, time)
+            image_rows = _nearest(index, by_camera, time)
         if time > earlier:
-            yield time, sample if is_key else None, found
+            yield time, sample if is_key else None, image_rows
 
 
 def _nearest(index: NuScenesIndex, by_camera: list[Ints], time: int) -> Ints:

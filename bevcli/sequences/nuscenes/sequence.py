@@ -17,7 +17,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import true_results
 from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import (
     NUSCENES,
     Dialect,
@@ -122,11 +122,11 @@ class TableSequence(Sequence):
     @property
     def class_counts(self) -> Mapping[str, int]:
         first, categories = self.index.samples.first_annotation, self.index.annotations.categories
-        found: Counter[bytes] = Counter()
+        by_category: Counter[bytes] = Counter()
         for sample in (entry.sample for entry in self._frames if entry.sample is not None):
-            found.update(categories[first[sample] : first[sample + 1]].tolist())
+            by_category.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
-        for category, count in found.items():
+        for category, count in by_category.items():
             if category and (name := self.dialect.class_of(category.decode())):
                 counts[name] += count
         return counts
@@ -169,9 +169,9 @@ class TableSequence(Sequence):
     def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
         for scene in self.scenes:
-            found = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
+            frames = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
             name = str(self.index.scenes.names[scene])
-            for time_us, sample, rows in found:
+            for time_us, sample, rows in frames:
                 yield _FrameEntry(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
                 number += 1
 
@@ -227,7 +227,7 @@ def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int, tables: Path) 
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
     lidars = index.samples.lidars[slice(*index.scenes.first_sample[scene : scene + 2])]
-    lidar = next((int(one) for one in lidars if one >= 0), None)
+    lidar = next((int(lidar_row) for lidar_row in lidars if lidar_row >= 0), None)
     if lidar is None or not dialect.bev_is_lidar:
         return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
     return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)

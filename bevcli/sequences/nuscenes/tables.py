@@ -81,10 +81,12 @@ class Rows:
         """(N,) int64 values of a column."""
         values = self.column(name)
         if not set(map(type, values)) <= {int, bool} or max(map(abs, values), default=0) > LARGEST_INTEGER // 1000:
-            found = next(one for one in values if type(one) not in (int, bool) or abs(one) > LARGEST_INTEGER // 1000)
-            unit = ": give microseconds, not seconds" if type(found) is float and 1e8 < found < 1e11 else ""
+            wrong = next(
+                value for value in values if type(value) not in (int, bool) or abs(value) > LARGEST_INTEGER // 1000
+            )
+            unit = ": give microseconds, not seconds" if type(wrong) is float and 1e8 < wrong < 1e11 else ""
             raise self._error(
-                f'"{name}": expected an integer of at most 52 bits in every row, found {found!r:.40}{unit}'
+                f'"{name}": expected an integer of at most 52 bits in every row, found {wrong!r:.40}{unit}'
             )
         return np.array(values, dtype=np.int64)
 
@@ -140,7 +142,7 @@ def read_batches(path: Path) -> Iterator[Rows]:
         rest = file.read(BATCH_BYTES).lstrip()[1:]  # without the list's opening bracket
         while block := file.read(BATCH_BYTES):
             text = rest + block
-            ends = [found.start() + 1 for found in BETWEEN_ROWS.finditer(text, max(0, len(text) - TAIL_BYTES))]
+            ends = [match.start() + 1 for match in BETWEEN_ROWS.finditer(text, max(0, len(text) - TAIL_BYTES))]
             cut = ends[-1] if ends else 0
             yield _parse(path, b"[" + text[:cut] + b"]")
             rest = text[cut:].lstrip()[1:]  # without the comma
@@ -270,13 +272,13 @@ def _read_sensor_data(
     path = tables / "sample_data.json"
     lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
-    parts, known = [], {token.decode() for token in sensor_tokens}
+    parts, listed = [], {token.decode() for token in sensor_tokens}
     for batch in read_batches(path):
         facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
         needed = batch.where(
             (owner in cameras and row.get("is_valid") is not False)
             or (key and owner in lidars)
-            or owner not in known  # an error, which `places_of` raises
+            or owner not in listed  # an error, which `places_of` raises
             for row, owner, key in facts
         )
         if len(needed):
@@ -305,8 +307,8 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     for batch in read_batches(path):
         rows = batch.where(token in needed for token in batch.texts("token"))
         parts.append((rows.tokens("token"), rows.vectors("translation", 3), rows.quaternions("rotation")))
-    found, translations, rotations = map(np.concatenate, zip(*parts, strict=True))
-    places = places_of(wanted, found, path)
+    tokens, translations, rotations = map(np.concatenate, zip(*parts, strict=True))
+    places = places_of(wanted, tokens, path)
     chosen = rotations[places]
     return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
@@ -365,18 +367,18 @@ def _optional(path: Path, name: str) -> dict[str, str]:
 
 def _middle(level: str) -> float:
     """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1; NaN for other levels."""
-    found = re.fullmatch(r"v(100|[0-9]{1,2})-(100|[0-9]{1,2})", level)
-    return np.nan if found is None else (int(found[1]) + int(found[2])) / 200
+    match = re.fullmatch(r"v(100|[0-9]{1,2})-(100|[0-9]{1,2})", level)
+    return np.nan if match is None else (int(match[1]) + int(match[2])) / 200
 
 
 def _num_points(rows: Rows) -> Ints:
     """(A,) lidar and radar points; -1 where one of them is null."""
     columns = [rows.column(name) for name in ("num_lidar_pts", "num_radar_pts")]
-    known = [None not in counts for counts in zip(*columns, strict=True)]
-    found = np.full(len(rows), -1, dtype=np.int64)
-    some = rows.where(known)
-    found[known] = some.integers("num_lidar_pts") + some.integers("num_radar_pts")
-    return found
+    has_counts = [None not in counts for counts in zip(*columns, strict=True)]
+    points = np.full(len(rows), -1, dtype=np.int64)
+    counted = rows.where(has_counts)
+    points[has_counts] = counted.integers("num_lidar_pts") + counted.integers("num_radar_pts")
+    return points
 
 
 def _columns(rows: Rows, names: _Names) -> Columns:

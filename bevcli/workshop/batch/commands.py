@@ -15,7 +15,7 @@ from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.batch.options import BatchOptions, ReproduceOptions, Workers
 
@@ -57,7 +57,7 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.sequences.nuscenes.format import NuScenesOptions
+    from bevcli.sequences.nuscenes import NuScenesOptions
     from bevcli.workshop.batch.job import Job, all_own_options, find_drives, read_list, with_absolute_paths
     from bevcli.workshop.batch.storage import is_url
 

@@ -30,7 +30,7 @@ from bevcli.parsing.files import MIB, read_text
 from bevcli.published import weights_folder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
-from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence

@@ -36,7 +36,7 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch.job import (
     ATTEMPTS,
     FAILED,

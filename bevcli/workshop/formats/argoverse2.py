@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D, with_track_velocities
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
+from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats import Argoverse2Options
+from bevcli.workshop.formats.labels import with_track_velocities
 
 # Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
 # and STROLLER, stay as they are, and are not scored.

@@ -7,7 +7,8 @@ from typing import Annotated
 
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
 from bevcli.printing import counted, say
-from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats import LabelOptions, WriteOptions
 
 PANEL = "Start"
 

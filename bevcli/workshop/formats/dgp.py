@@ -12,15 +12,16 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D, with_track_velocities
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
+from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
 from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.workshop.formats.labels import with_track_velocities
 
 # DDAD's class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as Wheeled
 # Slow and Train, stay as they are, and are not scored.

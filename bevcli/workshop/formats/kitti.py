@@ -24,7 +24,7 @@ from bevcli.parsing.files import MIB, read_bytes, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
-from bevcli.sequences.options import LabelOptions
+from bevcli.workshop.formats import LabelOptions
 from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels, Moment
 from bevcli.writing import write_whole
 

@@ -17,16 +17,16 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
-from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, with_track_velocities
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, velocities_between
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted
 from bevcli.registry import entries, load
-from bevcli.sequences.files.class_names import count_classes
+from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.open import scenes_of
-from bevcli.sequences.options import LabelOptions, UnlistedFrames
+from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 
 GROUP = "bevcli.label_formats"
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
@@ -212,6 +212,26 @@ def _index(labelled: LabelledFrame, times: np.ndarray, index_of: Mapping[int, in
 def _words(labelled: LabelledFrame) -> str:
     time = "" if labelled.timestamp_ns is None else f" at {labelled.timestamp_ns} ns"
     return f"the frame{'' if labelled.index is None else f' {labelled.index}'}{time}"
+
+
+def with_track_velocities(frames: Items[Boxes3D], timestamps_ns: Items[int]) -> list[Boxes3D]:
+    """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`; "" is none.
+
+    timestamps_ns: (T,) increasing.
+    """
+    together = Boxes3D.concatenate(frames)
+    if together.instances is None:
+        return list(frames)
+    counts = [len(boxes) for boxes in frames]
+    seconds = np.repeat((np.asarray(timestamps_ns) - timestamps_ns[0]) * 1e-9, counts)
+    order = np.lexsort((seconds, together.instances))
+    names = together.instances[order]
+    same = (names[1:] == names[:-1]) & (names[1:] != "")
+    first, last = np.arange(len(order)), np.arange(len(order))
+    first[order[1:][same]], last[order[:-1][same]] = order[:-1][same], order[1:][same]
+    velocities = velocities_between(together.centers, seconds, first, last)[:, :2]
+    parts = np.split(velocities, np.cumsum(counts)[:-1])
+    return [replace(boxes, velocities=own) for boxes, own in zip(frames, parts, strict=True)]
 
 
 LARGEST_BYTES = 512 * MIB

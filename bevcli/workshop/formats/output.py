@@ -16,19 +16,20 @@ import numpy as np
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, DriveFacts, Frame, FrameResult, Ground, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig, same_rig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of
 from bevcli.registry import load_form
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.format import true_result_files
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
-from bevcli.sequences.native.tables import write_ego_motion
-from bevcli.sequences.options import SequenceOptions, WriteOptions
-from bevcli.writing import remove_parts, whole_folder, write_whole
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats import WriteOptions
+from bevcli.writing import remove_parts, whole_file, whole_folder, write_whole
 
 GROUP: Final = "bevcli.drive_writers"
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
@@ -261,6 +262,31 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
         np.stack([pose.quaternion for pose in poses]),
         *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
     )
+
+
+def same_rig(one: CameraRig, other: CameraRig) -> bool:
+    """True if all names and numbers of two rigs are equal."""
+    return (
+        one.names == other.names
+        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        and all(
+            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
+            and np.array_equal(a.intrinsics, b.intrinsics)
+            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
+            for a, b in zip(one.cameras, other.cameras, strict=True)
+        )
+    )
+
+
+def write_ego_motion(path: Path, motion: EgoMotion) -> None:
+    """Write all columns, so that `read_ego_motion` returns the same numbers. Raises OutputError."""
+    columns = (motion.translations, motion.quaternions, motion.accelerations, motion.angular_rates, motion.velocities)
+    numbers = np.concatenate(columns, axis=1)  # (T, 16)
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
+        for time, row in zip(motion.timestamps_ns, numbers, strict=True):
+            writer.writerow([int(time), *(repr(float(value)) for value in row)])
 
 
 def _native_writer(folder: Path, sequence: Sequence, options: WriteOptions) -> NativeWriter:

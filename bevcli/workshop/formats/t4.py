@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.files.boxes_file import ClassNames
+from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Dialect
 from bevcli.sequences.nuscenes.sequence import TableSequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions

@@ -20,8 +20,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.options import gather
-from bevcli.sequences.native.tables import write_ego_motion
-from bevcli.workshop.formats.output import NativeWriter
+from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines

@@ -22,7 +22,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, level_rig
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, class_of_size
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.inference.machine import peak_memory
 from bevcli.inference.training_rigs import rigs_of
@@ -42,6 +42,19 @@ from bevcli.writing import write_whole
 INSIDE_PERCENT = 95.0  # of the boxes that the BEV range takes in
 LARGEST_HELD_OUT = 10  # drives
 NEAREST_RATE = 0.75  # data with at least this share of the preset's frame rate is trained at the preset's
+# Mean length, width and height of their boxes in nuScenes, metres.
+NUSCENES_SIZES: Mapping[str, tuple[float, float, float]] = {
+    "car": (4.6, 1.95, 1.72),
+    "truck": (6.93, 2.51, 2.84),
+    "construction_vehicle": (6.37, 2.73, 3.19),
+    "bus": (10.5, 2.94, 3.47),
+    "trailer": (12.29, 2.9, 3.87),
+    "barrier": (0.5, 2.53, 0.98),
+    "motorcycle": (2.11, 0.77, 1.47),
+    "bicycle": (1.7, 0.6, 1.28),
+    "pedestrian": (0.73, 0.67, 1.77),
+    "traffic_cone": (0.41, 0.41, 1.07),
+}
 
 
 @dataclass(frozen=True)
@@ -379,3 +392,13 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0) if job.loaders == 1 else 0.0  # processes take seconds to start
     return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))
+
+
+def class_of_size(length: float, width: float, height: float) -> str:
+    """The nuScenes class whose boxes are most alike to one of this size, in metres, by the ratios of their sides."""
+    size = length, width, height
+
+    def difference(name: str) -> float:
+        return sum(abs(math.log(a / b)) for a, b in zip(NUSCENES_SIZES[name], size, strict=True))
+
+    return min(NUSCENES_SIZES, key=difference)

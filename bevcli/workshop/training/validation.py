@@ -23,8 +23,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
-from bevcli.sequences.files.boxes_file import FrameBoxes
-from bevcli.sequences.files.class_names import ClassNames, count_classes
+from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes, count_classes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives

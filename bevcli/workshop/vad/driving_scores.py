@@ -20,7 +20,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import aligned, counted
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.sequences.nuscenes.format import is_nuscenes_root
+from bevcli.sequences.nuscenes import is_nuscenes_root
 from bevcli.workshop.vad import DrivingScoreOptions
 from bevcli.workshop.vad.driving_metrics import (
     THRESHOLDS_M,

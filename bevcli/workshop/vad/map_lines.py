@@ -13,7 +13,7 @@ from bevcli.frame import Frame, FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording.colors import map_colors
-from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import array_of_numbers
 
 FORMAT = "bevcli-map-lines/1"
@@ -32,7 +32,7 @@ OTHER_LINE_COLORS: tuple[Color, ...] = ((120, 170, 255), (255, 170, 120), (160, 
 OPACITY, WIDTH = 230, 1.6  # of 255; points of the user interface
 
 
-class LinesWriter(FileOfFrames):
+class LinesWriter(IncrementalJson):
     """Writes map_lines.json frame by frame, as `BoxesWriter` writes boxes. Raises OutputError."""
 
     def __init__(
@@ -40,7 +40,7 @@ class LinesWriter(FileOfFrames):
     ) -> None:
         """extras: at least "classes". resume_at: `size` of an earlier writer of this file, to go on from there."""
         head = {"format": FORMAT, "frame_of_reference": frame_of_reference, **extras}
-        super().__init__(path, head, resume_at)
+        super().__init__(path, head, "frames", resume_at)
 
     def write(self, ground: Ground, lines: "MapLines | None") -> None:
         """Append a frame. lines: in the bev frame; None where the model was not run."""

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml, read_yaml
-from bevcli.parsing.files import MIB, decompressed, read_text
+from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import aligned, counted, reason_of
 from bevcli.workshop.formats import BAG_METADATA, BAG_SUFFIXES, is_packed_bag
-from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, frame_of
+from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, decompressed, frame_of
 
 if TYPE_CHECKING:
     from bevcli.workshop.formats.ros.storage import McapFile, SqliteFile

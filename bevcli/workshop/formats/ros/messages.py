@@ -230,3 +230,36 @@ def _first(owner: Any, *names: str) -> Any:
         if hasattr(owner, name):
             return getattr(owner, name)
     raise ValueError(f"the field {names[0]} is missing")
+
+
+def decompressed(kind: str, data: bytes, largest: int) -> bytes:
+    """The bytes of compressed data.
+
+    kind: "zstd", "lz4", or "" for data that is not compressed.
+    Raises ValueError for another kind, damaged data, or more than `largest` bytes. Data that is cut off may give less.
+    """
+    kinds = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
+    if kind not in kinds:
+        raise ValueError(f'unknown compression "{kind:.20}" (expected zstd, lz4 or none)')
+    found = kinds[kind](data, largest + 1)
+    if len(found) > largest:
+        raise ValueError(f"has more than {largest} bytes when it is decompressed")
+    return found
+
+
+def _from_zstd(data: bytes, largest: int) -> bytes:
+    import zstandard
+
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(largest)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from None
+
+
+def _from_lz4(data: bytes, largest: int) -> bytes:
+    import lz4.frame  # type: ignore[import-not-found,import-untyped,unused-ignore]
+
+    try:
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, largest))
+    except (RuntimeError, EOFError) as error:
+        raise ValueError(str(error)) from None

@@ -21,12 +21,12 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DriveFacts, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.parsing.files import is_there
-from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
 from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
@@ -101,11 +101,11 @@ def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
     """
     before, _, after = stated.partition("compressed")
     encoding = after.strip() or before.partition(";")[0]
-    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, images.MOST_PIXELS) if BAYER.fullmatch(encoding) else None
+    pixels = decode_image(data, cv2.IMREAD_UNCHANGED, MOST_PIXELS) if BAYER.fullmatch(encoding) else None
     if pixels is not None and pixels.ndim == 2:
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         return cv2.cvtColor(pixels, RAW_ENCODINGS[encoding][2] or 0).astype(np.uint8, copy=False), False
-    pixels = images.decode(data)
+    pixels = decode_image(data, images.DECODE_FLAGS, MOST_PIXELS)
     if pixels is None or not (after.strip() and encoding.startswith("rgb")):
         return pixels, True
     return pixels[..., ::-1].copy(), False
@@ -152,7 +152,7 @@ class BagVideo:
             raise InputError(f"{bag.path}: {topic}: video format {self._format} is not supported (expected {expected})")
         self._folder = tempfile.TemporaryDirectory(prefix="bevcli-video-")
         self._group: range = range(0)  # messages of the group of pictures that is open
-        self._reader: images.VideoReader | None = None
+        self._reader: VideoReader | None = None
         self._lock = threading.Lock()
 
     def image(self, index: int, time_ns: int) -> images.MessageSource:
@@ -186,7 +186,7 @@ class BagVideo:
         path.write_bytes(b"".join(self._packet(number) for number in range(start, stop)))
         if self._reader is not None:
             self._reader.path.unlink(missing_ok=True)
-        self._reader, self._group = images.VideoReader(path), range(start, stop)
+        self._reader, self._group = VideoReader(path), range(start, stop)
 
     def _packet(self, index: int) -> bytes:
         return payload(self._bag.message(self._topic, self._numbers[index]))

@@ -19,8 +19,8 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.parsing.files import MIB, decompressed, open_regular
-from bevcli.workshop.formats.ros.messages import Topic
+from bevcli.parsing.files import MIB, open_regular
+from bevcli.workshop.formats.ros.messages import Topic, decompressed
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows

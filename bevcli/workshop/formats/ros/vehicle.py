@@ -14,7 +14,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
-from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.options import EgoMotionUse
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, spread
 from bevcli.workshop.formats.ros.messages import Transform, camera_of, frame_of, pose_of, timestamp_ns, transforms_of
