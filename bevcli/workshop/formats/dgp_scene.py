@@ -12,7 +12,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D, with_track_velocities
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
@@ -22,6 +22,7 @@ from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.workshop.formats.dgp import CLASS_OF_CATEGORY
+from bevcli.workshop.formats.labels import with_track_velocities
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3

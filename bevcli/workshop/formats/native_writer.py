@@ -23,7 +23,7 @@ from bevcli.sequences.format import true_result_files
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import FolderWriter, OutputFormat
+from bevcli.workshop.formats.output import FolderWriter, OutputFormat, same_rig
 from bevcli.writing import whole_file
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
@@ -96,7 +96,7 @@ class NativeWriter(FolderWriter):
             cameras = [cell_of(name) for name in frame.rig.names]
             times = [f"{name}.timestamp_ns" for name in cameras]
             self._rows.writerow(["frame", "scene", "timestamp_ns", *cameras, *times])
-        elif frame.rig is not self._rig and not _same_rig(frame.rig, self._rig):
+        elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
             raise InputError(
                 f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
                 "sequence has a single calibration: convert scene by scene (`scene`)"
@@ -149,20 +149,6 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
         np.stack([pose.translation for pose in poses]),
         np.stack([pose.quaternion for pose in poses]),
         *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
-    )
-
-
-def _same_rig(one: CameraRig, other: CameraRig) -> bool:
-    """True if all names and numbers of two rigs are equal."""
-    return (
-        one.names == other.names
-        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
-        and all(
-            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
-            and np.array_equal(a.intrinsics, b.intrinsics)
-            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(one.cameras, other.cameras, strict=True)
-        )
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import Camera, CameraRig, same_rig
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import is_file_name
@@ -21,7 +21,7 @@ from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence
 from bevcli.sequences.nuscenes.tables import Row
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import FolderWriter, OutputFormat
+from bevcli.workshop.formats.output import FolderWriter, OutputFormat, same_rig
 from bevcli.writing import write_whole
 
 VERSION = "v1.0-custom"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 import cv2
+import numpy as np
 
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import load_form
@@ -17,6 +18,7 @@ from bevcli.writing import remove_parts, whole_folder, write_whole
 
 if TYPE_CHECKING:
     from bevcli.frame import CameraImage, Frame, Sequence
+    from bevcli.geometry.cameras import CameraRig
 
 GROUP: Final = "bevcli.drive_writers"
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
@@ -123,3 +125,17 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     return chosen.opener(path, sequence, options)
+
+
+def same_rig(one: CameraRig, other: CameraRig) -> bool:
+    """True if all names and numbers of two rigs are equal."""
+    return (
+        one.names == other.names
+        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        and all(
+            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
+            and np.array_equal(a.intrinsics, b.intrinsics)
+            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
+            for a, b in zip(one.cameras, other.cameras, strict=True)
+        )
+    )
