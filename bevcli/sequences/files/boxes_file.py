@@ -163,9 +163,9 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         raise InputError(f"{where}: box {index}: {mistake}") from None
     columns: dict[str, NDArray[Any] | None] = {}
     for name, column in OPTIONAL_COLUMNS.items():
-        values = [getattr(row, column.key) for row in rows]
-        given = [column.unknown if value is UNSET or value is None else value for value in values]
-        columns[name] = None if values.count(UNSET) == len(values) else np.array(given)
+        given = [getattr(row, column.key) for row in rows]
+        known = [column.unknown if value is UNSET or value is None else value for value in given]
+        columns[name] = None if given.count(UNSET) == len(given) else np.array(known)
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
@@ -179,7 +179,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     if 0 < len(without) < len(rows):
         raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
     sizes = boxes.sizes_lwh
-    checks: list[tuple[str, Array, NDArray[np.bool_], str]] = [
+    checks: list[tuple[str, NDArray[Any], NDArray[np.bool_], str]] = [
         (column.key, shares, ((shares >= 0) & (shares <= 1)) | np.isnan(shares), "0 to 1")
         for name, column in OPTIONAL_COLUMNS.items()
         if column.values == "share" and (shares := columns[name]) is not None

@@ -55,7 +55,7 @@ def open_maps(path: Path) -> MapFolder:
     form = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
     if form != FORMAT:
         raise InputError(f'{legend_path}: "format" must be "{FORMAT}", found {form!r:.40}')
-    ranges: list[tuple[float, float]] = []
+    ranges: dict[str, tuple[float, float]] = {}
     for key in ("x_range_m", "y_range_m"):
         value = legend.get(key)
         numbers = value if isinstance(value, list) and all(type(v) in (int, float) for v in value) else []
@@ -63,7 +63,7 @@ def open_maps(path: Path) -> MapFolder:
             raise InputError(
                 f'{legend_path}: "{key}" must be two numbers, smaller first, in metres; found {value!r:.60}'
             )
-        ranges.append((float(numbers[0]), float(numbers[1])))
+        ranges[key] = float(numbers[0]), float(numbers[1])
     value = legend.get("classes")
     bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
     names = value.values() if isinstance(value, dict) else ()
@@ -74,7 +74,7 @@ def open_maps(path: Path) -> MapFolder:
             f"of two up to {max(bits.values())}, each name once; found {value!r:.80}"
         )
     classes = {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}
-    return MapFolder(path, *ranges, classes)
+    return MapFolder(path, ranges["x_range_m"], ranges["y_range_m"], classes)
 
 
 def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
