@@ -139,7 +139,9 @@ def imported(path: Path) -> Iterator[str]:
 
 def folders(group: str) -> set[str]:
     """The packages of bevcli's entries of a group, such as "bevcli.workshop.uniad"."""
-    return {value.partition(":")[0].rpartition(".")[0] for value in own(group).values()}
+    modules = {value.partition(":")[0] for value in own(group).values()}
+    packages = {module for module in modules if (PACKAGE.parent / module.replace(".", "/")).is_dir()}
+    return packages | {module.rpartition(".")[0] for module in modules - packages}
 
 
 def test_opening_a_sequence_names_no_format():
