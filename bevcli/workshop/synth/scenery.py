@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.synth.catalog import TREE_KINDS, StreetFurniture
 from bevcli.workshop.synth.city import (
     CORNER_M,
     DIRECTIONS,
@@ -32,7 +33,6 @@ from bevcli.workshop.synth.mesh import (
     linear,
     prism,
 )
-from bevcli.workshop.synth.street_objects import TREE_KINDS, StreetFurniture
 from bevcli.workshop.synth.traffic import Signals
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.workshop.synth.catalog import Body
-from bevcli.workshop.synth.city import CityPlan, JunctionPass, Route
-from bevcli.workshop.synth.people import RIDDEN
+from bevcli.workshop.synth.catalog import Assets, Body, draw_body
+from bevcli.workshop.synth.city import DIRECTIONS, STOP_LINE_M, CityPlan, JunctionPass, Route, build_route, right_of
+from bevcli.workshop.synth.road_users import RIDDEN
 
 Light = Literal["red", "yellow", "green"]
 YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all directions
@@ -263,3 +263,81 @@ def interpolated_track(track: Array, time_s: float) -> float:
     return float(
         (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
     )
+
+
+TRAFFIC_MIX = {
+    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
+}  # fmt: skip
+MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
+SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
+
+
+class VehicleSpawner:
+    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
+
+    def __init__(self, city: CityPlan, assets: Assets, route_m: float) -> None:
+        self.city, self.assets, self.route_m = city, assets, route_m
+        self._rng = city.stream("population")
+        self._count = 0
+
+    def spawn_ego(self, units: tuple[Unit, ...]) -> Vehicle:
+        """The ego vehicle, on the approach to junction (0, 0)."""
+        rng = self.city.stream("ego")
+        direction = int(rng.integers(4))
+        lane = int(rng.integers(self.city.street_at((0, 0), direction).lanes))
+        edge = self.city.street_at((0, 0), direction + 1).half_width + STOP_LINE_M
+        before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
+        route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
+        return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
+
+    def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
+        """Try to place a vehicle on a lane at a random point; None where it does not fit.
+
+        around: world point (2,). near_m, far_m: least and greatest distance from it, metres.
+        taken: (M, 2) world points of other vehicles. bicycle: whether to place a bicycle.
+        """
+        rng = self._rng
+        x, y = self.city.unbend(around)
+        axis = int(rng.integers(2))
+        across, lengthwise = (y, x) if axis == 0 else (x, y)
+        streets = self.city.streets_between(axis, across - far_m, across + far_m)
+        if not streets:
+            return None
+        street = self.city.street(axis, streets[int(rng.integers(len(streets)))])
+        at = lengthwise + rng.uniform(-far_m, far_m)
+        direction = axis + 2 * int(rng.integers(2))
+        following = self.city.below(1 - axis, at) + (direction < 2)
+        node = (following, street.index) if axis == 0 else (street.index, following)
+        before = float((self.city.node_center(node) - street.point(at)) @ DIRECTIONS[direction])
+        lane = int(rng.integers(street.lanes))
+        units = self._units(bicycle)
+        length = units[-1].lag + float(units[-1].body.size_lwh[0])
+        cross = self.city.street_at(node, direction + 1)
+        if before < cross.half_width + STOP_LINE_M + 1:
+            return None
+        point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
+        front = self.city.bend(point)
+        if not near_m <= np.hypot(*(front - around)) <= far_m:
+            return None
+        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # the space needed before and behind
+        gaps = self.city.bend(point + reach)[:, None] - taken
+        if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
+            return None
+        speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
+        route_m, before = self.route_m * speed / 12 + length, before + length + 2
+        route = build_route(self.city, rng, node, direction, lane, before, route_m, speed, bicycle=bicycle)
+        return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
+
+    def _units(self, bicycle: bool) -> tuple[Unit, ...]:
+        rng, draw = self._rng, self.assets.draw
+        class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
+        self._count += 1
+        name = f"moving-{self._count}"
+        if class_name == "train":
+            heavy = rng.random() < 0.7
+            first = draw("truck", rng, ("tractor",) if heavy else ("pickup", "delivery", "box"))
+            second = draw("trailer", rng, SEMITRAILERS if heavy else ("utility",))
+            tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
+            lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
+            return Unit(tractor, 0.0), Unit(towed, lag)
+        return (Unit(draw_body(draw(class_name, rng, MOVING_LOOKS.get(class_name)), rng, name), 0.0),)
