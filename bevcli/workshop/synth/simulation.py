@@ -2,29 +2,15 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
 
-from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth import traffic
 from bevcli.workshop.synth.catalog import Assets, Body, draw_body
-from bevcli.workshop.synth.city import (
-    DIRECTIONS,
-    KERB_M,
-    STOP_LINE_M,
-    CityPlan,
-    Route,
-    Street,
-    along,
-    distances_along,
-    points_at,
-    rounded_rectangle,
-    side_of,
-)
+from bevcli.workshop.synth.city import DIRECTIONS, KERB_M, CityPlan, Line, Street, along, rounded_rectangle, side_of
 from bevcli.workshop.synth.road_users import CYCLES, PERSON_NAMES
 
 STRIDE_M = 0.72  # distance after which the pose changes
@@ -40,20 +26,15 @@ class Walker:
 
     city: CityPlan  # the plan that the path belongs to
     body: Body  # size and looks
-    path: Array  # (P, 2) plan points, metres
+    path: Line  # in plan coordinates
     times: Array  # (K,) seconds; between them the person moves evenly
     walked_m: Array  # (K,) position along the path at these times, metres
     road: tuple[float, float]  # start and end of the part of the path that is on a road, metres; negative for none
 
-    @cached_property
-    def positions(self) -> Array:
-        """(P,) position of each point along the path, metres."""
-        return distances_along(self.path)
-
     def plan_at(self, time_s: ArrayLike) -> Array:
         """Plan points (..., 2) at times (...,) in seconds."""
         walked_m = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.walked_m)
-        return points_at(walked_m, self.path, self.positions)
+        return self.path.at(walked_m)
 
     def on_road(self, time_s: float) -> bool:
         """True while the person walks and is on the road, so that vehicles must stop."""
@@ -72,8 +53,8 @@ class Walker:
         if moving:
             yaw = float(np.arctan2(velocity[1], velocity[0]))
         else:  # a waiting person faces along the path
-            segment = int(np.searchsorted(self.positions, walked, side="right"))
-            way = self.path[segment] - self.path[segment - 1]
+            segment = int(np.searchsorted(self.path.positions, walked, side="right"))
+            way = self.path.points[segment] - self.path.points[segment - 1]
             yaw = self.city.heading(plan[1], way / max(float(np.hypot(*way)), 1e-9))
         inside = min(walked - self.road[0], self.road[1] - walked)  # metres into the road, negative on pavements
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
@@ -97,7 +78,7 @@ def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], colum
         walked = (span_s[1] - span_s[0]) * speed
         path = np.concatenate([ring] * (int(np.ceil(walked / lap)) + 1) + [ring[:1]])
         body = _person(assets, rng, f"stroller-{column}-{row}-{k}")
-        walkers.append(Walker(city, body, path, np.array(span_s), np.array([0.0, walked]), (-1.0, -1.0)))
+        walkers.append(Walker(city, body, Line(path), np.array(span_s), np.array([0.0, walked]), (-1.0, -1.0)))
     return walkers
 
 
@@ -139,7 +120,7 @@ def _crosser(
     end = start + (2 * reach - kerb) / speed
     body = _person(assets, rng, name)
     times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
-    return Walker(city, body, path, times, walked_m, (ALONG_PAVEMENT_M, far))
+    return Walker(city, body, Line(path), times, walked_m, (ALONG_PAVEMENT_M, far))
 
 
 def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:
@@ -197,9 +178,8 @@ class Roadside:
         if not street.parking_m:
             return []
         rng = self.city.stream("kerbside", axis, index, cross, side)
-        before, after = self.city.street(1 - axis, cross), self.city.street(1 - axis, cross + 1)
-        low = before.position + before.half_width + STOP_LINE_M + 2.5
-        high = after.position - after.half_width - STOP_LINE_M - 2.5
+        low, high = self.city.between_stop_lines(axis, index, cross)
+        low, high = low + 2.5, high - 2.5
         name = f"{axis}.{index}.{cross}.{side}"
         made: list[StandingActor] = []
         closed = (high + 1, high + 1)
@@ -339,31 +319,6 @@ WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
 AFTER_S = 0.6  # simulated time after the last frame
 VEHICLES, BICYCLES = 22, 6  # numbers around the ego vehicle, which counts as a vehicle
 REACH_M = 75.0  # traffic is simulated within this distance of the ego vehicle
-EGO_REAR_AXLE_M = 3.75  # from the front of the ego vehicle to its rear axle, the origin of the ego frame
-EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle's speed
-
-
-@dataclass(frozen=True)
-class EgoTrack:
-    """The motion of the ego vehicle's rear axle."""
-
-    route: Route  # its route
-    track: Array  # (3, T) times (seconds), route positions (metres), speeds (m/s)
-
-    def pose(self, time_s: float) -> tuple[Array, float]:
-        """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
-        s = traffic.interpolated_track(self.track, time_s)
-        return self.route.at(s), float(self.route.yaw_at(s))
-
-    def motion(self, time_s: float) -> tuple[Array, Array, Array]:
-        """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
-        h = 0.05
-        s = [traffic.interpolated_track(self.track, time_s + d) for d in (-h, 0.0, h)]
-        speed = (s[2] - s[0]) / (2 * h)
-        rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
-        before, after = np.interp([time_s - h, time_s + h], self.track[0], self.track[2])
-        forward = float(after - before) / (2 * h)
-        return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
 
 class Simulation:
@@ -382,7 +337,7 @@ class Simulation:
         self._strollers = lru_cache(maxsize=None)(partial(strollers, city, assets, self.span_s))
         self._driving: list[traffic.DrivingActor] = []
         self._run()
-        self.ego = _smoothed(self._ego)
+        self.ego = traffic.EgoTrack.smoothed(self._ego)
 
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
         """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
@@ -444,11 +399,3 @@ class Simulation:
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
         points = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
         return self.city.bend(np.array(points).reshape(-1, 2))
-
-
-def _smoothed(ego: traffic.Vehicle) -> EgoTrack:
-    """The track of the ego vehicle with its speed smoothed, which limits its acceleration."""
-    times, fronts, speeds = np.array(ego.track).T
-    soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / traffic.STEP_S, mode="nearest")
-    moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * traffic.STEP_S)])
-    return EgoTrack(ego.route, np.stack([times, fronts[0] - EGO_REAR_AXLE_M + moved, soft]))

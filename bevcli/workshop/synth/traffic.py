@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
+from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
 from bevcli.workshop.synth.catalog import Assets, Body, draw_body
@@ -263,6 +265,41 @@ def interpolated_track(track: Array, time_s: float) -> float:
     return float(
         (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
     )
+
+
+EGO_REAR_AXLE_M = 3.75  # from the front of the ego vehicle to its rear axle, the origin of the ego frame
+EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle's speed
+
+
+@dataclass(frozen=True)
+class EgoTrack:
+    """The motion of the ego vehicle's rear axle."""
+
+    route: Route  # its route
+    track: Array  # (3, T) times (seconds), route positions (metres), speeds (m/s)
+
+    @staticmethod
+    def smoothed(ego: Vehicle) -> "EgoTrack":
+        """The track of the ego vehicle with its speed smoothed, which limits its acceleration."""
+        times, fronts, speeds = np.array(ego.track).T
+        soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / STEP_S, mode="nearest")
+        moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * STEP_S)])
+        return EgoTrack(ego.route, np.stack([times, fronts[0] - EGO_REAR_AXLE_M + moved, soft]))
+
+    def pose(self, time_s: float) -> tuple[Array, float]:
+        """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
+        s = interpolated_track(self.track, time_s)
+        return self.route.at(s), float(self.route.yaw_at(s))
+
+    def motion(self, time_s: float) -> tuple[Array, Array, Array]:
+        """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
+        h = 0.05
+        s = [interpolated_track(self.track, time_s + d) for d in (-h, 0.0, h)]
+        speed = (s[2] - s[0]) / (2 * h)
+        rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
+        before, after = np.interp([time_s - h, time_s + h], self.track[0], self.track[2])
+        forward = float(after - before) / (2 * h)
+        return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
 
 TRAFFIC_MIX = {
