@@ -19,7 +19,7 @@ from bevcli.geometry.transforms import Array, inverse
 
 Indices = NDArray[np.int64]
 OF_CAMERA = 7  # unknowns: rotation, position, delay
-HEIGHT = 5  # place of a camera's height among them
+HEIGHT = 5  # index of a camera's height among them
 OF_PAIR = 3  # the error of the vehicle's rotation
 OF_RIG = 3  # scale of the ego-motion, slope of the road along x and y
 DELAYS_S = np.linspace(-0.3, 0.3, 25)  # of a camera's capture times, where the motion of a pair is tabulated
@@ -53,11 +53,11 @@ class Unknowns:
 
     @cached_property
     def columns(self) -> Indices:
-        """(G, 20) the places in x of the unknowns that a group depends on: two cameras, the pair, and the rig."""
+        """(G, 20) the indices in x of the unknowns that a group depends on: two cameras, the pair, and the rig."""
         pair, first, second = self.groups.T[..., None]
         start, rig = OF_CAMERA * self.cameras, OF_CAMERA * self.cameras + OF_PAIR * self.pairs
         of_rig = np.broadcast_to(rig + np.arange(OF_RIG), (len(self.groups), OF_RIG))
-        cameras = [OF_CAMERA * each + np.arange(OF_CAMERA) for each in (first, second)]
+        cameras = [OF_CAMERA * index + np.arange(OF_CAMERA) for index in (first, second)]
         return np.concatenate([*cameras, start + OF_PAIR * pair + np.arange(OF_PAIR), of_rig], axis=-1)
 
     def of_camera(self, x: Array) -> Array:
@@ -97,7 +97,7 @@ def geometry(unknowns: Unknowns, local: Array) -> GroupGeometry:
     """The geometry of all groups. local: (G, 20), the values of `Unknowns.columns`."""
     of_a, of_b, pair, rig = np.split(local, np.cumsum([OF_CAMERA, OF_CAMERA, OF_PAIR]), axis=-1)
     (_, first, second), stated = unknowns.groups.T, unknowns.stated
-    before, after = (_pose_at(unknowns.poses[:, side], each[:, 6]) for side, each in enumerate((of_a, of_b)))
+    before, after = (_pose_at(unknowns.poses[:, side], camera[:, 6]) for side, camera in enumerate((of_a, of_b)))
     motion = inverse(after) @ before
     motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(pair).as_matrix()
     motion[:, :3, 3] *= 1 + rig[:, :1]
@@ -226,7 +226,7 @@ class Solution:
     """The unknowns that fit best."""
 
     x: Array  # (P,) their values
-    columns: Indices  # (G, 20) the places in x that each group depends on
+    columns: Indices  # (G, 20) the indices in x that each group depends on
     blocks: Array  # (G, 20, 20) the information of each group about them
     gradients: Array  # (G, 20) of each group; they sum up to little, and their scatter tells how well the groups agree
 
@@ -273,8 +273,8 @@ def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
     """
     sizes, camera = np.abs(values(unknowns, residuals, x)), unknowns.groups[residuals.group, 1]
     result = np.full(len(sizes), DEVIATION * np.median(sizes) if sizes.size else 1.0)
-    for each in np.unique(camera):
-        mine = camera == each
+    for index in np.unique(camera):
+        mine = camera == index
         if mine.sum() >= FEWEST:
             result[mine] = DEVIATION * np.median(sizes[mine])
     return np.maximum(result, SMALLEST_PX)

@@ -132,7 +132,8 @@ def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
         f"tilt of the ego frame: pitch {pitch}, roll {roll}",
         f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
     ]
-    lines += [f"time offset: {text}" for each in cameras for text in (delay_text(each), either_text(each)) if text]
+    for estimate in cameras:
+        lines += [f"time offset: {text}" for text in (delay_text(estimate), either_text(estimate)) if text]
     return "\n".join(lines)
 
 
@@ -303,7 +304,7 @@ class CalibrationResult:
     facts: DriveFacts
 
     def __getitem__(self, camera: str) -> CameraEstimate:
-        return next(each for each in self.cameras if each.camera == camera)
+        return next(estimate for estimate in self.cameras if estimate.camera == camera)
 
     def text(self) -> str:
         """One row a camera, and lines about the whole rig, for a terminal."""
@@ -315,7 +316,7 @@ class CalibrationResult:
         content = {
             "drive": self.name,
             "pairs": self.pairs,
-            "cameras": {each.camera: each.to_dict() for each in self.cameras},
+            "cameras": {estimate.camera: estimate.to_dict() for estimate in self.cameras},
             "rig": asdict(self.whole),
         }
         return json.dumps(content, indent=1, ensure_ascii=False)

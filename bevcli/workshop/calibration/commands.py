@@ -64,9 +64,9 @@ def _corrected(options: CalibrateFirstOptions, drive: Sequence) -> Sequence:
 
     with Progress(calibration.STEPS, "steps of the calibration") as progress:
         result = calibration.calibrate(drive, after_step=progress.advance)
-    for each in result.cameras:
-        reason = calibration.change_text(each) if each.verdict is calibration.Verdict.CORRECTED else each.reason
-        say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
+    for camera in result.cameras:
+        reason = calibration.change_text(camera) if camera.verdict is calibration.Verdict.CORRECTED else camera.reason
+        say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
     return calibration.CorrectedDrive(drive, result)
 
 

@@ -48,12 +48,12 @@ class Views:
 
     stated: CameraRig  # the rig of the frames
     rig: CameraRig  # the same with cameras for the reduced images
-    pairs: tuple[tuple[int, int], ...]  # places of the frames of each pair
-    of: dict[tuple[int, int], View]  # (place, camera index) -> view; missing images are left out
+    pairs: tuple[tuple[int, int], ...]  # indices of the frames of each pair
+    of: dict[tuple[int, int], View]  # (frame index, camera index) -> view; missing images are left out
 
     def groups(self) -> list[tuple[int, int, int]]:
         """(pair, camera of its first frame, camera of its second one): each camera with itself and its neighbours."""
-        cameras = [(each, each) for each in range(len(self.rig.cameras))] + self.neighbours()
+        cameras = [(index, index) for index in range(len(self.rig.cameras))] + self.neighbours()
         return [
             (pair, first, second)
             for pair, (a, b) in enumerate(self.pairs)
@@ -116,7 +116,7 @@ def _check(drive: Sequence) -> None:
 
 
 def _positions(drive: Sequence) -> tuple[list[int], Array]:
-    """Places of frames, and their positions with headings (F, 3): x, y in metres, yaw in radians."""
+    """Indices of frames, and their positions with headings (F, 3): x, y in metres, yaw in radians."""
     count = len(drive.stamps)
     if drive.ego_motion is not None:
         frames = list(range(count))

@@ -144,7 +144,11 @@ def barrier(name: str) -> list[mesh.Mesh]:
     """The parts of a barrier, about 0.5 m long (its thickness), 2.5 m wide and 1 m high. name: one of BARRIER_NAMES."""
     walls = {"concrete": ((172, 168, 160),), "plastic": (RED, WHITE) * 2, "white_plastic": (WHITE, RED) * 2}
     if name in walls:
-        return _jersey(walls[name])
+        foot = [(0.28, 0.0), (0.26, 0.2), (0.1, 0.45), (0.08, 0.95)]  # sloped
+        outline = [(-0.28, 0.0), *foot, *((-x, z) for x, z in foot[:0:-1])]
+        half = 1.25 / len(walls[name])
+        pieces = enumerate(walls[name])
+        return [mesh.side_profile(outline, half, paint, y=-1.25 + (2 * k + 1) * half) for k, paint in pieces]
     feet = mesh.twin_blocks((0, 0.95, 0.05), (0.5, 0.14, 0.1), (46, 46, 48))
     if name == "plank":
         parts = [feet, mesh.twin_blocks((0, 0.95, 0.5), (0.06, 0.06, 1.0), (150, 152, 150))]
@@ -154,14 +158,6 @@ def barrier(name: str) -> list[mesh.Mesh]:
     parts = [mesh.block((0, 0, z), (0.05, 2.5, 0.06), (206, 208, 204)) for z in (0.2, 1.02)]
     parts += [mesh.block((0, -1.2 + 0.2 * k, 0.6), (0.03, 0.03, 0.84), (206, 208, 204)) for k in range(13)]
     return [feet, *parts, mesh.block((0.03, 0, 0.72), (0.03, 0.9, 0.3), ORANGE)]
-
-
-def _jersey(colors: Colors) -> list[mesh.Mesh]:
-    """A wall along y with a sloped foot, in pieces of these colours."""
-    side = [(0.28, 0.0), (0.26, 0.2), (0.1, 0.45), (0.08, 0.95)]
-    outline = [(-0.28, 0.0), *side, *((-x, z) for x, z in side[:0:-1])]
-    half = 1.25 / len(colors)
-    return [mesh.side_profile(outline, half, paint, y=-1.25 + (2 * k + 1) * half) for k, paint in enumerate(colors)]
 
 
 BARK: mesh.Color = (92, 74, 58)

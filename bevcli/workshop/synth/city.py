@@ -12,7 +12,7 @@ from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.transforms import Array
@@ -377,7 +377,10 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
     positions = Line(points).positions
     way = np.gradient(points, axis=0)
     yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-    limits = _speed_limits(positions, yaws, speed)
+    curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
+    squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
+    falling = squared + 2 * BRAKING * positions  # the limits fall before curves so that BRAKING is enough
+    limits = np.sqrt(np.minimum.accumulate(falling[::-1])[::-1] - 2 * BRAKING * positions)
     passes, start = [], 0
     for node, direction, turn, *plan_points in marks:
         reached = []
@@ -387,11 +390,3 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
             reached.append(float(positions[start]))
         passes.append(JunctionPass(node, direction, turn, *reached))
     return Route(points, yaws, limits, tuple(passes))
-
-
-def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:
-    """(P,) m/s: the limits of the curves, lowered before them so that BRAKING is enough."""
-    curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
-    squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
-    falling = squared + 2 * BRAKING * positions
-    return np.sqrt(np.minimum.accumulate(falling[::-1])[::-1] - 2 * BRAKING * positions)

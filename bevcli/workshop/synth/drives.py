@@ -100,7 +100,9 @@ class RenderedDrives(FolderDrives):
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
             self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
-            self.input_shapes = tuple(_input_shape(drawn.rig, image) for drawn in self._rigs)
+            sizes = [image_for_rig(drawn.rig, image).padded_size for drawn in self._rigs]
+            counts = [len(drawn.rig.cameras) for drawn in self._rigs]
+            self.input_shapes = tuple((count, h, w) for count, (w, h) in zip(counts, sizes, strict=True))
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
@@ -157,11 +159,6 @@ def _enlarged(drawn: DrawnRig, image: ImageConfig) -> DrawnRig:
     factor = rig_enlargement(drawn.rig, image)
     cameras = tuple(camera.scaled(factor) for camera in drawn.rig.cameras)
     return replace(drawn, rig=replace(drawn.rig, cameras=cameras))
-
-
-def _input_shape(rig: CameraRig, image: ImageConfig) -> InputShape:
-    width, height = image_for_rig(rig, image).padded_size
-    return len(rig.cameras), height, width
 
 
 def _digest(rig: CameraRig) -> str:

@@ -24,6 +24,10 @@ def person(name: str, stride: int) -> list[mesh.Mesh]:
     skin, hair, legs = SKIN[k % 4], HAIR[(k + 1) % 4], TROUSERS[k % 4]
     swing = 0.26 * stride
     x, z = 0.02, 1.62  # of the middle of the head, metres
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False) + np.pi / 8
+    ring = np.stack([0.13 * np.cos(angle), 0.2 * np.sin(angle)], -1)
+    levels = ((0.86, 0.86), ((0.86 + 1.46) / 2, 0.9), (1.46 - 0.08, 1.12), (1.46, 0.75))  # height, metres; width
+    torso = [np.column_stack([ring * scale, np.full(8, height)]) for height, scale in levels]
     things: dict[str, list[mesh.Row]] = {
         "woman": [(mesh.cone, 0.55, 1.0, 0.27, 0.17, SHIRT), (mesh.ball, (-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair)],
         "worker": [
@@ -36,7 +40,7 @@ def person(name: str, stride: int) -> list[mesh.Mesh]:
     return [
         *_leg(0.1, swing, legs),
         *_leg(-0.1, -swing, legs),
-        _torso((240, 120, 30) if name == "worker" else SHIRT),
+        mesh.loft(torso, (240, 120, 30) if name == "worker" else SHIRT),
         *_arm(0.25, -swing * 0.9, skin),
         *_arm(-0.25, swing * 0.9, skin),
         mesh.rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin),
@@ -63,14 +67,6 @@ def _arm(y: float, swing: float, skin: mesh.Color) -> list[mesh.Mesh]:
         mesh.rod(elbow, hand, 0.048, SHIRT),
         mesh.ball(hand, (0.05, 0.05, 0.06), skin, subdivisions=0),
     ]
-
-
-def _torso(surface: mesh.Surface) -> mesh.Mesh:
-    low, high = 0.86, 1.46  # metres
-    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False) + np.pi / 8
-    ring = np.stack([0.13 * np.cos(angle), 0.2 * np.sin(angle)], -1)
-    levels = ((low, 0.86), ((low + high) / 2, 0.9), (high - 0.08, 1.12), (high, 0.75))
-    return mesh.loft([np.column_stack([ring * scale, np.full(8, z)]) for z, scale in levels], surface)
 
 
 def rider(seat: Place, bars: Place, pedal: Place, helmet: mesh.Color) -> list[mesh.Mesh]:
@@ -236,19 +232,8 @@ def car(name: str) -> list[mesh.Mesh]:
         for side in (-1, 1):
             start, end = (s.at(low), side * half * 0.915, s.belt), (s.at(high), side * roof_half, s.height - 0.02)
             parts.append(mesh.rod(start, end, 0.045, mesh.PAINT, sections=4))
-    parts += _details(s, half)
-    if name == "taxi":
-        parts.append(
-            mesh.block(
-                (s.at(0.42), 0, s.height + 0.09), (0.22, 0.6, 0.16), mesh.Finish((255, 214, 90), mesh.Material.GLOW)
-            )
-        )
-    return parts
-
-
-def _details(s: CarShape, half: float) -> list[mesh.Mesh]:
     lamp_z, tail_z, lamp = s.nose - 0.1, s.tail - 0.12, mesh.Finish((255, 250, 230), mesh.Material.GLOW)
-    parts = [
+    parts += [
         mesh.block((s.at(0.995), 0, s.clearance + 0.2), (0.06, half * 1.5, 0.16), mesh.TRIM),
         mesh.block((s.at(0.99), 0, lamp_z - 0.06), (0.08, half * 0.9, 0.12), mesh.TRIM),
         mesh.block((s.at(0.005), 0, s.clearance + 0.2), (0.06, half * 1.6, 0.16), mesh.TRIM),
@@ -264,6 +249,9 @@ def _details(s: CarShape, half: float) -> list[mesh.Mesh]:
             z, y = s.wheel_radius + 0.02, side * half
             parts.append(mesh.rod((x, y * 0.8, z), (x, y * 0.972, z), s.wheel_radius + 0.05, (12, 12, 13), sections=12))
             parts.append(mesh.wheel(x, side * (half - 0.12), s.wheel_radius, 0.22))
+    if name == "taxi":
+        sign = mesh.Finish((255, 214, 90), mesh.Material.GLOW)
+        parts.append(mesh.block((s.at(0.42), 0, s.height + 0.09), (0.22, 0.6, 0.16), sign))
     return parts
 
 
@@ -440,7 +428,7 @@ def bus(name: str) -> list[mesh.Mesh]:
     length, height, floor = BUSES[name]
     half, front = 1.28, length / 2
     slope = 0.5 if name == "coach" else 0.12
-    nose = front - 1.5 if name == "school" else front
+    nose, start = (front - 1.5 if name == "school" else front), -front + 0.7  # of the windows
     body = [
         (-front, floor), (nose, floor), (nose, 1.3), (nose - slope, height - 0.1), (nose - slope - 0.15, height),
         (-front + 0.1, height),
@@ -448,7 +436,10 @@ def bus(name: str) -> list[mesh.Mesh]:
     parts = [mesh.side_profile(body, half, mesh.PAINT, top_half_width=half * 0.96)]
     for low, high in {"double": [(1.2, 1.95), (2.65, 3.5)], "coach": [(1.9, 3.0)]}.get(name, [(1.35, 2.35)]):
         z = (low + high) / 2
-        parts += _bus_windows(-front + 0.7, nose - 1.0, z, high - low, half)
+        count = max(int((nose - 1.0 - start) / 1.4), 2)
+        width = (nose - 1.0 - start) / count
+        size = (width - 0.14, half * 1.985, high - low)
+        parts += [mesh.block((start + (k + 0.5) * width, 0, z), size, mesh.GLASS) for k in range(count)]
         parts.append(
             mesh.block((nose - slope / 2, 0, z + 0.05), (0.06 + slope * 0.5, half * 1.8, high - low + 0.25), mesh.GLASS)
         )
@@ -470,9 +461,3 @@ def bus(name: str) -> list[mesh.Mesh]:
         mesh.twin_blocks((-front, half * 0.82, 1.0), (0.06, 0.22, 0.4), mesh.TAIL_LAMP),
         mesh.axles(positions, half + 0.02 - 0.16, 0.46, 0.3),
     ]
-
-
-def _bus_windows(start: float, end: float, z: float, height: float, half: float) -> list[mesh.Mesh]:
-    count = max(int((end - start) / 1.4), 2)
-    width, size = (end - start) / count, ((end - start) / count - 0.14, half * 1.985, height)
-    return [mesh.block((start + (k + 0.5) * width, 0, z), size, mesh.GLASS) for k in range(count)]

@@ -85,42 +85,32 @@ def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], colum
 def crossers(
     city: CityPlan, assets: Assets, signals: traffic.Signals, span_s: tuple[float, float], node: tuple[int, int]
 ) -> list[Walker]:
-    """People who cross a street at a junction (column, row), over the whole simulation."""
+    """People who walk to the kerb at a junction (column, row), wait for the signal, cross the road and walk on."""
     rng = city.stream("crossers", *node)
     walkers: list[Walker] = []
     begin = span_s[0] - 30
     while begin < span_s[1]:
-        name = f"crosser-{node[0]}-{node[1]}-{len(walkers)}"
-        walkers.append(_crosser(city, assets, signals, node, begin, rng, name, len(walkers)))
+        index = len(walkers)
+        arm = int(rng.integers(4))
+        street, cross = city.street_at(node, arm), city.street_at(node, arm + 1)
+        side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
+        sideways = DIRECTIONS[(arm + 1) % 4] * side
+        ahead = cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
+        spot, reach = city.node_center(node) + DIRECTIONS[arm] * ahead, street.half_width + ALONG_PAVEMENT_M
+        path = Line(along(spot - sideways * reach, spot + sideways * reach))
+        speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # crosses within 13 s
+        kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
+        arrival = begin + kerb / speed
+        start = arrival
+        while not signals.walk(node, arm % 2, start):
+            start += 0.25
+        start += rng.uniform(0, 1.0) if start > arrival else 0.0
+        end = start + (2 * reach - kerb) / speed
+        body = _person(assets, rng, f"crosser-{node[0]}-{node[1]}-{index}")
+        times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
+        walkers.append(Walker(city, body, path, times, walked_m, (ALONG_PAVEMENT_M, far)))
         begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
     return walkers
-
-
-def _crosser(
-    city: CityPlan, assets: Assets, signals: traffic.Signals, node: tuple[int, int], begin: float,
-    rng: np.random.Generator, name: str, index: int,
-) -> Walker:  # fmt: skip
-    """One person who walks to the kerb, waits for the signal, crosses the road and walks on; neighbours keep apart."""
-    arm = int(rng.integers(4))
-    street, cross = city.street_at(node, arm), city.street_at(node, arm + 1)
-    side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
-    sideways = DIRECTIONS[(arm + 1) % 4] * side
-    spot = city.node_center(node) + DIRECTIONS[arm] * (
-        cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
-    )
-    reach = street.half_width + ALONG_PAVEMENT_M
-    path = along(spot - sideways * reach, spot + sideways * reach)
-    speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # crosses within 13 s
-    kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
-    arrival = begin + kerb / speed
-    start = arrival
-    while not signals.walk(node, arm % 2, start):
-        start += 0.25
-    start += rng.uniform(0, 1.0) if start > arrival else 0.0
-    end = start + (2 * reach - kerb) / speed
-    body = _person(assets, rng, name)
-    times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
-    return Walker(city, body, Line(path), times, walked_m, (ALONG_PAVEMENT_M, far))
 
 
 def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:
@@ -280,7 +270,15 @@ class Roadside:
     def _site(self, column: int, row: int) -> list[StandingActor]:
         rng = self.city.stream("site", column, row)
         name, (low, high) = f"{column}.{row}", self.city.block(column, row).inside(0.4)
-        made = list(self._fence(low, high, rng, name))
+        made: list[StandingActor] = []
+        barrier = self.assets.draw("barrier", rng)
+        for side in range(4):
+            start, way, _, length = side_of(low, high, side)
+            for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):
+                if rng.random() >= 0.12:
+                    body = draw_body(barrier, rng, f"fence-{name}.{side}.{k}", 0.02)
+                    yaw = self.city.heading(start + way * at, way) + np.pi / 2
+                    made.append(self._stand_on_land(body, start + way * at, yaw))
         machines = [("construction_vehicle", None)] * int(rng.integers(4, 7))
         trucks = [("truck", ("dumper", "flatbed"))] * 2
         trailers = [("trailer", ("flatbed", "container", "utility"))]
@@ -301,16 +299,6 @@ class Roadside:
                 body = self._body("traffic_cone", rng, f"sitecone-{name}.{k}", 0.03)
                 made.append(self._stand_on_land(body, point, 0.0))
         return made
-
-    def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> Iterator[StandingActor]:
-        barrier = self.assets.draw("barrier", rng)
-        for side in range(4):
-            start, way, _, length = side_of(low, high, side)
-            for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):
-                if rng.random() >= 0.12:
-                    body = draw_body(barrier, rng, f"fence-{name}.{side}.{k}", 0.02)
-                    yaw = self.city.heading(start + way * at, way) + np.pi / 2
-                    yield self._stand_on_land(body, start + way * at, yaw)
 
 
 Actor = traffic.DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive

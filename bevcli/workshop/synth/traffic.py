@@ -123,7 +123,10 @@ def _acceleration(
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
-        lead = vehicles[other].speed if other >= 0 and _same_way(vehicle, vehicles[other]) else 0.0
+        lead = 0.0
+        if other >= 0:  # the speed counts if the other vehicle drives in about the same direction, within 60 degrees
+            yaw = vehicles[other].route.yaw_at(vehicles[other].front)
+            lead = vehicles[other].speed if np.cos(route.yaw_at(vehicle.front) - yaw) > 0.5 else 0.0
         wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
@@ -138,11 +141,6 @@ def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed
     """Acceleration (IDM) behind a vehicle at `lead_speed`, `gap` metres ahead: keep a distance of 2 m plus 1.2 s."""
     desired = 2.0 + max(0.0, speed * 1.2 + speed * (speed - lead_speed) / (2 * np.sqrt(strongest * COMFORT)))
     return strongest * (1 - (speed / max(limit, 0.3)) ** 4 - (desired / max(gap, 0.1)) ** 2)
-
-
-def _same_way(vehicle: Vehicle, other: Vehicle) -> bool:
-    """True where the other vehicle drives in about the same direction (within 60 degrees)."""
-    return bool(np.cos(vehicle.route.yaw_at(vehicle.front) - other.route.yaw_at(other.front)) > 0.5)
 
 
 def _may_enter(
