@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.adjustment import (
     DELAYS_S,
     HEIGHT,
@@ -19,7 +20,6 @@ from bevcli.workshop.calibration.adjustment import (
     spread,
     values,
 )
-from bevcli.workshop.calibration.options import CalibrateOptions
 from bevcli.workshop.calibration.road import beside_way, level_corrections, sees_road
 from bevcli.workshop.calibration.views import View, Views, unknowns_of
 

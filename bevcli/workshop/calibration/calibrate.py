@@ -22,8 +22,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.workshop.calibration import adjustment
-from bevcli.workshop.calibration.options import CalibrateOptions
+from bevcli.workshop.calibration import CalibrateOptions, adjustment
 from bevcli.workshop.calibration.road import level_corrections, road_residuals, search_heights, sees_road
 from bevcli.workshop.calibration.views import (
     FEWEST_PAIRS,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.calibration.options import (
+from bevcli.workshop.calibration import (
     CalibrateFirstOptions,
     CalibrateOptions,
     CalibrateOutputOptions,

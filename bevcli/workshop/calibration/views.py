@@ -19,8 +19,8 @@ from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.adjustment import DELAYS_S, OF_PAIR, EpipolarResiduals, Unknowns
-from bevcli.workshop.calibration.options import CalibrateOptions
 
 WIDTH, MOST_ENLARGED = 1000, 2  # pixels: all images are brought to this width; largest factor
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair

@@ -22,13 +22,13 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotat
 from bevcli.options import gather
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.workshop.formats.native_writer import NativeWriter
-from bevcli.workshop.synth import renderer
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
+from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Simulation
@@ -49,7 +49,7 @@ class RenderedFrame:
     """One frame of a rendered drive with its ground truth."""
 
     stamp: FrameStamp
-    views: Mapping[str, renderer.RenderedView]  # by camera
+    views: Mapping[str, RenderedView]  # by camera
     world_from_ego: Pose
     world_from_ego_at: Mapping[str, Pose]  # by camera, at the time of its image
     camera_timestamps_ns: Mapping[str, int]  # by camera
@@ -151,7 +151,7 @@ class RenderedDrive:
         states = [state for _, state in actors]
         pose = self.world_from_ego(time_s)
         delays = {name: self._delays_s.get(name, 0.0) for name in self.rig.names}
-        views: dict[str, renderer.RenderedView] = {}
+        views: dict[str, RenderedView] = {}
         for delay in sorted(set(delays.values())):
             later = [actor.state(time_s + delay) for actor, _ in actors] if delay else states
             # An object that has gone in the meantime is drawn where it was.
@@ -170,7 +170,7 @@ class RenderedDrive:
 
     def _render_views(
         self, names: list[str], states: list[ActorState], world_from_ego: Pose, time_s: float, here: Array
-    ) -> dict[str, renderer.RenderedView]:
+    ) -> dict[str, RenderedView]:
         """The images of cameras that see the world at the same time. The object indices are positions in `states`.
 
         here: (2,) world, metres, the point around which the scenery is made.
@@ -183,29 +183,30 @@ class RenderedDrive:
         signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
-        pattern = renderer.NO_PATTERN if self._looks is None else self._looks.pattern()
         soup = TriangleSoup.gather([scenery, moving])
-        snapshot = renderer.WorldSnapshot(soup, len(actors), ground, shadows, self.weather, pattern)
+        snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather)
+        if self._looks is not None:
+            snapshot = replace(snapshot, pattern=self._looks.pattern())
 
-        def render_one(name: str) -> renderer.RenderedView:
+        def render_one(name: str) -> RenderedView:
             pose = world_from_ego.matrix
             if name in self._lenses:
-                return renderer.render_through_lens(snapshot, self._lenses[name], pose, self._supersampling)
-            return renderer.render_view(snapshot, self.rig[name], pose, self._supersampling)
+                return render_through_lens(snapshot, self._lenses[name], pose, self._supersampling)
+            return render_view(snapshot, self.rig[name], pose, self._supersampling)
 
         if self._threads == 1:
             return {name: render_one(name) for name in names}
         with ThreadPoolExecutor(self._threads) as pool:
             return dict(zip(names, pool.map(render_one, names), strict=True))
 
-    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, renderer.ShadowMap]:
+    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         scenery = self._scenery.around(center, SCENERY_M)
         if self._looks is not None:
             texture = replace(texture, texels=self._looks.ground(texture.texels))
             scenery = self._looks.scenery(scenery)
-        shadows = renderer.ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
+        shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
         return scenery, texture, shadows
 
     def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
@@ -222,7 +223,7 @@ class RenderedDrive:
         x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
         return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
 
-    def _boxes(self, states: list[ActorState], views: Mapping[str, renderer.RenderedView], pose: Pose) -> Boxes3D:
+    def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
         """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""
         if not states:
             return Boxes3D.empty()

@@ -290,9 +290,6 @@ class ShadowMap:
         return replace(self, heights=heights)
 
 
-NO_PATTERN = (0.0, 1.0, 0.0)
-
-
 @dataclass(frozen=True)
 class WorldSnapshot:
     """The world at one time, as the renderer needs it."""
@@ -302,7 +299,7 @@ class WorldSnapshot:
     ground: GroundTexture
     shadows: ShadowMap
     weather: Weather  # light, sky and haze
-    pattern: tuple[float, float, float] = NO_PATTERN  # strength, waves per metre, hardness; not on the ground
+    pattern: tuple[float, float, float] = (0.0, 1.0, 0.0)  # strength, waves per metre, hardness; not on the ground
 
 
 @dataclass(frozen=True)
