@@ -118,11 +118,6 @@ class RigEstimate:
     tilt_deviation_deg: tuple[float, float]
 
 
-def table(cameras: Items[CameraEstimate]) -> str:
-    """One row a camera."""
-    return aligned([HEADER, *map(_row, cameras)], left=(0, 9))
-
-
 def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
     """Lines about the whole rig, and about the capture times of its cameras."""
     pitch, roll = (f"{a:+.2f}° ± {d:.2f}°" for a, d in zip(whole.tilt_deg, whole.tilt_deviation_deg, strict=True))
@@ -308,7 +303,8 @@ class CalibrationResult:
     def text(self) -> str:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
-        return "\n".join([table(self.cameras), "", pairs, rig_text(self.whole, self.cameras)])
+        table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
+        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras)])
 
     def to_json(self) -> str:
         """The content of report.json."""
