@@ -33,7 +33,7 @@ ALLOWED = {
     ("workshop/synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("workshop/training/loading.py", "clip.result"): "in a thread whose own result has a limit",
     ("workshop/robustness/conditions.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("workshop/calibration/measure.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/calibration/views.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("workshop/calibration/road.py", "ThreadPoolExecutor"): "the tasks only compute",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.

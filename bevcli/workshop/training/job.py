@@ -22,7 +22,7 @@ from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
-from bevcli.workshop.synth.drives import Drives, check_training_seeds, split_of, training_drives, write_split
+from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.workshop.training.augmentation import AugmentationConfig
@@ -248,7 +248,6 @@ def prepare_training(
     check_folder(out, resume=options.resume)
     if options.log is not None:
         require_tensorboard()
-    check_training_seeds(data.rendered or ())
     if data.split is not None and options.held_out is not None:
         raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
     rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
@@ -272,9 +271,8 @@ def prepare_training(
     if group.leads and not (options.resume and not out.exists()):
         lock.enter_context(folder_lock(out))
         check_folder(out, resume=options.resume)  # again: another training may have been faster
-    split = split_of(data, config.held_out)
-    if group.leads and split is not None and split.validate:
-        write_split(out / "split.toml", split)
+    if group.leads and own is not None and data.rendered is None:
+        write_split(out / "split.toml", Split(drives.folders, own.folders))
     rest = options.seed, group, notes, options.log, tuple(started), lock
     return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
