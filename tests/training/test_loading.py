@@ -16,8 +16,7 @@ from torch import Tensor
 from bevcli.inference.preprocess import write_network_image
 from bevcli.model.config import ImageConfig
 from bevcli.workshop.training.augmentation import AugmentationConfig, noisy
-from bevcli.workshop.training.loading import BatchMaker, loaded_batches
-from bevcli.workshop.training.samples import ClipConfig, images_from_bytes, write_bytes
+from bevcli.workshop.training.samples import BatchMaker, ClipConfig, images_from_bytes, loaded_batches, write_bytes
 
 NOTHING, NOISE = AugmentationConfig(0, 0), AugmentationConfig(0.5, 0.5, exposure=1.0, noise=6.0, calibration_share=0.5)
 LITE = ImageConfig((64, 48), mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), color_order="rgb")

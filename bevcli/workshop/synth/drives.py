@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -325,3 +325,36 @@ def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
     if not folders:
         raise InputError(f"{path}: {key}: leaves no drive (expected at least one folder)")
     return tuple(folders)
+
+
+@dataclass
+class ImageMemory:
+    """The memory, in bytes, that is left for decoded images of several sequences."""
+
+    left_bytes: int
+
+
+class KeptFrames(DerivedSequence):
+    """Keeps decoded frames, without the bytes of files, while the memory lasts; frames beyond it are read each time.
+
+    Its frames are shared: do not change their images in place.
+    """
+
+    def __init__(self, sequence: Sequence, memory: ImageMemory) -> None:
+        super().__init__(sequence)
+        self._memory, self._frames = memory, dict[int, Frame]()
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self.sequence.ground_truth_frame(place)
+
+    def load(self, place: int) -> Frame:
+        if place in self._frames:
+            return self._frames[place]
+        frame = self.sequence.load(place)
+        images = {name: replace(image, encoded=None, media_type=None) for name, image in frame.images.items()}
+        frame = replace(frame, images=images)
+        size = sum(image.pixels_bgr.nbytes for image in images.values())
+        if size <= self._memory.left_bytes:
+            self._memory.left_bytes -= size
+            self._frames[place] = frame
+        return frame

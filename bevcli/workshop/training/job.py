@@ -26,11 +26,10 @@ from bevcli.workshop.synth.drives import Drives, check_training_seeds, split_of,
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.files import require_tensorboard
 from bevcli.workshop.training.frame_losses import LossConfigs
 from bevcli.workshop.training.options import Log, TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.validation import check_training_drives
+from bevcli.workshop.training.validation import check_training_drives, require_tensorboard
 from bevcli.workshop.training.warm_start import WarmStart, start_backbone, warm_start
 from bevcli.writing import write_whole
 

@@ -34,7 +34,7 @@ from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
 from bevcli.workshop.training.options import Preset, TrainOptions
-from bevcli.workshop.training.samples import ground_truth_boxes
+from bevcli.workshop.training.targets import ground_truth_boxes
 from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.training.validation import longest_scene
 from bevcli.writing import write_whole

@@ -1,18 +1,25 @@
-"""Checks of drives before they are trained on or scored, and scores of a model over several drives.
+"""Checks of drives before they are trained on or scored, scores of a model over several drives, and learning curves.
 
 Each drive is run as by `bevcli run`, and all are scored as by `bevcli eval`.
 """
 
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.util
+import io
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevcli.errors import InputError
+from bevcli.errors import BevcliError, InputError
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite
@@ -24,13 +31,19 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
+from bevcli.parsing.files import MIB, read_text
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.samples import ClipConfig, own_heads
+from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.targets import own_heads
+from bevcli.writing import output_errors, whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def check_training_drives(
@@ -269,3 +282,116 @@ def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
     found, true = zip(*frames, strict=True) if frames else ((), ())
     poses = [frame.world_from_ego.matrix for frame in true]
     return FramePairs("world", found, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())
+
+
+LARGEST_CSV_BYTES = 256 * MIB
+Row = Mapping[str, float]
+
+
+class LearningCurve:
+    """A CSV file with a column `step` and one row a step, and TensorBoard's curves of the same numbers.
+
+    Attributes:
+        path: the file.
+        rows: its rows.
+    """
+
+    def __init__(self, path: Path, done: int = 0, group: str = "", events: Any = None) -> None:
+        """Opens the file of a resumed training, or starts a new one.
+
+        done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
+        group: of the curves in TensorBoard, before their names. events: of `event_writer`; None for no such curves.
+        Raises OutputError, and InputError for a damaged file.
+        """
+        self.path, self._group, self._events = path, group, events
+        self.rows: list[Row] = [row for row in _read_rows(path) if row["step"] <= done] if done else []
+        with whole_file(path) as unfinished:
+            _write_rows(unfinished, self.rows, "w")
+
+    def add(self, step: int, numbers: Row) -> None:
+        """Appends a row and writes it to the files at once, finite numbers only for TensorBoard."""
+        row = {"step": step, **numbers}
+        _write_rows(self.path, [row], "a", header=not self.rows)
+        self.rows.append(row)
+        if self._events is not None:
+            for name, value in numbers.items():
+                if math.isfinite(value):
+                    self._events.add_scalar(f"{self._group}/{name}", value, step)
+            self._events.flush()
+
+
+def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
+    """Writes a PNG: smoothed losses on the left, scores on the right."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
+    _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
+    left.set(title="Training loss", xlabel="step", yscale="log")
+    right.set(title="Validation", xlabel="step", ylim=(0, 1))
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)
+
+
+def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
+    for name in rows[0] if rows else ():
+        values = [row[name] for row in rows]
+        if name not in skipped and not all(map(math.isnan, values)):
+            axes.plot([row["step"] for row in rows], values, label=name, marker=marker)
+    if rows:
+        axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def _scores(row: Row) -> Row:
+    return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
+
+
+def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
+    """Means over blocks of equal length, at least `points` blocks if there are so many rows."""
+    size = max(1, len(rows) // points)
+    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
+    return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
+
+
+def _read_rows(path: Path) -> list[Row]:
+    """The rows of a file, without damaged ones. Raises InputError."""
+    if not path.is_file():
+        return []
+    text = read_text(path, LARGEST_CSV_BYTES)
+    rows: list[Row] = []
+    try:
+        for row in csv.DictReader(io.StringIO(text)):
+            with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
+                rows.append({name: float(value) for name, value in row.items()})
+    except csv.Error as error:
+        raise InputError(f"{path}: {error}: move it away, or start a new training") from None
+    if rows and "step" not in rows[0]:
+        raise InputError(f"{path}: has no column step: move it away, or start a new training")
+    return rows
+
+
+def _write_rows(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
+    with output_errors(path), path.open(mode, newline="") as file:
+        if rows:
+            writer = csv.DictWriter(file, list(rows[0]))
+            if header:
+                writer.writeheader()
+            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
+
+
+def require_tensorboard() -> None:
+    """Raise BevcliError where the package tensorboard is not installed."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
+
+
+def event_writer(folder: Path, done: int) -> Any:
+    """A writer of event files: `tensorboard --logdir FOLDER` draws them, also while the training runs.
+
+    done: steps done. TensorBoard hides later ones, of an interrupted training.
+    """
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=done + 1 if done else None)
