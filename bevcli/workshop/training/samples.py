@@ -15,12 +15,13 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence as Items
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence as Items
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import zip_longest
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -38,11 +39,19 @@ from bevcli.inference.background import read_ahead
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
-from bevcli.model.upload import pinned
+from bevcli.model.upload import pinned, upload
 from bevcli.printing import counted
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
-from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
+from bevcli.workshop.training.augmentation import (
+    UNDISTORTED,
+    AugmentationConfig,
+    ColorChange,
+    augmented,
+    distorted,
+    distorted_images,
+    mask_images,
+)
 from bevcli.workshop.training.targets import Targets, frame_targets, joined_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
@@ -166,31 +175,38 @@ class Batch:
         world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
         plain: the same clips before augmentation, for a teacher; None without one.
+        distortions: (B, N, 4) float32 of each input: photometric ones of images in bytes; () where they are distorted.
     """
 
     inputs: tuple[ModelInputs, ...]
     world_from_bev: Tensor
     targets: tuple[Targets, ...]
     plain: Batch | None = None
+    distortions: tuple[Tensor, ...] = ()
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
         inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
-        return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
+        targets = tuple(targets.to(device) for targets in self.targets)
+        return Batch(inputs, self.world_from_bev, targets, plain, tuple(upload(x, device) for x in self.distortions))
 
     def pinned(self) -> Batch:
         """A copy whose images and targets are in memory that a GPU reads by itself."""
-        return replace(self._with_images(pinned), targets=tuple(targets.pinned() for targets in self.targets))
+        inputs = tuple(replace(one, images=pinned(one.images)) for one in self.inputs)
+        plain = None if self.plain is None else self.plain.pinned()
+        return replace(self, inputs=inputs, targets=tuple(targets.pinned() for targets in self.targets), plain=plain)
 
     def normalised(self, image: ImageConfig) -> Batch:
-        """The batch with its images normalised, where they are in bytes."""
-        in_bytes = self.inputs[0].images.dtype == torch.uint8
-        return self._with_images(lambda images: images_from_bytes(images, image)) if in_bytes else self
-
-    def _with_images(self, changed: Callable[[Tensor], Tensor]) -> Batch:
-        inputs = tuple(replace(one, images=changed(one.images)) for one in self.inputs)
-        return replace(self, inputs=inputs, plain=None if self.plain is None else self.plain._with_images(changed))
+        """The batch with its images distorted and normalised, where they are in bytes."""
+        if self.inputs[0].images.dtype != torch.uint8:
+            return self
+        inputs = tuple(
+            replace(one, images=images_from_bytes(one.images, image, distortions))
+            for one, distortions in zip_longest(self.inputs, self.distortions)
+        )
+        plain = None if self.plain is None else self.plain.normalised(image)
+        return replace(self, inputs=inputs, plain=plain, distortions=())
 
 
 def load_batch(
@@ -217,8 +233,8 @@ def load_batch(
     def load_clip(clip: Clip) -> Batch:
         drive = drives.open(clip.drive)
         loaded = [drive.load(index) for index in clip.frames]
-        shown = augmented(loaded, augmentation, random)
-        prepared = _prepared(shown, config, in_bytes)
+        shown, drawn = augmented(loaded, augmentation, random)
+        prepared = _prepared(shown if in_bytes else [*map(distorted, shown, drawn)], config, in_bytes)
         inputs = _inputs(prepared, config)
         for step in inputs:
             mask_images(step.images, augmentation.grid_mask, random)
@@ -227,7 +243,8 @@ def load_batch(
         learned = list(zip(prepared, clip.frames, strict=True))[0 if learn_all else -1 :]
         targets = tuple(frame_targets(one.frame, drive, index, config) for one, index in learned)
         before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
-        return Batch(inputs, world_from_bev, targets, before)
+        distortions = tuple(map(_distortions, prepared, drawn)) if in_bytes and augmentation.photometric else ()
+        return Batch(inputs, world_from_bev, targets, before, distortions)
 
     return joined([load_clip(clip) for clip in clips])
 
@@ -240,12 +257,18 @@ def joined(batches: Items[Batch]) -> Batch:
     targets = tuple(joined_targets(steps) for steps in zip(*(batch.targets for batch in batches), strict=True))
     plain = [batch.plain for batch in batches if batch.plain is not None]
     world_from_bev = torch.cat([batch.world_from_bev for batch in batches], dim=1)
-    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None)
+    distortions = tuple(map(torch.cat, zip(*(batch.distortions for batch in batches), strict=True)))
+    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None, distortions)
 
 
 def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
     written: dict[str, Any] = {"write": write_bytes, "dtype": np.uint8} if in_bytes else {}
     return [*map(Preprocessor(config, threads=1, **written), clip)]
+
+
+def _distortions(prepared: PreparedFrame, drawn: Mapping[str, ColorChange]) -> Tensor:
+    """(1, N, 4) those of the images of a frame."""
+    return torch.tensor([[drawn.get(name, UNDISTORTED) for name in prepared.assignment.cameras]])
 
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
@@ -280,14 +303,20 @@ def write_bytes(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[
     np.subtract(pixels.reshape(rows, -1), np.tile(_grey(image), columns), out=lines)
 
 
-def images_from_bytes(images: Tensor, image: ImageConfig) -> Tensor:
-    """The normalised images of `write_bytes` (B, N, 3, H, W), on the same device, channels last."""
+def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | None = None) -> Tensor:
+    """The normalised images of `write_bytes` (B, N, 3, H, W), on the same device, channels last.
+
+    distortions: (B, N, 4), photometric. What is 0 in all channels (padding, missing images, masks) stays 0.
+    """
     flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
     grey, mean, std = (
         torch.tensor(of_channels, dtype=torch.float32).view(3, 1, 1).to(flat.device, non_blocking=True)
         for of_channels in (_grey(image).tolist(), image.mean, image.std)
     )
     pixels = (flat + grey.to(torch.uint8)).float()
+    if distortions is not None:
+        changed = distorted_images(pixels, distortions.flatten(0, 1), image.color_order)
+        pixels = changed.where(flat.ne(0).any(dim=1, keepdim=True), pixels)
     return pixels.sub_(mean).div_(std).unflatten(0, images.shape[:2])
 
 
