@@ -27,7 +27,7 @@ from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
-from bevcli.workshop.synth.drives import ImageMemory, KeptFrames
+from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
 from bevcli.writing import write_whole
 
 RESULTS, FORMAT = "stress.json", "bevcli-stress/1"
@@ -186,8 +186,8 @@ def stress(
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     model = model.in_engine(drives[0].rig, drives[0])
-    parts, memory = [part for drive in drives for part in split_scenes(drive)], ImageMemory(KEPT_BYTES)
-    scenes = [KeptFrames(part, memory) for part in parts]
+    memory, parts = FrameMemory(KEPT_BYTES), [part for drive in drives for part in split_scenes(drive)]
+    scenes = [KeptFrames(part, memory, index) for index, part in enumerate(parts)]
     against = None if options.against is None else read_results(options.against)
     facts = _facts(model, drives, replace(options, against=None))
     with RunFolder(out, force=force, resume=resume) as folder:

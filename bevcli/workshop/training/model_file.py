@@ -367,7 +367,8 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
         if times[-1] - times[0] >= longest_s:
             raise _EnoughMeasured
 
-    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
+    # Images are not kept: they would count as memory of the training, and be read sooner than in a longer one.
+    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6, kept_share=0.0)
     config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
     machine = f"{job.device.type}, {torch.get_num_threads()} threads"
     if job.device.type == "cuda":

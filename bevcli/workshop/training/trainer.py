@@ -25,6 +25,7 @@ from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
 from bevcli.parsing.pth import read_pth
+from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
 from bevcli.workshop.training.augmentation import randomised
 from bevcli.workshop.training.clip_steps import FrozenStages, Lesson, Teacher, forward_clip
 from bevcli.workshop.training.frame_losses import FrameLosses
@@ -126,7 +127,8 @@ class Trainer:
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self.maker = BatchMaker(
-            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            KeptDrives(job.drives, FrameMemory(job.kept_bytes)),
+            job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
             with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
             in_bytes=job.device.type == "cuda",
         )  # fmt: skip
