@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from painted_drives import CONFIG, PaintedDrive, PaintedDrives
+from simulated_device import simulated
 from torch import Tensor
 
 from bevcli.inference.preprocess import write_network_image
@@ -126,6 +127,17 @@ def test_images_in_bytes_are_distorted_where_they_are_normalised() -> None:
         assert errors.quantile(0.99) <= 1.01
         assert ((own.images == 0) == (other.images == 0)).float().mean() > 0.99
         assert ((own.images - before.images).abs() * std).mean() > 5
+
+
+def test_a_gpu_distorts_and_normalises_without_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = maker(AugmentationConfig(1.0, 0.5), in_bytes=True)(0, 0)
+    expected = batch.normalised(CONFIG.image)
+    with simulated("cuda:0", monkeypatch, lambda *_, **__: None) as device:
+        found = batch.to(device.device).normalised(CONFIG.image)
+        assert device.waits == []
+        for own, other in zip(expected.inputs, found.inputs, strict=True):
+            torch.testing.assert_close(other.images.held, own.images)
+            assert own.image_from_bev is other.image_from_bev
 
 
 @pytest.mark.parametrize(

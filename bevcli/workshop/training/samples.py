@@ -309,10 +309,8 @@ def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | 
     distortions: (B, N, 4), photometric. What is 0 in all channels (padding, missing images, masks) stays 0.
     """
     flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
-    grey, mean, std = (
-        torch.tensor(of_channels, dtype=torch.float32).view(3, 1, 1).to(flat.device, non_blocking=True)
-        for of_channels in (_grey(image).tolist(), image.mean, image.std)
-    )
+    of_channels = torch.tensor([_grey(image).tolist(), image.mean, image.std], dtype=torch.float32)
+    grey, mean, std = upload(of_channels, flat.device)[..., None, None].unbind(0)  # (3, 1, 1) each
     pixels = (flat + grey.to(torch.uint8)).float()
     if distortions is not None:
         changed = distorted_images(pixels, distortions.flatten(0, 1), image.color_order)
