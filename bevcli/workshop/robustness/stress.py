@@ -343,7 +343,9 @@ def stress_table(results: StressResults, against: StressResults | None = None) -
         for corruption in tested
     }
     parts += [_block(results, severities, group, against) for severities, group in groups.items()]
-    published, unseen = (sum(each.group is group for each in tested) for group in (Group.ROBOBEV, Group.UNSEEN))
+    published, unseen = (
+        sum(corruption.group is group for corruption in tested) for group in (Group.ROBOBEV, Group.UNSEEN)
+    )
     if published:
         parts.append(_means(results, published, against))
     if unseen:

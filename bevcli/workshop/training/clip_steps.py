@@ -164,8 +164,8 @@ class FrozenStages:
             images = images.to(self._dtype).contiguous(memory_format=torch.channels_last)
             if self._device.type != "cpu":
                 return list(self._part(images))
-            each = [self._part(image) for image in images.split(1)]
-            return [torch.cat(maps) for maps in zip(*each, strict=True)]
+            maps_of_images = [self._part(image) for image in images.split(1)]
+            return [torch.cat(maps) for maps in zip(*maps_of_images, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -212,9 +212,9 @@ def _outlines(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]
     """
     corners, matrix = _corners(codes), image_from_bev[:, None, None]
     projected = (matrix[..., :3, :3] * corners[..., None, :]).sum(-1) + matrix[..., :3, 3]  # (P, G, 8, 3)
-    one, other = projected.index_select(2, _edges(codes.device)).chunk(2, dim=2)  # (P, G, 12, 3) each
-    ends = torch.cat([_cut(one, other), _cut(other, one)], 2)  # (P, G, 24, 3)
-    in_front = (torch.maximum(one[..., 2], other[..., 2]) > OUTLINE_DEPTH_M).repeat(1, 1, 2)[..., None]
+    first, last = projected.index_select(2, _edges(codes.device)).chunk(2, dim=2)  # (P, G, 12, 3) each
+    ends = torch.cat([_cut(first, last), _cut(last, first)], 2)  # (P, G, 24, 3)
+    in_front = (torch.maximum(first[..., 2], last[..., 2]) > OUTLINE_DEPTH_M).repeat(1, 1, 2)[..., None]
     pixels = ends[..., :2] / ends[..., 2:].clamp(min=OUTLINE_DEPTH_M)
     start = pixels.where(in_front, torch.inf).amin(2)
     end = pixels.where(in_front, -torch.inf).amax(2)

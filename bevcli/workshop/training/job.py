@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import torch.distributed
 from torch import Tensor, nn
 
 from bevcli.config import TRAINING, load_config, load_table, settings_of_table
@@ -352,15 +351,15 @@ def with_changes(config: TrainingConfig, changes: Mapping[str, str]) -> Training
     Raises ConfigError for an unknown key, which names the nearest, or a wrong value.
     """
     table: dict[str, Any] = asdict(config)
-    known = list(_keys(config))
+    keys = list(_keys(config))
     for key, text in changes.items():
         key = key.removeprefix(f"{TRAINING}.")
-        if key not in known:
-            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, known)}')
+        if key not in keys:
+            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, keys)}')
         *tables, name = key.split(".")
         inner = table
-        for each in tables:
-            inner = inner[each]
+        for name_of_table in tables:
+            inner = inner[name_of_table]
         inner[name] = _value(text)
     return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes`")
 
@@ -381,8 +380,10 @@ def _value(text: str) -> Any:
         return text
 
 
-def _nearest(key: str, known: list[str]) -> str:
+def _nearest(key: str, keys: list[str]) -> str:
     """The key with the most similar name or, without its table, with the most similar last part."""
-    last = {name.rpartition(".")[2]: name for name in reversed(known)}
-    found = difflib.get_close_matches(key, known, 1) or [last[name] for name in difflib.get_close_matches(key, last, 1)]
-    return f'did you mean "{found[0]}"?' if found else "the keys are in the table of docs/training.md"
+    last = {name.rpartition(".")[2]: name for name in reversed(keys)}
+    similar = difflib.get_close_matches(key, keys, 1) or [
+        last[name] for name in difflib.get_close_matches(key, last, 1)
+    ]
+    return f'did you mean "{similar[0]}"?' if similar else "the keys are in the table of docs/training.md"

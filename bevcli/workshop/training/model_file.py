@@ -106,7 +106,7 @@ def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
         stamps = [frame.stamp for frame in frames]
         gaps_s += [np.diff([stamps[i].timestamp_ns for i in scene]) / 1e9 for scene in scenes_of(stamps)]
         maps = [frame.ground_truth_map for frame in frames if frame.ground_truth_map is not None]
-        map_reaches += [min(abs(end) for end in (*each.x_range_m, *each.y_range_m)) for each in maps]
+        map_reaches += [min(abs(end) for end in (*bev_map.x_range_m, *bev_map.y_range_m)) for bev_map in maps]
     names = np.concatenate([boxes.classes for boxes in labelled])
     if not len(names):
         raise InputError(f"the {len(drives)} drives have no boxes (expected some to train on)")
@@ -156,9 +156,9 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     table = copy.deepcopy(read_model_file(model)[0])
     for path, changes in changes_by_table.items():
         _change(table, path, changes)
-    known = [each for each in NUSCENES_CLASSES if each in facts.class_counts]
-    own = [each for each in facts.class_counts if each not in NUSCENES_CLASSES]  # the most frequent first
-    table |= {"name": name, "classes": known + own, "cameras": list(facts.cameras)}
+    official = [label for label in NUSCENES_CLASSES if label in facts.class_counts]
+    own = [label for label in facts.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": official + own, "cameras": list(facts.cameras)}
     if own:
         table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))

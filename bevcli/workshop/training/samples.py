@@ -186,14 +186,14 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
-        inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
+        inputs = tuple(step.to(device, keep_geometry=True) for step in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
         targets = tuple(targets.to(device) for targets in self.targets)
         return Batch(inputs, self.world_from_bev, targets, plain, tuple(upload(x, device) for x in self.distortions))
 
     def pinned(self) -> Batch:
         """A copy whose images and targets are in memory that a GPU reads by itself."""
-        inputs = tuple(replace(one, images=pinned(one.images)) for one in self.inputs)
+        inputs = tuple(replace(step, images=pinned(step.images)) for step in self.inputs)
         plain = None if self.plain is None else self.plain.pinned()
         return replace(self, inputs=inputs, targets=tuple(targets.pinned() for targets in self.targets), plain=plain)
 
@@ -202,8 +202,8 @@ class Batch:
         if self.inputs[0].images.dtype != torch.uint8:
             return self
         inputs = tuple(
-            replace(one, images=images_from_bytes(one.images, image, distortions))
-            for one, distortions in zip_longest(self.inputs, self.distortions)
+            replace(step, images=images_from_bytes(step.images, image, distortions))
+            for step, distortions in zip_longest(self.inputs, self.distortions)
         )
         plain = None if self.plain is None else self.plain.normalised(image)
         return replace(self, inputs=inputs, plain=plain, distortions=())
@@ -238,10 +238,10 @@ def load_batch(
         inputs = _inputs(prepared, config)
         for step in inputs:
             mask_images(step.images, augmentation.grid_mask, random)
-        poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev] for one in prepared]
+        poses = [[x.frame.world_from_ego.matrix @ x.frame.rig.ego_from_bev] for x in prepared]
         world_from_bev = torch.from_numpy(np.array(poses))
         learned = list(zip(prepared, clip.frames, strict=True))[0 if learn_all else -1 :]
-        targets = tuple(frame_targets(one.frame, drive, index, config) for one, index in learned)
+        targets = tuple(frame_targets(x.frame, drive, index, config) for x, index in learned)
         before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
         distortions = tuple(map(_distortions, prepared, drawn)) if in_bytes and augmentation.photometric else ()
         return Batch(inputs, world_from_bev, targets, before, distortions)
@@ -272,8 +272,8 @@ def _distortions(prepared: PreparedFrame, drawn: Mapping[str, ColorChange]) -> T
 
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
-    poses = [None, *(one.frame.world_from_ego for one in frames[:-1])]
-    return tuple(model_inputs([one], [pose], config) for one, pose in zip(frames, poses, strict=True))
+    poses = [None, *(prepared.frame.world_from_ego for prepared in frames[:-1])]
+    return tuple(model_inputs([prepared], [pose], config) for prepared, pose in zip(frames, poses, strict=True))
 
 
 def _grey(image: ImageConfig) -> NDArray[np.uint8]:

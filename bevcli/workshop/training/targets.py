@@ -74,9 +74,9 @@ def padded(targets: AnyTargets) -> PaddedTargets:
     """The boxes of B frames as tensors."""
     if isinstance(targets, PaddedTargets):
         return targets
-    counts = tuple(len(one.labels) for one in targets)
-    labels, codes = (pad_rows([getattr(one, name) for one in targets]) for name in ("labels", "codes"))
-    exists = pad_rows([torch.ones_like(one.labels, dtype=torch.bool) for one in targets])
+    counts = tuple(len(boxes.labels) for boxes in targets)
+    labels, codes = (pad_rows([getattr(boxes, name) for boxes in targets]) for name in ("labels", "codes"))
+    exists = pad_rows([torch.ones_like(boxes.labels, dtype=torch.bool) for boxes in targets])
     return PaddedTargets(labels, codes, exists, counts)
 
 
@@ -173,11 +173,11 @@ def padded_masks(targets: AnyMasks) -> PaddedMasks:
         return targets
     nothing = targets[0].things.new_zeros(len(STUFF_CLASSES), targets[0].things.shape[-1])
     return PaddedMasks(
-        torch.stack([nothing if one.stuff is None else one.stuff for one in targets]),
-        torch.tensor([one.stuff is not None for one in targets]),
-        pad_rows([one.things for one in targets]),
-        pad_rows([one.locations for one in targets]),
-        tuple(len(one.things) for one in targets),
+        torch.stack([nothing if masks.stuff is None else masks.stuff for masks in targets]),
+        torch.tensor([masks.stuff is not None for masks in targets]),
+        pad_rows([masks.things for masks in targets]),
+        pad_rows([masks.locations for masks in targets]),
+        tuple(len(masks.things) for masks in targets),
     )
 
 
@@ -191,7 +191,7 @@ def segmentation_targets(
 
     boxes: the frame's ground truth boxes, bev frame.
     """
-    names = [name for name, one in classes.items() if one.vehicle]
+    names = [name for name, settings in classes.items() if settings.vehicle]
     vehicles = boxes[np.isin(boxes.classes, names) & has_points(boxes)]
     vehicles = vehicles[(grid.cell_of(vehicles.centers[:, :2]) >= 0).all(-1)]
     stuff = None if bev_map is None else torch.from_numpy(_stuff(bev_map, grid)).float()
@@ -228,10 +228,10 @@ def _check_map(bev_map: BevMap, grid: BevGrid) -> None:
             f"a ground truth map has the classes {', '.join(bev_map.classes)}, but the segmentation head learns "
             f"{', '.join(STUFF_CLASSES)}: write other maps, or train without the segmentation head"
         )
-    for axis, found, needed in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
-        if found[0] > needed[0] or found[1] < needed[1]:
+    for axis, covered, needed in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
+        if covered[0] > needed[0] or covered[1] < needed[1]:
             raise InputError(
-                f"a ground truth map covers {axis} {found[0]:g} to {found[1]:g} m, but the model's BEV grid "
+                f"a ground truth map covers {axis} {covered[0]:g} to {covered[1]:g} m, but the model's BEV grid "
                 f"{needed[0]:g} to {needed[1]:g} m: write larger maps, or train without the segmentation head"
             )
 
@@ -313,12 +313,12 @@ class Targets:
 
 
 def joined_targets(parts: Items[Targets]) -> Targets:
-    masks = [one.segmentation[frame] for one in parts if one.segmentation for frame in range(len(one.segmentation))]
+    masks = [part.segmentation[frame] for part in parts if part.segmentation for frame in range(len(part.segmentation))]
     return Targets(
-        padded([one.detection[frame] for one in parts for frame in range(len(one.detection))]),
-        padded([one.perspective[frame] for one in parts for frame in range(len(one.perspective))]),
+        padded([part.detection[frame] for part in parts for frame in range(len(part.detection))]),
+        padded([part.perspective[frame] for part in parts for frame in range(len(part.perspective))]),
         padded_masks(masks) if masks else None,
-        tuple(truth for one in parts for truth in one.truths),
+        tuple(truth for part in parts for truth in part.truths),
     )
 
 

@@ -222,7 +222,7 @@ class Trainer:
         job, config = self.job, self.job.config
         random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
         batch = replace(
-            batch, inputs=tuple(replace(one, images=randomised(one.images, *random)) for one in batch.inputs)
+            batch, inputs=tuple(replace(step, images=randomised(step.images, *random)) for step in batch.inputs)
         )
         outputs = forward_clip(
             job.model, batch, learn_all=config.clips.learn == "all", freeze_batch_norm=config.freeze_batch_norm

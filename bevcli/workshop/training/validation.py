@@ -3,8 +3,6 @@
 Each drive is run as by `bevcli run`, and all are scored as by `bevcli eval`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import importlib.util
@@ -15,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +39,6 @@ from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.targets import own_heads
 from bevcli.writing import output_errors, whole_file
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 def check_training_drives(
@@ -112,9 +107,9 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
 def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
     first, heads = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0, own_heads(config)
     for drive in map(drives.open, range(len(drives))):
-        places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
+        indices = [index for scene in scenes_of(drive.stamps) for index in scene[first:]]
         without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): []}
-        for frame in map(drive.ground_truth_frame, places):
+        for frame in map(drive.ground_truth_frame, indices):
             if frame.ground_truth is None:
                 without["boxes", BOXES_FILE].append(frame.stamp.index)
             lacking = None if heads is None else heads.missing(frame, config)
@@ -123,7 +118,7 @@ def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) 
         for (truth, file), missing in without.items():
             if missing:
                 raise InputError(
-                    f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
+                    f"{drive.name}: {len(missing)} of {len(indices)} frames to train on have no ground truth {truth}, "
                     f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
                 )
 
@@ -230,15 +225,15 @@ def validate(
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
-        places, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
-        for frame, prediction, _ in runner.run(sequence, places, preprocessor):
+        indices, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
+        for frame, prediction, _ in runner.run(sequence, indices, preprocessor):
             if frame.ground_truth is not None:
                 if tracked:
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
                     sides = (prediction.boxes_world, frame.ground_truth)
-                    found, true = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
-                    tracks.append((found, true))
+                    predicted_frame, true_frame = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
+                    tracks.append((predicted_frame, true_frame))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -261,8 +256,8 @@ def drives_table(drives: Items[DriveScores]) -> str:
     """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
     width = max(len("drive"), *(len(drive.name) for drive in drives))
     lines = [f"{'drive':{width}}  cameras    mAP    NDS"]
-    lines += [f"{one.name:{width}}  {one.cameras:7}  {one.mean_ap:.3f}  {one.nd_score:.3f}" for one in drives]
-    scored = [one.mean_ap for one in drives if not math.isnan(one.mean_ap)]
+    lines += [f"{drive.name:{width}}  {drive.cameras:7}  {drive.mean_ap:.3f}  {drive.nd_score:.3f}" for drive in drives]
+    scored = [drive.mean_ap for drive in drives if not math.isnan(drive.mean_ap)]
     if scored:
         lines.append(f"mAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}")
     return "\n".join(lines)
@@ -279,9 +274,9 @@ def boxes_ego(
 
 def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
     """Predicted and true boxes in the world frame, for the scores of tracks."""
-    found, true = zip(*frames, strict=True) if frames else ((), ())
+    predicted, true = zip(*frames, strict=True) if frames else ((), ())
     poses = [frame.world_from_ego.matrix for frame in true]
-    return FramePairs("world", found, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())
+    return FramePairs("world", predicted, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())
 
 
 LARGEST_CSV_BYTES = 256 * MIB
@@ -334,7 +329,7 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
         figure.savefig(unfinished, dpi=110)
 
 
-def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
+def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
     for name in rows[0] if rows else ():
         values = [row[name] for row in rows]
         if name not in skipped and not all(map(math.isnan, values)):
