@@ -25,7 +25,7 @@ from bevcli.model.box_coding import encode
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.temporal_model import model_class
-from bevcli.model.upload import pinned, upload
+from bevcli.model.upload import exchanged, pinned, tensors_in, upload
 from bevcli.registry import for_model
 
 
@@ -303,13 +303,8 @@ class Targets:
         return self._changed(pinned)
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
-
-        def changed(part: Any) -> Any:
-            tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
-            return replace(part, **{name: change(x) for name, x in tensors.items()})
-
-        masks = None if self.segmentation is None else changed(self.segmentation)
-        return Targets(changed(self.detection), changed(self.perspective), masks, self.truths)
+        parts = (self.detection, self.perspective, self.segmentation)
+        return Targets(*exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts))), self.truths)
 
 
 def joined_targets(parts: Items[Targets]) -> Targets:
