@@ -304,7 +304,8 @@ class Targets:
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
         parts = (self.detection, self.perspective, self.segmentation)
-        return Targets(*exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts))), self.truths)
+        boxes, all_boxes, masks = exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts)))
+        return Targets(boxes, all_boxes, masks, self.truths)
 
 
 def joined_targets(parts: Items[Targets]) -> Targets:
