@@ -17,10 +17,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply
 from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.clip_steps import forward_clip
 from bevcli.workshop.training.frame_losses import FrameLosses, LossConfigs
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
 from bevcli.workshop.training.samples import Clip, ClipConfig, load_batch
-from bevcli.workshop.training.trainer import Trainer, forward_clip
+from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.frame_truth import frame_truth
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig

@@ -24,13 +24,20 @@ from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, sc
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.commands import _run
-from bevcli.workshop.training.files import LearningCurve, load_checkpoint, save_checkpoint
-from bevcli.workshop.training.frame_losses import DenseLossConfig
+from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
+from bevcli.workshop.training.losses import DenseLossConfig
 from bevcli.workshop.training.options import TrainOptions
-from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
+from bevcli.workshop.training.trainer import (
+    Trainer,
+    alternated,
+    load_checkpoint,
+    make_optimizer,
+    save_checkpoint,
+    set_learning_rate,
+)
+from bevcli.workshop.training.validation import LearningCurve
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)

@@ -40,8 +40,7 @@ def stress(
     from bevcli.errors import InputError
     from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.results import read_results, stress_table
-    from bevcli.workshop.robustness.stress import stress
+    from bevcli.workshop.robustness.stress import read_results, stress, stress_table
     from bevcli.workshop.synth.drives import RenderedDrives
 
     conditions = choose_conditions(output.severity, output.only)

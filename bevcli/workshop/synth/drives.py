@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -278,3 +278,59 @@ def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
     if not folders:
         raise InputError(f"{path}: {key}: leaves no drive (expected at least one folder)")
     return tuple(folders)
+
+
+class FrameMemory:
+    """Keeps decoded frames of several sequences, without the bytes of files, while its memory lasts.
+
+    Frames beyond it are read each time. A copy in another process begins empty. Frames are shared: do not change their
+    images in place.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        """most_bytes: of decoded images that are kept."""
+        self._most_bytes = self._left_bytes = most_bytes
+        self._frames: dict[tuple[int, int], Frame] = {}
+
+    def __reduce__(self) -> tuple[type["FrameMemory"], tuple[int]]:
+        return FrameMemory, (self._most_bytes,)
+
+    def load(self, sequence: Sequence, key: int, place: int) -> Frame:
+        """The frame at a place of a sequence, whose number is `key`."""
+        if (key, place) in self._frames:
+            return self._frames[key, place]
+        frame = sequence.load(place)
+        images = {name: replace(image, encoded=None, media_type=None) for name, image in frame.images.items()}
+        frame = replace(frame, images=images)
+        size = sum(image.pixels_bgr.nbytes for image in images.values())
+        if size <= self._left_bytes:
+            self._left_bytes -= size
+            self._frames[key, place] = frame
+        return frame
+
+
+class KeptFrames(DerivedSequence):
+    """A sequence whose frames come from a `FrameMemory`, in which its number is `key`."""
+
+    def __init__(self, sequence: Sequence, memory: FrameMemory, key: int) -> None:
+        super().__init__(sequence)
+        self._memory, self._key = memory, key
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self.sequence.ground_truth_frame(place)
+
+    def load(self, place: int) -> Frame:
+        return self._memory.load(self.sequence, self._key, place)
+
+
+class KeptDrives:
+    """Drives whose frames are kept in memory; see `Drives`."""
+
+    def __init__(self, drives: Drives, memory: FrameMemory) -> None:
+        self._drives, self._memory, self.input_shapes = drives, memory, drives.input_shapes
+
+    def __len__(self) -> int:
+        return len(self._drives)
+
+    def open(self, index: int) -> Sequence:
+        return KeptFrames(self._drives.open(index), self._memory, index)

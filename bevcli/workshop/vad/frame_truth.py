@@ -10,7 +10,7 @@ from bevcli.frame import Frame, Sequence, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
-from bevcli.workshop.training.detection_loss import boxes_inside
+from bevcli.workshop.training.targets import boxes_inside
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.driving_scores import LATE_S, FramesByTime, followed, with_true_futures
 from bevcli.workshop.vad.map_lines import TRUE_LINES, MapLines

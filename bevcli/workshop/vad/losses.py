@@ -16,8 +16,8 @@ from torch import Tensor
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.training.detection_loss import focal_cost, focal_loss, hungarian_matching
-from bevcli.workshop.training.samples import OwnHeads
+from bevcli.workshop.training.losses import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.targets import OwnHeads
 from bevcli.workshop.vad.config import LossWeights, VADConfig
 from bevcli.workshop.vad.frame_truth import FrameTruth, frame_truth, missing_truth
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
