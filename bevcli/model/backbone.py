@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Protocol
 
 from torch import Tensor, nn
 
@@ -66,13 +66,13 @@ class Backbone(nn.Module):
     def freeze(self, stages: int) -> None:
         """Keeps the stem and so many first stages as they are in a training; with 0 nothing is frozen."""
         self.frozen_stages = stages
-        for part in self._frozen_parts():
+        for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else ():
             part.requires_grad_(False)
 
     def train(self, mode: bool = True) -> "Backbone":
         """As `nn.Module.train`; batch norms of frozen parts stay in evaluation mode."""
         super().train(mode)
-        for part in self._frozen_parts():
+        for part in [self.conv1, self.bn1, *self.stages[: self.frozen_stages]] if self.frozen_stages else ():
             part.eval()
         return self
 
@@ -86,6 +86,3 @@ class Backbone(nn.Module):
             x = blocks(x)
             maps.append(x)
         return [maps[stage - 1] for stage in self.output_stages]
-
-    def _frozen_parts(self) -> list[Any]:
-        return [self.conv1, self.bn1, *self.stages[: self.frozen_stages]] if self.frozen_stages else []

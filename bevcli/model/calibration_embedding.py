@@ -72,7 +72,11 @@ def ray_features(
     focal = torch.linalg.norm(columns[0], dim=-1).reciprocal() * determinant  # of the x axis, pixels
     levels = []
     for level_rows, level_columns in level_shapes:
-        pixels = _cell_centers(level_rows, level_columns, image_size, matrix.device)  # (S_l, 3)
+        v = (torch.arange(level_rows, dtype=torch.float32, device=matrix.device) + 0.5) * (image_size[0] / level_rows)
+        u = torch.arange(level_columns, dtype=torch.float32, device=matrix.device) + 0.5
+        u = u * (image_size[1] / level_columns)
+        vv, uu = torch.meshgrid(v, u, indexing="ij")
+        pixels = torch.stack([uu, vv, torch.ones_like(uu)], dim=-1).flatten(0, 1)  # (S_l, 3), of the cells' centres
         rays = (bev_from_image[:, None] * pixels[:, None]).sum(-1)  # (K, S_l, 3), of depth 1 m
         above_ground = (center[:, None, 2] + height_m).clamp(min=0.1)
         to_ground = (-rays[..., 2] / above_ground).clamp(0.0, 1 / _NEAREST_M)[..., None]  # inverse depth of the ground
@@ -82,12 +86,3 @@ def ray_features(
         numbers = [directions, of_camera.expand(-1, len(pixels), -1), to_ground, torch.log1p(20 * to_ground)]
         levels.append(torch.cat(numbers, dim=-1))
     return torch.cat(levels, dim=1)
-
-
-def _cell_centers(rows: int, columns: int, image_size: tuple[int, int], device: torch.device) -> Tensor:
-    """(rows · columns, 3) float32 homogeneous pixels of the centres of a feature map's cells."""
-    height, width = image_size
-    v = (torch.arange(rows, dtype=torch.float32, device=device) + 0.5) * (height / rows)
-    u = (torch.arange(columns, dtype=torch.float32, device=device) + 0.5) * (width / columns)
-    vv, uu = torch.meshgrid(v, u, indexing="ij")
-    return torch.stack([uu, vv, torch.ones_like(uu)], dim=-1).flatten(0, 1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
 
 # Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
@@ -45,25 +45,25 @@ def assign_cameras(
     Raises InputError for an unknown camera in `chosen`, or where the model's cameras have no known viewing direction.
     """
     chosen = chosen or {}
-    for camera, embedding in chosen.items():
-        if camera not in rig.names:
-            raise InputError(f"camera {camera}: is not in the rig (it has {', '.join(rig.names)})")
+    for name, embedding in chosen.items():
+        if name not in rig.names:
+            raise InputError(f"camera {name}: is not in the rig (it has {', '.join(rig.names)})")
         if embedding not in model_cameras:
             raise InputError(
-                f"camera {camera}: the model has no camera {embedding} (expected {', '.join(model_cameras)})"
+                f"camera {name}: the model has no camera {embedding} (expected {', '.join(model_cameras)})"
             )
-    embeddings = {camera.name: chosen.get(camera.name) or _embedding(camera, model_cameras) for camera in rig.cameras}
+    yaws = np.radians([NUSCENES_YAWS_DEG.get(name, np.nan) for name in model_cameras])
+    embeddings = {}
+    for camera in rig.cameras:
+        embedding = chosen.get(camera.name, camera.name if camera.name in model_cameras else "")
+        if not embedding:
+            distances = np.abs(wrap_angle(yaws - camera.yaw))
+            if np.isnan(distances).all():
+                raise InputError(
+                    f"camera {camera.name}: the model has no camera of this name; pass "
+                    f"`cameras={{'{camera.name}': 'NAME'}}`"
+                )
+            embedding = model_cameras[int(np.nanargmin(distances))]
+        embeddings[camera.name] = embedding
     order = sorted(rig.names, key=lambda name: (model_cameras.index(embeddings[name]), name != embeddings[name], name))
     return CameraAssignment(tuple(order), tuple(embeddings[name] for name in order))
-
-
-def _embedding(camera: Camera, model_cameras: tuple[str, ...]) -> str:
-    if camera.name in model_cameras:
-        return camera.name
-    yaws = np.radians([NUSCENES_YAWS_DEG.get(name, np.nan) for name in model_cameras])
-    distances = np.abs(wrap_angle(yaws - camera.yaw))
-    if np.isnan(distances).all():
-        raise InputError(
-            f"camera {camera.name}: the model has no camera of this name; pass `cameras={{'{camera.name}': 'NAME'}}`"
-        )
-    return model_cameras[int(np.nanargmin(distances))]

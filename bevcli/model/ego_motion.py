@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
+from bevcli.geometry.transforms import Pose, yaw_of_quaternion
 from bevcli.model.upload import upload
 
 CAN_BUS_SIZE = 18
@@ -91,9 +91,13 @@ def ego_motion_inputs(
     yaws = [np.radians(yaw_deg), turned_deg]
     sensors = (kinematics.acceleration, kinematics.angular_rate, kinematics.velocity)
     can_bus = np.concatenate([moved, quaternion, *sensors, yaws])
+    # The translation to the right and ahead of the ego, over the extent of the BEV map.
+    distance, angle = np.hypot(moved[0], moved[1]), np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
+    extent_x, extent_y = (end - start for start, end in (grid.x_range_m, grid.y_range_m))
+    shift = np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
     return EgoMotionInputs(
         can_bus=can_bus.astype(np.float32),
-        shift=(_history_shift(moved, yaw_deg, grid) * config.shift).astype(np.float32),
+        shift=(shift * config.shift).astype(np.float32),
         rotation_deg=turned_deg * config.rotation,
     )
 
@@ -117,20 +121,18 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
 def turned_history(history: Tensor, rotation: Tensor, grid: BevGrid) -> Tensor:
     """The part of `rotate_history` on the history's device. rotation: (B, 2, 3) of `map_rotation`."""
     rows, columns = grid.rows, grid.columns
-    row, column = _source_cells(rotation, grid)  # (B, Y, X) each
+    by_x, by_y, translation = rotation.unbind(-1)  # (B, 2) each
+    x = torch.arange(columns, device=rotation.device) + 0.5 - columns / 2  # (X,)
+    y = torch.arange(rows, device=rotation.device) + 0.5 - rows / 2  # (Y,)
+    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
+    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
+    # The old cell that each cell takes its history from, (B, Y, X) int64 each.
+    row = (((source_y + 1) * rows - 1) / 2).round().long()
+    column = (((source_x + 1) * columns - 1) / 2).round().long()
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     source = (row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)).flatten(1)  # (B, Y·X)
     batch = torch.arange(len(history), device=history.device)[:, None]
     return history[batch, source] * inside.flatten(1)[..., None]
-
-
-def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
-    """A translation (3,) in world metres as (2,), to the right and ahead of the ego, over the extent of the BEV."""
-    distance = np.hypot(moved[0], moved[1])
-    angle = np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
-    extent_x = grid.x_range_m[1] - grid.x_range_m[0]
-    extent_y = grid.y_range_m[1] - grid.y_range_m[0]
-    return np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
 
 
 def map_rotation(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
@@ -149,15 +151,3 @@ def map_rotation(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) ->
     translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
     scaled = rotation.float() / half[:, None]  # (B, 2, 2)
     return torch.cat([scaled, translation[..., None]], dim=-1)
-
-
-def _source_cells(rotation: Tensor, grid: BevGrid) -> tuple[Tensor, Tensor]:
-    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from."""
-    by_x, by_y, translation = rotation.unbind(-1)  # (B, 2) each
-    x = torch.arange(grid.columns, device=rotation.device) + 0.5 - grid.columns / 2  # (X,)
-    y = torch.arange(grid.rows, device=rotation.device) + 0.5 - grid.rows / 2  # (Y,)
-    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
-    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
-    row = (((source_y + 1) * grid.rows - 1) / 2).round().long()
-    column = (((source_x + 1) * grid.columns - 1) / 2).round().long()
-    return row, column

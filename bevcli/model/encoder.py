@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
@@ -161,7 +161,8 @@ class TemporalSelfAttention(nn.Module):
         batch, cells = offsets.shape[:2]
         maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-        locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+        sizes = self.attention.sampling.level_sizes(self.level_shapes, offsets.device)
+        locations = sampling_locations(reference, offsets, sizes)  # (B, Y·X, heads, 2, 1, P, 2)
         locations = locations.movedim(3, 1).flatten(0, 2)
         weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
         queries_per_map = [2 * cells // maps] * (maps * batch)
@@ -205,7 +206,8 @@ class SpatialCrossAttention(nn.Module):
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.weights(logits)))
-        locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
+        sizes = self.attention.sampling.level_sizes(level_shapes, offsets.device)
+        locations = sampling_locations(reference[:, None, None], offsets, sizes)  # (M, heads, L, P, 2)
         values = self.attention.values(tokens)
         sampled: Tensor = self.attention.sampling(values, level_shapes, locations, weights, hits.hits_per_camera)
         return sampled

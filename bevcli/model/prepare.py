@@ -20,9 +20,14 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, in_place_of
+from bevcli.model.kernels.choose import (
+    KeptCalibrationEmbedding,
+    KeptPillars,
+    choose_kernels,
+    fold_batch_norms,
+    in_place_of,
+)
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.last_call import KeptCalibrationEmbedding, KeptPillars
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
@@ -42,7 +47,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
     Results that do not change from frame to frame are computed once ("constant_parts" of the model, `LastCall`). On a
-    CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
+    CUDA GPU, the `device_methods` of the model are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -73,12 +78,13 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         network.neck.to(dtype)
         network.backbone.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
-    round_attentions(network, dtype, temporal=rounds, queries=rounds or (precision != "fp32" and device.type == "cuda"))
+    if dtype != torch.float32:
+        round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")
     _check_finite(network)
     if device.type == "cuda":
         from bevcli.model.cuda_graph import Captured
 
-        for name in methods_on_device(type(network)):
+        for name in network.device_methods:
             network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
@@ -94,8 +100,6 @@ def round_attentions(network: nn.Module, dtype: torch.dtype, *, temporal: bool, 
     Those are the values of the image features, with `temporal` those of the BEV maps, and with `queries` the attention
     of object queries to each other.
     """
-    if dtype == torch.float32:
-        return
     for module in list(network.modules()):
         if isinstance(module, SpatialCrossAttention) or (temporal and isinstance(module, TemporalSelfAttention)):
             projection = module.attention.value_projection
@@ -116,11 +120,6 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
-
-
-def methods_on_device(kind: type) -> list[str]:
-    """Names of the methods of a class that are marked by `on_device`."""
-    return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
 
 
 def fix_first_attention(model: Network) -> None:

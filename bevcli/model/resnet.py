@@ -68,7 +68,14 @@ class ResNet(Backbone):
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.pool = nn.MaxPool2d(3, stride=2, padding=1)
-        self.stages = nn.ModuleList(_stage(number, config) for number in range(1, max(config.output_stages) + 1))
+        self.stages, in_channels = nn.ModuleList(), width
+        for number, blocks in enumerate(config.blocks[: max(config.output_stages)], 1):
+            channels, deformable = width * 2 ** (number - 1), number in config.deformable_stages
+            # The first bottleneck of a stage has the stride; the stem has that of the first stage.
+            inputs = [(in_channels, 1 if number == 1 else 2)] + (blocks - 1) * [(4 * channels, 1)]
+            stage = (Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs)
+            self.stages.append(nn.Sequential(*stage))
+            in_channels = 4 * channels
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
     def stem(self, images: Tensor) -> Tensor:
@@ -133,12 +140,3 @@ class BasicBlock(nn.Module):
         """x: (B, in_channels, Y, X) -> (B, channels, Y, X)."""
         y = F.relu(self.bn1(self.conv1(x)))
         return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
-
-
-def _stage(number: int, config: ResNetConfig) -> nn.Sequential:
-    """The bottlenecks of a stage (1 to 4); the first of them has the stride."""
-    channels, deformable = config.width * 2 ** (number - 1), number in config.deformable_stages
-    # The stage before has half the channels, the stem as many as the first stage.
-    first = (config.width, 1) if number == 1 else (2 * channels, 2)
-    inputs = [first] + (config.blocks[number - 1] - 1) * [(4 * channels, 1)]
-    return nn.Sequential(*(Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs))

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.camera_assignment import CameraAssignment
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.upload import upload
@@ -106,6 +108,15 @@ class ModelOutputs:
     def further(self) -> dict[str, Tensor]:
         """The last layers' outputs that only this model has, by their names in an exported file."""
         return {}
+
+    def boxes(self, config: ModelConfig) -> Boxes3D:
+        """The boxes with the best scores of the last decoder layer, by falling score, bev frame; of a batch of one.
+
+        There are at most config.decoder.max_boxes. No box is removed: training matches each object to one query. A
+        query gives one box for each of its classes that is among the best scores.
+        """
+        best = best_boxes(self.class_logits[-1].detach(), self.box_codes[-1].detach(), config.decoder)
+        return best.decoded(config.classes)
 
     def last_layers(self) -> Self:
         """The outputs of the last layers, all that results are decoded from."""

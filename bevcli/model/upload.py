@@ -1,6 +1,6 @@
 """Copies from the CPU to a device that the CPU does not wait for; the tensors in nested tuples and dataclasses."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
@@ -10,17 +10,6 @@ import torch
 from torch import Tensor
 
 Value = TypeVar("Value")
-Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-def on_device(method: Method) -> Method:
-    """Marks a method of a model that is a pure function of tensors on the device.
-
-    It does not wait for the device, uploads nothing but its arguments, and no shape depends on a tensor's numbers. On a
-    CUDA GPU it becomes a CUDA graph (`bevcli.model.prepare`).
-    """
-    vars(method)["is_on_device"] = True
-    return method
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
@@ -86,7 +75,8 @@ def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
         for part in value:
             yield from tensors_in(part, name)
     else:
-        for field in _field_names(value):
+        kind: Any = type(value)
+        for field in _fields_of(kind):
             yield from tensors_in(getattr(value, field), field)
 
 
@@ -96,16 +86,12 @@ def exchanged(value: Any, others: Iterator[Any]) -> Any:
         return next(others)
     if isinstance(value, tuple | list):
         return type(value)(exchanged(part, others) for part in value)
-    names = _field_names(value)
-    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
-
-
-def _field_names(value: object) -> tuple[str, ...]:
-    """Of a dataclass; () for another value. They are kept: asking a dataclass takes longer than copying a tensor."""
     kind: Any = type(value)
-    return _fields_of(kind)
+    names = _fields_of(kind)
+    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
 
 
 @cache
 def _fields_of(kind: Any) -> tuple[str, ...]:
+    """Of a dataclass; () for another type. They are kept: asking a dataclass takes longer than copying a tensor."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()

@@ -17,7 +17,7 @@ from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
-from bevcli.model.kernels.by_hits import Hits
+from bevcli.model.kernels.compiled import Hits
 from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))

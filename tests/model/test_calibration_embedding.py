@@ -19,8 +19,7 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.calibration_embedding import CalibrationEmbedding, ray_features
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokensConfig
-from bevcli.model.kernels.choose import in_place_of
-from bevcli.model.kernels.last_call import KeptCalibrationEmbedding
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, in_place_of
 from bevcli.workshop.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from bevcli.model.deformable_attention import GridSampling, level_sizes, sampling_locations
-from bevcli.model.kernels.by_hits import Hits
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
-from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
+from bevcli.model.kernels.compiled import CompiledSampling, Hits, sample_hits
 from bevcli.model.kernels.softmax import softmax_of_groups
 from bevcli.workshop.benchmark.versions import PaddedSampling
 

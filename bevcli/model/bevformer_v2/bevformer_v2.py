@@ -16,11 +16,11 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES, Network
-from bevcli.model.official_keys import OfficialNames
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.resnet import BasicBlock
 from bevcli.model.step import ModelOutputs, PreparedFrame
-from bevcli.model.upload import on_device, upload
+from bevcli.model.temporal_model import OfficialNames
+from bevcli.model.upload import upload
 
 NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
 
@@ -102,6 +102,7 @@ class BEVFormerV2(Network):
     config: BEVFormerV2Config
     config_class = BEVFormerV2Config
     memory_type = FeatureWindow
+    device_methods = ("image_features", "compute")
     stages: Mapping[str, str] = STAGES | {"fusion": "fusion"}
     official_names = OfficialNames(
         mark=r"^(fcos3d_bbox_head|pts_bbox_head\.transformer\.fusion)\.",
@@ -137,11 +138,6 @@ class BEVFormerV2(Network):
         images, camera_index = (upload(x, self.device) for x in (prepared.images, prepared.camera_index))
         return FrameFeatures.of(prepared, self.image_features(images, camera_index))
 
-    @on_device
-    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
-        """See `Network`."""
-        return super().image_features(images, camera_index)
-
     def forward(self, window: Sequence[WindowFrame | None]) -> ModelOutputs:
         """One step. window: the frames in the order of `config.frames`.
 
@@ -164,7 +160,6 @@ class BEVFormerV2(Network):
         seen = tuple((frame.image_features, of_frame) for frame, of_frame in zip(frames, hits, strict=True))
         return seen, tuple(indices.index(index) for index in sources)
 
-    @on_device
     def compute(self, frames: Sequence[tuple[FeatureMaps, PillarHits]], sources: Sequence[int]) -> ModelOutputs:
         """The device part of a step. Arguments: see `geometry`."""
         position = self.bev_queries.position()

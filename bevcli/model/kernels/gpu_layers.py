@@ -12,9 +12,8 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import has_triton
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton
 from bevcli.model.kernels.compiled import in_threads
-from bevcli.model.kernels.last_call import KeptCalibrationEmbedding, LastCall
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.segmentation import (

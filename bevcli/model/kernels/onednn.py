@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.feed_forward import FeedForward
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
 Activation = Literal["none", "relu", "relu6"]
@@ -129,7 +128,12 @@ class FusedInvertedResidual(nn.Module):
     def __init__(self, block: InvertedResidual) -> None:
         super().__init__()
         wide = [layer for layer in (block.expand, block.depthwise) if layer is not None]
-        self.wide = nn.Sequential(*(_packed(layer, "relu6") for layer in wide))
+        self.wide = nn.Sequential()
+        for layer in wide:
+            if isinstance(layer, SameConvolution):
+                self.wide.append(PackedSameConvolution(layer, "relu6"))
+            else:
+                self.wide.append(PackedConvolution(layer, "relu6"))
         self.project, self.adds = PackedConvolution(block.project), block.adds
 
     def forward(self, x: Tensor) -> Tensor:
@@ -144,7 +148,15 @@ class FusedBlock(nn.Module):
     def __init__(self, block: Bottleneck | BasicBlock) -> None:
         super().__init__()
         *first, last = [child for name, child in block.named_children() if name.startswith("conv")]
-        self.first = nn.Sequential(*(_with_relu(convolution) for convolution in first))
+        self.first = nn.Sequential()
+        for convolution in first:
+            if isinstance(convolution, nn.Conv2d):
+                self.first.append(PackedConvolution(convolution, "relu"))
+            else:  # a `CompiledDeformableConvolution`, whose result is a linear layer's
+                product = convolution.get_submodule("product")
+                assert isinstance(product, nn.Linear)
+                convolution.set_submodule("product", PackedLinear(product, "relu"))
+                self.first.append(convolution)
         assert isinstance(last, nn.Conv2d)
         self.last, self.downsample = PackedConvolution(last, "relu"), block.downsample
 
@@ -154,31 +166,20 @@ class FusedBlock(nn.Module):
         return self.last.add_to(self.downsample(x), y)
 
 
-def _packed(convolution: nn.Conv2d, activation: Activation = "none") -> PackedConvolution:
-    if isinstance(convolution, SameConvolution):
-        return PackedSameConvolution(convolution, activation)
-    return PackedConvolution(convolution, activation)
-
-
-def _with_relu(convolution: nn.Module) -> nn.Module:
-    if isinstance(convolution, nn.Conv2d):
-        return PackedConvolution(convolution, "relu")
-    assert isinstance(convolution, CompiledDeformableConvolution)
-    convolution.set_submodule("product", PackedLinear(convolution.product, "relu"))
-    return convolution
-
-
 def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
     """Replaces convolutions, linear layers and residual blocks of a module, in place, for inference.
 
     Batch norms must be folded already. rounds: linear layers of float32 compute in `rounded_products`, except for those
     that predict positions: boxes would move.
     """
-    for name, child in part.named_children():
-        rounds_child = rounds and name != "reference_points" and not isinstance(child, RegressionBranch)
-        fast = _fast(child, rounds_child)
-        setattr(part, name, fast)
-        use_onednn(fast, rounds=rounds_child)
+    left = [(part, rounds)]
+    while left:
+        parent, rounds_parent = left.pop()
+        for name, child in parent.named_children():
+            rounds_child = rounds_parent and name != "reference_points" and not isinstance(child, RegressionBranch)
+            fast = _fast(child, rounds_child)
+            setattr(parent, name, fast)
+            left.append((fast, rounds_child))
 
 
 def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
@@ -193,7 +194,9 @@ def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
     if isinstance(layer, FeedForward):  # dropout has no effect in inference
         expand = PackedLinear(layer.expand, layer.activation, rounds=rounds)
         return nn.Sequential(expand, PackedLinear(layer.reduce, rounds=rounds))
+    if isinstance(layer, SameConvolution):
+        return PackedSameConvolution(layer)
+    if isinstance(layer, nn.Conv2d):
+        return PackedConvolution(layer)
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
-    if type(layer) is nn.Linear:
-        return PackedLinear(layer, rounds=rounds)
-    return _packed(layer) if isinstance(layer, nn.Conv2d) else layer
+    return PackedLinear(layer, rounds=rounds) if type(layer) is nn.Linear else layer

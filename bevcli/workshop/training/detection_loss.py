@@ -16,8 +16,8 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import encode
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import encode
 from bevcli.model.upload import upload
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
@@ -91,7 +91,7 @@ class DetectionTargets:
 
     Attributes:
         labels: (G,) int64, indices into the model's classes.
-        codes: (G, 10) float32 box codes (see `bevcli.model.box_coding`); unknown velocities are NaN.
+        codes: (G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN.
     """
 
     labels: Tensor
