@@ -87,14 +87,10 @@ class DeformableAttention(nn.Module):
         """Offsets and logits of the weights of the samples of queries (..., query_channels).
 
         Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
-        (..., heads, maps, L, P), see `weights`.
+        (..., heads, maps, L, P), see `GridSampling.weights`.
         """
         offsets = self.sampling_offsets(query).float().unflatten(-1, (*self.shape, 2))
         return offsets, self.attention_weights(query).unflatten(-1, self.shape)
-
-    def weights(self, logits: Tensor) -> Tensor:
-        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
-        return self.sampling.softmax(logits.flatten(-2)).view_as(logits)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values (B, Q, C) of queries that sample one map each.
@@ -109,7 +105,7 @@ class DeformableAttention(nn.Module):
         offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
         sizes = self.sampling.level_sizes(level_shapes, offsets.device)
         locations = sampling_locations(reference_points[:, :, None, None, None], offsets, sizes)
-        samples = locations.flatten(0, 1), self.weights(logits).flatten(0, 1), [queries] * batch
+        samples = locations.flatten(0, 1), self.sampling.weights(logits).flatten(0, 1), [queries] * batch
         sampled = self.sampling(self.values(tokens), level_shapes, *samples)
         attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
         return attended
@@ -122,9 +118,9 @@ class DeformableAttention(nn.Module):
 class GridSampling(nn.Module):
     """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another."""
 
-    def softmax(self, logits: Tensor) -> Tensor:
-        """Over the last axis."""
-        return logits.softmax(-1)
+    def weights(self, logits: Tensor) -> Tensor:
+        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
+        return logits.flatten(-2).softmax(-1).view_as(logits)
 
     def level_sizes(self, level_shapes: LevelShapes, device: torch.device) -> Tensor:
         """See the function `level_sizes`."""

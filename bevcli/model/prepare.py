@@ -14,12 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import DecoderLayer, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
-from bevcli.model.image_tokens import ImageTokens
+from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.kernels.choose import (
     KeptCalibrationEmbedding,
     KeptPillars,
@@ -47,7 +46,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
     Results that do not change from frame to frame are computed once ("constant_parts" of the model, `LastCall`). On a
-    CUDA GPU, the `device_methods` of the model are replayed as CUDA graphs.
+    CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -64,7 +63,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     choose_kernels(network, device)
     kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
     if device.type != "cpu":
-        from bevcli.model.kernels.gpu_layers import finish_gpu_parts, gpu_kinds
+        from bevcli.model.kernels.gpu import finish_gpu_parts, gpu_kinds
 
         kinds = gpu_kinds(device)
     for name, module in list(network.named_modules()):
@@ -82,9 +81,9 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")
     _check_finite(network)
     if device.type == "cuda":
-        from bevcli.model.cuda_graph import Captured
+        from bevcli.model.kernels.gpu import Captured
 
-        for name in network.device_methods:
+        for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
             captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
@@ -116,10 +115,15 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     loaded = threading.Event()
     for name, module in list(network.named_modules()):
         if isinstance(module, ResNet):
-            network.set_submodule(f"{name}.pool", CompiledPool(module.pool, loaded))
+            network.set_submodule(f"{name}.pool", in_place_of(module.pool, CompiledPool, loaded=loaded))
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
+
+
+def methods_on_device(kind: type) -> list[str]:
+    """Names of the methods of a class that are marked by `on_device`."""
+    return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
 
 
 def fix_first_attention(model: Network) -> None:

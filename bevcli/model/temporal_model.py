@@ -57,9 +57,6 @@ class TemporalModel(nn.Module):
         memory_type: class of the memory, by which the state of an interrupted run is read.
         official_names: of the tensors in the released files of the model.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
-        device_methods: names of methods that are pure functions of tensors on the device. They do not wait for it,
-            upload nothing but their arguments, and no shape depends on a tensor's numbers. On a CUDA GPU they become
-            CUDA graphs (`bevcli.model.prepare`).
         config: of the model.
     """
 
@@ -67,7 +64,6 @@ class TemporalModel(nn.Module):
     memory_type: ClassVar[type] = type(None)
     official_names: ClassVar[OfficialNames] = OfficialNames()
     stages: Mapping[str, str] = {}
-    device_methods: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

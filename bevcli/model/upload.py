@@ -1,6 +1,6 @@
 """Copies from the CPU to a device that the CPU does not wait for; the tensors in nested tuples and dataclasses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
@@ -10,6 +10,17 @@ import torch
 from torch import Tensor
 
 Value = TypeVar("Value")
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def on_device(method: Method) -> Method:
+    """Marks a method of a model that is a pure function of tensors on the device.
+
+    It does not wait for the device, uploads nothing but its arguments, and no shape depends on a tensor's numbers. On a
+    CUDA GPU it becomes a CUDA graph (`bevcli.model.prepare`).
+    """
+    vars(method)["is_on_device"] = True
+    return method
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:

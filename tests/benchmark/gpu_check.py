@@ -38,7 +38,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.transfer import image_uploader
 from bevcli.model.network import Network
-from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.prepare import Precision, methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say
@@ -375,7 +375,7 @@ def is_launch(name: str) -> bool:
 @contextlib.contextmanager
 def without_graphs(network: TemporalModel) -> Iterator[bool]:
     """Inside, nothing is replayed as a CUDA graph. Yields whether anything was before."""
-    parts = [getattr(network, name) for name in network.device_methods]
+    parts = [getattr(network, name) for name in methods_on_device(type(network))]
     captured = [part for part in parts if any(getattr(part, "graphs", {}).values())]
     for part in captured:
         part.failure = RuntimeError("switched off")

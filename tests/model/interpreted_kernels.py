@@ -153,7 +153,7 @@ def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: 
 def compare_stems() -> None:
     """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
     from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
-    from bevcli.model.kernels.triton_stem import FusedStem
+    from bevcli.model.kernels.triton_convolution import FusedStem
 
     torch.manual_seed(0)
     backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)

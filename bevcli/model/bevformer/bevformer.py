@@ -11,7 +11,7 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
-from bevcli.model.upload import upload, upload_together
+from bevcli.model.upload import on_device, upload, upload_together
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,6 @@ class BEVFormer(Network):
     """The whole model: a recurrence, in which the BEV map of a frame is the history of the next."""
 
     memory_type: ClassVar[type] = BevHistory
-    device_methods = ("compute",)
 
     def step(
         self, prepared: PreparedFrame, memory: BevHistory | None, upcoming: Sequence[PreparedFrame] = ()
@@ -88,6 +87,7 @@ class BEVFormer(Network):
             rotation=rotation,
         )
 
+    @on_device
     def compute(self, inputs: EncoderInputs, heads: bool = True) -> Any:
         """The device part of a step (the paper's figure 2): its outputs, or without `heads` the BEV map (B, Y·X, C)."""
         inputs = upload_together(inputs, self.device)

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, GridSampling, LevelShapes, level_sizes
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.image_tokens import CalibrationEmbedding
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, Hits, sample_hits
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits, Pillars
@@ -46,23 +46,25 @@ def choose_kernels(model: nn.Module, device: torch.device, *, gradients: bool = 
     functions: dict[str, Any] = {}
     if not gradients:
         functions["level_sizes"] = cache(level_sizes)  # CUDA graphs hold the addresses of the tables
-        functions |= {"softmax": softmax_of_few} if device.type == "cpu" else {}
-    kernel = sample_hits
+        functions |= {"weights": softmax_of_few} if device.type == "cpu" else {}
     by_hits: Kinds = {TemporalSelfAttention: TemporalByHits, SpatialCrossAttention: SpatialByHits}
-    kinds: Kinds = {} if gradients or device.type != "cpu" else by_hits
-    if has_triton(device):
+    kinds: Kinds = {}
+    sampling: type[GridSampling] = GridSampling
+    kernel = sample_hits
+    if device.type == "cpu":
+        sampling, kinds = CompiledSampling, {} if gradients else by_hits
+    elif has_triton(device):
         from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
         from bevcli.model.kernels import triton_attention, triton_convolution  # only where Triton is installed
 
-        kernel = triton_attention.sample_hits
+        sampling, kernel = triton_attention.TritonSampling, triton_attention.sample_hits
         kinds = {} if gradients else {**by_hits, DeformableAttention: AttentionByHits}
         for name, module in list(model.named_modules()):
             if isinstance(module, ModulatedDeformableConvolution):
                 model.set_submodule(name, in_place_of(module, triton_convolution.TritonDeformableConvolution))
     for name, module in list(model.named_modules()):
         if isinstance(module, DeformableAttention):
-            sampling = fastest_sampling(device)  # for each its own, for observers
-            module.sampling = in_place_of(sampling, type(sampling), **functions)
+            module.sampling = in_place_of(sampling(), sampling, **functions)
         if kind := kinds.get(type(module)):
             model.set_submodule(name, in_place_of(module, kind, sample_hits=kernel))
 
@@ -72,23 +74,13 @@ def has_triton(device: torch.device) -> bool:
     return device.type == "cuda" and find_spec("triton") is not None
 
 
-def fastest_sampling(device: torch.device) -> GridSampling:
-    """The fastest module for `DeformableAttention.sampling` on a device, with gradients; the plain one for "mps"."""
-    if device.type == "cpu":
-        return CompiledSampling()
-    if has_triton(device):
-        from bevcli.model.kernels.triton_attention import TritonSampling  # only where Triton is installed
-
-        return TritonSampling()
-    return GridSampling()
-
-
 def softmax_of_few(logits: Tensor) -> Tensor:
-    """Softmax over the last axis. On a CPU that of PyTorch takes ten times as long where this has 4 or 8 elements."""
-    if logits.shape[-1] >= VECTORISED:
-        return logits.softmax(-1)
-    exponentials = (logits - logits.amax(-1, keepdim=True)).exp_()
-    return exponentials.div_(exponentials.sum(-1, keepdim=True))
+    """As `GridSampling.weights`. On a CPU, PyTorch's softmax takes ten times as long for 4 or 8 samples."""
+    flat = logits.flatten(-2)
+    if flat.shape[-1] >= VECTORISED:
+        return flat.softmax(-1).view_as(logits)
+    exponentials = (flat - flat.amax(-1, keepdim=True)).exp_()
+    return exponentials.div_(exponentials.sum(-1, keepdim=True)).view_as(logits)
 
 
 def fold_batch_norms(model: nn.Module, device: torch.device) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
 Activation = Literal["none", "relu", "relu6"]
@@ -177,26 +177,23 @@ def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
         parent, rounds_parent = left.pop()
         for name, child in parent.named_children():
             rounds_child = rounds_parent and name != "reference_points" and not isinstance(child, RegressionBranch)
-            fast = _fast(child, rounds_child)
+            fast = child
+            parameter = next(child.parameters(), None)
+            if parameter is None or not has_onednn(parameter.dtype):
+                pass
+            elif isinstance(child, Bottleneck | BasicBlock):
+                fast = FusedBlock(child)
+            elif isinstance(child, InvertedResidual):
+                fast = FusedInvertedResidual(child)
+            elif isinstance(child, FeedForward):  # dropout has no effect in inference
+                expand = PackedLinear(child.expand, child.activation, rounds=rounds_child)
+                fast = nn.Sequential(expand, PackedLinear(child.reduce, rounds=rounds_child))
+            elif isinstance(child, SameConvolution):
+                fast = PackedSameConvolution(child)
+            elif isinstance(child, nn.Conv2d):
+                fast = PackedConvolution(child)
+            # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
+            elif type(child) is nn.Linear:
+                fast = PackedLinear(child, rounds=rounds_child)
             setattr(parent, name, fast)
             left.append((fast, rounds_child))
-
-
-def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
-    """The replacement of a layer; the layer itself where oneDNN has nothing for it, or not in this dtype."""
-    parameter = next(layer.parameters(), None)
-    if parameter is None or not has_onednn(parameter.dtype):
-        return layer
-    if isinstance(layer, Bottleneck | BasicBlock):
-        return FusedBlock(layer)
-    if isinstance(layer, InvertedResidual):
-        return FusedInvertedResidual(layer)
-    if isinstance(layer, FeedForward):  # dropout has no effect in inference
-        expand = PackedLinear(layer.expand, layer.activation, rounds=rounds)
-        return nn.Sequential(expand, PackedLinear(layer.reduce, rounds=rounds))
-    if isinstance(layer, SameConvolution):
-        return PackedSameConvolution(layer)
-    if isinstance(layer, nn.Conv2d):
-        return PackedConvolution(layer)
-    # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
-    return PackedLinear(layer, rounds=rounds) if type(layer) is nn.Linear else layer

@@ -168,7 +168,7 @@ class SlottedSpatialCrossAttention(nn.Module):
     def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
         """As `SpatialCrossAttention.forward`."""
         offsets, logits = (part[:, :, 0] for part in self.attention.predict(query[0]))
-        weights = self.attention.weights(logits)
+        weights = self.attention.sampling.weights(logits)
         heads, levels = self.attention.shape[0], image_features.level_shapes
         values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
         points = hits.reference_points

@@ -8,8 +8,14 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, frames_at, kept
+from bevcli.model.bevformer_v2.bevformer_v2 import (
+    BEVFormerV2Config,
+    FeatureWindow,
+    FrameFeatures,
+    WindowFrame,
+    frames_at,
+    kept,
+)
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.step import PreparedFrame, model_inputs

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.model.bevformer_v2.window import WindowFrame
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs

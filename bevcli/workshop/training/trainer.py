@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from bevcli.errors import BevcliError
 from bevcli.inference.cpu_settings import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
-from bevcli.model.backbone import Backbone
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
+from bevcli.model.resnet import Backbone
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.training import files
 from bevcli.workshop.training.augmentation import randomised

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sampling_locations
-from bevcli.model.encoder import normalized_centers
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward, normalized_centers
 
 TEMPERATURE = 10_000.0  # of the sine position embedding
 
@@ -38,7 +37,7 @@ class FlatListAttention(DeformableAttention):
         else:
             locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
         locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))  # (B, Q or more, heads, L, P, 2)
-        weights = self.weights(logits).flatten(1, 4).unflatten(1, (-1, heads, levels))
+        weights = self.sampling.weights(logits).flatten(1, 4).unflatten(1, (-1, heads, levels))
         samples = locations[:, :queries].flatten(0, 1), weights[:, :queries].flatten(0, 1), [queries] * batch
         sampled = self.sampling(self.values(tokens), level_shapes, *samples)
         attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
