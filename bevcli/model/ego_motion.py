@@ -5,7 +5,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
@@ -77,15 +76,14 @@ def ego_motion_inputs(
         previous_pose: world_from_ego of the previous frame. None for a scene's first frame, which has neither
             translation nor rotation, and where config.first_frame is "original" for the first frame of the run.
     """
-    position = np.asarray(pose.translation, dtype=np.float64)
-    yaw_deg = heading_deg(pose.quaternion)
-    moved, turned_deg = np.zeros(3), 0.0
-    if previous_pose is None and config.first_frame == "original":
-        previous_pose = Pose.identity()
-    if previous_pose is not None:
-        moved = position - np.asarray(previous_pose.translation, dtype=np.float64)
-        # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
-        turned_deg = yaw_deg - heading_deg(previous_pose.quaternion)
+    if previous_pose is None:
+        previous_pose = Pose.identity() if config.first_frame == "original" else pose
+    poses = pose, previous_pose
+    position, previous_position = (np.asarray(each.translation, dtype=np.float64) for each in poses)
+    moved = position - previous_position
+    yaw_deg, previous_yaw_deg = (float(np.degrees(yaw_of_quaternion(each.quaternion)) % 360.0) for each in poses)
+    # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
+    turned_deg = yaw_deg - previous_yaw_deg
     w, x, y, z = np.asarray(pose.quaternion, dtype=np.float64)
     quaternion = [w, w, w, w] if config.can_bus_quaternion == "w" else [w, x, y, z]
     yaws = [np.radians(yaw_deg), turned_deg]
@@ -100,11 +98,6 @@ def ego_motion_inputs(
         shift=(shift * config.shift).astype(np.float32),
         rotation_deg=turned_deg * config.rotation,
     )
-
-
-def heading_deg(quaternion: ArrayLike) -> float:
-    """Yaw of a pose in degrees, in [0, 360), from its quaternion (4,) w, x, y, z."""
-    return float(np.degrees(yaw_of_quaternion(quaternion)) % 360.0)
 
 
 def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:

@@ -19,13 +19,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
-from bevcli.model.kernels.choose import (
-    KeptCalibrationEmbedding,
-    KeptPillars,
-    choose_kernels,
-    fold_batch_norms,
-    in_place_of,
-)
+from bevcli.model.kernels import choose
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.network import Network
@@ -59,8 +53,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         fix_constant_parts(network)
     points_on_cpu = {name: module.points for name, module in network.named_modules() if isinstance(module, Pillars)}
     network.to(device)
-    fold_batch_norms(network, device)
-    choose_kernels(network, device)
+    choose.fold_batch_norms(network, device)
+    choose.choose_kernels(network, device)
     kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
     if device.type != "cpu":
         from bevcli.model.kernels.gpu import finish_gpu_parts, gpu_kinds
@@ -68,7 +62,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         kinds = gpu_kinds(device)
     for name, module in list(network.named_modules()):
         if kind := kinds.get(type(module)):
-            network.set_submodule(name, in_place_of(module, kind))
+            network.set_submodule(name, choose.in_place_of(module, kind))
     if device.type != "cpu":
         finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
@@ -115,7 +109,7 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     loaded = threading.Event()
     for name, module in list(network.named_modules()):
         if isinstance(module, ResNet):
-            network.set_submodule(f"{name}.pool", in_place_of(module.pool, CompiledPool, loaded=loaded))
+            network.set_submodule(f"{name}.pool", choose.in_place_of(module.pool, CompiledPool, loaded=loaded))
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
@@ -219,8 +213,8 @@ class TokensInBlocks(ImageTokens):
 
 # The classes that take the place of plain ones on a CPU, beside those of `choose_kernels`.
 CPU_KINDS: dict[type[nn.Module], type[nn.Module]] = {
-    Pillars: KeptPillars,
-    CalibrationEmbedding: KeptCalibrationEmbedding,
+    Pillars: choose.KeptPillars,
+    CalibrationEmbedding: choose.KeptCalibrationEmbedding,
     EfficientNetLite: EfficientNetLiteByImage,
     ImageTokens: TokensInBlocks,
 }

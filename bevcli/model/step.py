@@ -97,12 +97,9 @@ class ModelInputs:
         """(height, width) of the network's input, pixels."""
         return self.images.shape[-2], self.images.shape[-1]
 
-    def to(self, device: torch.device, *, keep_geometry: bool = False) -> "ModelInputs":
-        """The same inputs on a device.
-
-        keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where they are read without a wait.
-        """
-        kept = ("image_from_bev", "has_image", "rotation_deg") if keep_geometry else ()
+    def to(self, device: torch.device) -> "ModelInputs":
+        """The same inputs on a device, but for what is read on the CPU: image_from_bev, has_image and rotation_deg."""
+        kept = ("image_from_bev", "has_image", "rotation_deg")
         tensors = {part.name: getattr(self, part.name) for part in fields(self)}
         return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 

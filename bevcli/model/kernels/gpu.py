@@ -17,22 +17,14 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model import upload
+from bevcli.model import segmentation, upload
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton
 from bevcli.model.kernels.compiled import in_threads
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
-from bevcli.model.segmentation import (
-    MaskDecoderLayer,
-    SegmentationConfig,
-    SegmentationHead,
-    SegmentationOutputs,
-    map_layers,
-)
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.model.upload import exchanged, tensors_in, upload_together
 
 PLACES = 128  # numbers of padded hits are multiples of this
 
@@ -44,7 +36,11 @@ def gpu_kinds(device: torch.device) -> dict[type[nn.Module], type[nn.Module]]:
         CalibrationEmbedding: KeptCalibrationEmbedding,
     }
     if device.type == "cuda":
-        kinds |= {ImageTokens: TokensInOnePass, MaskDecoderLayer: AttentionByProducts, SegmentationHead: MapOnDevice}
+        kinds |= {
+            ImageTokens: TokensInOnePass,
+            segmentation.MaskDecoderLayer: AttentionByProducts,
+            segmentation.SegmentationHead: MapOnDevice,
+        }
         kinds |= {Bottleneck: FusedBottleneck} if torch.version.hip is None else {}  # cuDNN is NVIDIA's
     if has_triton(device):
         from bevcli.model.kernels.triton_convolution import FusedStem  # only where Triton is installed
@@ -115,7 +111,7 @@ class TokensInOnePass(ImageTokens):
         return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
 
 
-class AttentionByProducts(MaskDecoderLayer):
+class AttentionByProducts(segmentation.MaskDecoderLayer):
     """A `MaskDecoderLayer` with its table of attention weights in memory.
 
     With few queries and many keys this is faster: PyTorch's kernel gives each block of queries to one multiprocessor.
@@ -127,7 +123,7 @@ class AttentionByProducts(MaskDecoderLayer):
         return scores.softmax(-1) @ values
 
 
-class MapOnDevice(SegmentationHead):
+class MapOnDevice(segmentation.SegmentationHead):
     """A `SegmentationHead`: the GPU merges the masks, so that neither masks are copied nor the CPU does it.
 
     Attributes:
@@ -135,14 +131,14 @@ class MapOnDevice(SegmentationHead):
         grid: of the BEV map.
     """
 
-    config: SegmentationConfig
+    config: segmentation.SegmentationConfig
     grid: BevGrid
 
-    def forward(self, bev: Tensor, position: Tensor) -> SegmentationOutputs:
+    def forward(self, bev: Tensor, position: Tensor) -> segmentation.SegmentationOutputs:
         """As `SegmentationHead.forward`, for a batch of one, with map layers."""
         outputs = super().forward(bev, position)
         masks, classes = outputs.mask_logits[-1, 0].float(), outputs.class_logits[-1, 0].float()
-        return replace(outputs, map_layers=map_layers(masks, classes, self.config, self.grid))
+        return replace(outputs, map_layers=segmentation.map_layers(masks, classes, self.config, self.grid))
 
 
 class PaddedPillars(Pillars):
@@ -164,7 +160,7 @@ class PaddedPillars(Pillars):
         if any(count > size for count, size in zip(hits.hits_per_camera, sizes, strict=True)):
             roomy = (min(len(self.points), _roomy(count)) for count in hits.hits_per_camera)
             sizes = self.sizes[key] = tuple(map(max, roomy, sizes))
-        return upload_together(hits.padded(sizes), self.points.device)
+        return upload.upload_together(hits.padded(sizes), self.points.device)
 
 
 def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
@@ -219,12 +215,12 @@ class CudaGraph:
 
         Raises RuntimeError where an operation cannot be captured, such as a wait for the GPU.
         """
-        self._sources = [tensor for _, tensor in tensors_in(arguments)]
+        self._sources = [tensor for _, tensor in upload.tensors_in(arguments)]
         small = [tensor for tensor in self._sources if tensor.device.type == "cpu"]
         self._uploaded = upload.upload(upload.packed(small), device) if small else None
         of_cpu = iter([] if self._uploaded is None else upload.unpacked(self._uploaded, small))
         self._inputs = [next(of_cpu) if x.device.type == "cpu" else x.clone() for x in self._sources]
-        own = exchanged(arguments, iter(self._inputs))
+        own = upload.exchanged(arguments, iter(self._inputs))
         with torch.cuda.device(device):
             stream = torch.cuda.Stream(device)
             stream.wait_stream(torch.cuda.current_stream(device))
@@ -239,7 +235,7 @@ class CudaGraph:
     def replay(self, arguments: tuple[Any, ...]) -> Any:
         """The results for other arguments of the same shapes, in new memory."""
         small = []
-        for index, (_, tensor) in enumerate(tensors_in(arguments)):
+        for index, (_, tensor) in enumerate(upload.tensors_in(arguments)):
             if tensor.device.type == "cpu":
                 small.append(tensor)
             elif tensor is not self._sources[index]:  # hits of a rig stay the same for many frames
@@ -248,7 +244,7 @@ class CudaGraph:
         if self._uploaded is not None:
             self._uploaded.copy_(upload.pinned(upload.packed(small)), non_blocking=True)
         self._graph.replay()
-        return exchanged(self._outputs, (tensor.clone() for _, tensor in tensors_in(self._outputs)))
+        return upload.exchanged(self._outputs, (tensor.clone() for _, tensor in upload.tensors_in(self._outputs)))
 
 
 class Captured:
@@ -288,7 +284,9 @@ class Captured:
 
     def _graph_for(self, arguments: tuple[Any, ...]) -> CudaGraph | None:
         """The graph for arguments of these shapes; None where they come for the first time or cannot be captured."""
-        key = exchanged(arguments, ((tuple(x.shape), x.dtype, x.device) for _, x in tensors_in(arguments)))
+        key = upload.exchanged(
+            arguments, ((tuple(x.shape), x.dtype, x.device) for _, x in upload.tensors_in(arguments))
+        )
         if key not in self.graphs:
             self.graphs[key] = None
             if len(self.graphs) > KEPT_GRAPHS:

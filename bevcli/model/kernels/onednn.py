@@ -91,21 +91,19 @@ class PackedConvolution(nn.Module):
         self.geometry = (*map(list, geometry), convolution.groups)
         self.packed_for: torch.Size | None = None
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x: (B, in, H, W) -> (B, out, H', W'), channels last."""
-        arguments = x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise(*arguments, *self.activation, "")
+    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H', W'), channels last.
 
-    def add_to(self, shortcut: Tensor, x: Tensor) -> Tensor:
-        """activation(convolution(x) + shortcut), (B, out, H', W'), in the memory of the shortcut."""
-        arguments = shortcut, x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise_.binary(*arguments, "add", 1.0, self.after_sum, [], "")
-
-    def _packed(self, input_size: torch.Size) -> Tensor:
-        if self.packed_for != input_size:
+        With a shortcut: activation(convolution(x) + shortcut), in the memory of the shortcut.
+        """
+        if self.packed_for != x.shape:
             pack = torch.ops.mkldnn._reorder_convolution_weight
-            self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(input_size)), input_size
-        return self.packed
+            self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(x.shape)), x.shape
+        arguments = x, self.packed, self.bias, *self.geometry
+        if shortcut is None:
+            return torch.ops.mkldnn._convolution_pointwise(*arguments, *self.activation, "")
+        add = torch.ops.mkldnn._convolution_pointwise_.binary
+        return add(shortcut, *arguments, "add", 1.0, self.after_sum, [], "")
 
 
 class PackedSameConvolution(PackedConvolution):
@@ -115,8 +113,8 @@ class PackedSameConvolution(PackedConvolution):
         super().__init__(convolution, activation)
         self.padding_for = convolution.padding_for
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x: (B, in, H, W) -> (B, out, H / 2, W / 2), rounded up, channels last."""
+    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H / 2, W / 2), rounded up, channels last. There is no shortcut."""
         padding, rows, columns = self.padding_for(x)
         self.geometry = (padding, *self.geometry[1:])
         return super().forward(x)[..., rows:, columns:]
@@ -139,7 +137,7 @@ class FusedInvertedResidual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """As the block's own `forward`. Where it adds x, the result is written over x."""
         y = self.wide(x)
-        return self.project.add_to(x, y) if self.adds else self.project(y)
+        return self.project(y, x if self.adds else None)
 
 
 class FusedBlock(nn.Module):
@@ -163,7 +161,7 @@ class FusedBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """As the block's own `forward`. Without a `downsample` the result is written over x."""
         y = self.first(x)
-        return self.last.add_to(self.downsample(x), y)
+        return self.last(y, self.downsample(x))
 
 
 def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:

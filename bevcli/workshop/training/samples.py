@@ -213,7 +213,7 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
-        inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
+        inputs = tuple(inputs.to(device) for inputs in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
         return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
 
