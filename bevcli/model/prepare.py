@@ -57,14 +57,14 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     choose.choose_kernels(network, device)
     kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
     if device.type != "cpu":
-        from bevcli.model.kernels.gpu import finish_gpu_parts, gpu_kinds
+        from bevcli.model.kernels import gpu
 
-        kinds = gpu_kinds(device)
+        kinds = gpu.gpu_kinds(device)
     for name, module in list(network.named_modules()):
         if kind := kinds.get(type(module)):
             network.set_submodule(name, choose.in_place_of(module, kind))
     if device.type != "cpu":
-        finish_gpu_parts(network, points_on_cpu)
+        gpu.finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
     if isinstance(network, Network):
         network.backbone.to(dtype)
@@ -75,11 +75,9 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")
     _check_finite(network)
     if device.type == "cuda":
-        from bevcli.model.kernels.gpu import Captured
-
         for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
-            captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
+            captured: Any = gpu.Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)

@@ -145,36 +145,21 @@ class ModelOutputs:
         return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
 
 
-def model_inputs(
-    frames: Sequence[PreparedFrame], previous_poses: Sequence[Pose | None], config: ModelConfig
-) -> ModelInputs:
-    """B frames, each of another sequence, as a batch.
-
-    previous_poses: world_from_ego of the frame before in each sequence; None at its start.
-    Raises InputError where the sequences do not have the same number of cameras.
-    """
-    indices = [prepared.camera_index for prepared in frames]
-    for prepared in frames:
-        if len(prepared.camera_index) != len(indices[0]):
-            raise InputError(
-                f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
-                "cannot go into one batch: use sequences with the same number of cameras, or batches of 1"
-            )
-    same = all(torch.equal(index, indices[0]) for index in indices)
-    motions = [
-        ego_motion_inputs(frame.world_from_ego, pose, frame.kinematics, config.bev_grid, config.ego_motion)
-        for frame, pose in zip((prepared.frame for prepared in frames), previous_poses, strict=True)
-    ]
+def model_inputs(prepared: PreparedFrame, previous_pose: Pose | None, config: ModelConfig) -> ModelInputs:
+    """A frame as a batch of one. previous_pose: see `ego_motion_inputs`."""
+    frame = prepared.frame
+    motion = ego_motion_inputs(
+        frame.world_from_ego, previous_pose, frame.kinematics, config.bev_grid, config.ego_motion
+    )
     return ModelInputs(
-        # Copying the images of a single frame would take milliseconds.
-        images=frames[0].images if len(frames) == 1 else _together([prepared.images for prepared in frames]),
+        images=prepared.images,
         # Without the noise of the poses' products (1e-14), so that frames of one rig have equal projections.
-        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).round(decimals=12).float(),
-        camera_index=indices[0] if same else torch.stack(indices),
-        has_image=torch.cat([prepared.has_image for prepared in frames]),
-        can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
-        shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
-        rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),
+        image_from_bev=prepared.image_from_bev.round(decimals=12).float(),
+        camera_index=prepared.camera_index,
+        has_image=prepared.has_image,
+        can_bus=torch.from_numpy(motion.can_bus)[None],
+        shift=torch.from_numpy(motion.shift)[None],
+        rotation_deg=torch.tensor([motion.rotation_deg], dtype=torch.float32),
     )
 
 

@@ -109,7 +109,7 @@ class WindowForm(ExportForm):
     def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
         """See `ExportForm`. Of a frame that does not exist no camera has an image."""
         past = self._past(prepared, memory)
-        current = model_inputs([prepared], [None], self.config)
+        current = model_inputs(prepared, None, self.config)
         indices = [len(past) + offset for offset in self.frames[:-1]]
         absent = WindowFrame(
             FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),

@@ -320,7 +320,7 @@ def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[Pr
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
     poses = [None, *(one.frame.world_from_ego for one in frames[:-1])]
-    return tuple(model_inputs([one], [pose], config) for one, pose in zip(frames, poses, strict=True))
+    return tuple(model_inputs(frame, pose, config) for frame, pose in zip(frames, poses, strict=True))
 
 
 def _grey(image: ImageConfig) -> NDArray[np.uint8]:

@@ -211,7 +211,7 @@ class UniAD(BEVFormer):
         frame, device = prepared.frame, self.device
         is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
         previous_pose = memory.pose if memory is not None and is_known else None
-        inputs = model_inputs([prepared], [previous_pose], self.config)
+        inputs = model_inputs(prepared, previous_pose, self.config)
         inputs = replace(inputs, images=upload(inputs.images, device))
         history = tracks = motion = None
         if memory is not None:
