@@ -45,9 +45,9 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
 
     Paths of meshes are relative to the folder of `file`.
     """
-    architecture, known = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
-    if architecture not in known:
-        expected = " or ".join(f'"{name}"' for name in known)
+    architecture, architectures = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
+    if architecture not in architectures:
+        expected = " or ".join(f'"{name}"' for name in architectures)
         raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r:.60}')
     settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
     model: type[TemporalModel] = load("bevcli.models", architecture)
@@ -90,7 +90,9 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
 def _plain(settings: Any) -> dict[str, Any]:
     """The fields of a dataclass as TOML has them: nested dictionaries; lists for tuples; None is left out."""
     table = settings if isinstance(settings, dict) else msgspec.to_builtins(settings)
-    return {key: _plain(each) if isinstance(each, dict) else each for key, each in table.items() if each is not None}
+    return {
+        key: _plain(value) if isinstance(value, dict) else value for key, value in table.items() if value is not None
+    }
 
 
 def read_model_file(name: str) -> tuple[dict[str, Any], str]:

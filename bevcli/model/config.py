@@ -282,11 +282,11 @@ class ModelConfig:
 
 def _check_numbers(config: Any, prefix: str = "") -> None:
     """Raises ValueError for a whole number that no model has, before anything of its size is made."""
-    for each in fields(config):
-        value = getattr(config, each.name)
+    for setting in fields(config):
+        value = getattr(config, setting.name)
         if is_dataclass(value):
-            _check_numbers(value, f"{prefix}{each.name}.")
-        most = LARGEST.get(each.name, LARGEST.get(each.name.rpartition("_")[2], LARGEST_NUMBER))
+            _check_numbers(value, f"{prefix}{setting.name}.")
+        most = LARGEST.get(setting.name, LARGEST.get(setting.name.rpartition("_")[2], LARGEST_NUMBER))
         for number in value if isinstance(value, tuple) else (value,):
             if type(number) is int and abs(number) > most:
-                raise ValueError(f"{prefix}{each.name} is {number} (expected at most {most})")
+                raise ValueError(f"{prefix}{setting.name} is {number} (expected at most {most})")

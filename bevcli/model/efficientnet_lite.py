@@ -161,4 +161,4 @@ def _stage(number: int, config: EfficientNetLiteConfig) -> nn.Sequential:
     channels = config.channels(number)
     before = STEM_CHANNELS if number == 1 else config.channels(number - 1)
     inputs = [(before, stride)] + (config.blocks(number) - 1) * [(channels, 1)]
-    return nn.Sequential(*(InvertedResidual(size, channels, kernel_size, each, expansion) for size, each in inputs))
+    return nn.Sequential(*(InvertedResidual(size, channels, kernel_size, stride, expansion) for size, stride in inputs))

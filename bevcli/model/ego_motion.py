@@ -79,9 +79,9 @@ def ego_motion_inputs(
     if previous_pose is None:
         previous_pose = Pose.identity() if config.first_frame == "original" else pose
     poses = pose, previous_pose
-    position, previous_position = (np.asarray(each.translation, dtype=np.float64) for each in poses)
+    position, previous_position = (np.asarray(at.translation, dtype=np.float64) for at in poses)
     moved = position - previous_position
-    yaw_deg, previous_yaw_deg = (float(np.degrees(yaw_of_quaternion(each.quaternion)) % 360.0) for each in poses)
+    yaw_deg, previous_yaw_deg = (float(np.degrees(yaw_of_quaternion(at.quaternion)) % 360.0) for at in poses)
     # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
     turned_deg = yaw_deg - previous_yaw_deg
     w, x, y, z = np.asarray(pose.quaternion, dtype=np.float64)

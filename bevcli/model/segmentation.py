@@ -219,7 +219,7 @@ def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: B
     """
     layers = outputs.map_layers
     if layers is None:
-        logits, of_class = (each[-1, 0].detach().float() for each in (outputs.mask_logits, outputs.class_logits))
+        logits, of_class = (layers[-1, 0].detach().float() for layers in (outputs.mask_logits, outputs.class_logits))
         used = logits.amax(-1).sigmoid() * of_class.sigmoid() > config.min_thing  # the other things are in no cell
         used[: len(STUFF_CLASSES)] = True
         layers = map_layers(logits[used], of_class[used], config, grid)

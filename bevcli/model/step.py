@@ -100,7 +100,7 @@ class ModelInputs:
     def to(self, device: torch.device) -> "ModelInputs":
         """The same inputs on a device, but for what is read on the CPU: image_from_bev, has_image and rotation_deg."""
         kept = ("image_from_bev", "has_image", "rotation_deg")
-        tensors = {part.name: getattr(self, part.name) for part in fields(self)}
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
         return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 
 
@@ -186,13 +186,13 @@ def _together(images: list[Tensor]) -> Tensor:
 
     They are joined channels last, as they lie in memory.
     """
-    height, width = (max(of_batch.shape[axis] for of_batch in images) for axis in (-2, -1))
+    height, width = (max(batch.shape[axis] for batch in images) for axis in (-2, -1))
 
-    def padded(one: Tensor) -> Tensor:
-        missing = (0, width - one.shape[-1], 0, height - one.shape[-2])
-        return (F.pad(one, missing) if any(missing) else one).movedim(2, -1)
+    def padded(batch: Tensor) -> Tensor:
+        missing = (0, width - batch.shape[-1], 0, height - batch.shape[-2])
+        return (F.pad(batch, missing) if any(missing) else batch).movedim(2, -1)
 
-    return torch.cat([padded(one) for one in images]).movedim(-1, 2)
+    return torch.cat([padded(batch) for batch in images]).movedim(-1, 2)
 
 
 def assign_cameras(

@@ -208,8 +208,8 @@ class BEVFormerV2(Network):
         """See `TemporalModel`; the images of a frame pass the backbone once."""
         memory = FeatureWindow(()) if memory is None else memory
         past = memory.before(prepared.frame.stamp, self.config.past_frames)
-        known = {frame.stamp: frame for frame in memory.frames}
-        present = [known.get(one.frame.stamp) or self._features(one) for one in (prepared, *upcoming)]
+        features = {frame.stamp: frame for frame in memory.frames}
+        present = [features.get(now.frame.stamp) or self._features(now) for now in (prepared, *upcoming)]
         frames, current = (*past, *present), len(past)
         outputs = self(frames_at(frames, [current + offset for offset in self.config.frames], prepared))
         return outputs, kept(frames, current, self.config.past_frames)
@@ -285,12 +285,12 @@ def frames_at(
 
 
 def kept(frames: Sequence[FrameFeatures], current: int, past_frames: int) -> FeatureWindow:
-    """The memory for the next frame, which needs one frame less of the past. current: place of the current frame."""
+    """The memory for the next frame, which needs one frame less of the past. current: index of the current frame."""
     return FeatureWindow(tuple(frames[max(0, current + 1 - past_frames) :]))
 
 
 def fill_window(frames: Sequence[int], exists: Sequence[bool]) -> list[int]:
-    """For each frame of the window, the place of the frame whose BEV map it takes.
+    """For each frame of the window, the index of the frame whose BEV map it takes.
 
     That is its own, or, where it does not exist, that of the nearest existing frame towards the current one.
 

@@ -201,11 +201,11 @@ def load_compiled(dtype: torch.dtype, loaded: threading.Event) -> None:
         sampling, pool = CompiledSampling(), CompiledPool(3, stride=2, padding=1)
         pool.loaded = threading.Event()
         pool.loaded.set()
-        place = torch.zeros(1, 1, 1, 1, 2)
-        hit = Hits(torch.zeros(1, dtype=torch.int64), place[0, 0], (1,), torch.zeros(1, dtype=torch.int64))
+        location = torch.zeros(1, 1, 1, 1, 2)
+        hit = Hits(torch.zeros(1, dtype=torch.int64), location[0, 0], (1,), torch.zeros(1, dtype=torch.int64))
         for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
-            sampling(values, [(1, 1)], place, place[..., 0], [1])
-            sample_hits(values, ((1, 1),), hit, place[None], place[None, ..., 0])
+            sampling(values, [(1, 1)], location, location[..., 0], [1])
+            sample_hits(values, ((1, 1),), hit, location[None], location[None, ..., 0])
         pool(torch.zeros(1, 1, 1, 1, dtype=dtype))
         loaded.set()
 

@@ -264,7 +264,7 @@ class Captured:
         self._function, self._device, self._rounds = function, device, rounds
         parts = [module for module in model.modules() if module is not model]
         hooks = [hooks for part in parts for hooks in (part._forward_hooks, part._forward_pre_hooks)]
-        self._no_hooks, self._own = [each for each in hooks if not each], [each for each in hooks if each]
+        self._no_hooks, self._own = [kind for kind in hooks if not kind], [kind for kind in hooks if kind]
         self._own_hooks = sum(map(len, self._own))
         self.graphs: OrderedDict[Any, CudaGraph | None] = OrderedDict()
         self._pool: Any = None

@@ -20,8 +20,8 @@ BFLOAT16_BITS = 16
 
 
 @njit(nogil=True, inline="always")
-def sum_samples(values, first, step, cells, shares, begin, end, out, place, depth):  # type: ignore[no-untyped-def]
-    """Writes the weighted sums of `depth` successive channels to out[place], out[place + 1] and so on.
+def sum_samples(values, first, step, cells, shares, begin, end, out, first_sum, depth):  # type: ignore[no-untyped-def]
+    """Writes the weighted sums of `depth` successive channels to out[first_sum], out[first_sum + 1] and so on.
 
     values: (N,) float32, or bfloat16 bits as uint16. first: index of the first channel in cell 0. step: from a cell to
     the next. cells (int32), shares: (4, T), the corners of all samples and their weights; samples begin to end - 1 are
@@ -29,20 +29,20 @@ def sum_samples(values, first, step, cells, shares, begin, end, out, place, dept
     """
     if depth % 32 == 0:
         for c in range(0, depth, 32):
-            _sum_channels(32, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(32, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     elif depth % 16 == 0:
         for c in range(0, depth, 16):
-            _sum_channels(16, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(16, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     elif depth % 8 == 0:
         for c in range(0, depth, 8):
-            _sum_channels(8, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(8, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     else:
         for c in range(depth):
-            _sum_channels(1, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(1, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
 
 
 @intrinsic(prefer_literal=True)
-def _sum_channels(typing, width, values, first, step, cells, shares, begin, end, out, place):  # type: ignore[no-untyped-def]
+def _sum_channels(typing, width, values, first, step, cells, shares, begin, end, out, first_sum):  # type: ignore[no-untyped-def]
     """The sums of `width` channels from `first` on; arguments as for `sum_samples`. The width is a constant."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -82,7 +82,7 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
         builder.store(result, pointer, align=2 if rounds else 4)
         return context.get_dummy_value()
 
-    return types.void(width, values, first, step, cells, shares, begin, end, out, place), generate
+    return types.void(width, values, first, step, cells, shares, begin, end, out, first_sum), generate
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
@@ -198,8 +198,8 @@ def _sum_heads(values, chosen_map, cells, shares, samples, out, query):  # type:
     start = chosen_map * values.shape[1] * step
     for head in range(heads):
         channel, first = head * depth, head * samples
-        place = query * step + channel
-        sum_samples(flat, start + channel, step, cells, shares, first, first + samples, sums, place, depth)
+        first_sum = query * step + channel
+        sum_samples(flat, start + channel, step, cells, shares, first, first + samples, sums, first_sum, depth)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})

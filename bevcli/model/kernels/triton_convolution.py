@@ -75,7 +75,7 @@ class _Convolution(torch.autograd.Function):
         bias_gradient = gradient.sum((0, 1, 2), dtype=torch.float32)
         learned = (x_gradient, predicted_gradient, weight_gradient, bias_gradient)
         dtypes = (x.dtype, predicted.dtype, weight.dtype, weight.dtype)
-        return *(each.to(dtype) for each, dtype in zip(learned, dtypes, strict=True)), None
+        return *(gradient.to(dtype) for gradient, dtype in zip(learned, dtypes, strict=True)), None
 
 
 def _channels_last(x: Tensor) -> Tensor:
@@ -226,11 +226,11 @@ def _add_gradients(  # type: ignore[no-untyped-def]
             gradient = tl.load(source + channel[None, :], exists[:, None] & has_channel[None, :], 0.0).to(tl.float32)
             for corner in tl.static_range(4):
                 cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
-                place = cell[:, None] * CHANNELS + channel[None, :]
+                element = cell[:, None] * CHANNELS + channel[None, :]
                 read = inside[:, None] & has_channel[None, :]
-                value = tl.load(values + place, read, 0.0).to(tl.float32)
+                value = tl.load(values + element, read, 0.0).to(tl.float32)
                 tl.atomic_add(
-                    values_gradient + place, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed"
+                    values_gradient + element, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed"
                 )
                 product = tl.sum(value * gradient, 1)
                 of_mask += of_rows * of_columns * product
@@ -281,12 +281,12 @@ def _pool(  # type: ignore[no-untyped-def]
 
     One program takes BLOCK elements of one image. values (B, H, W, C), bias (C,), out (B, H', W', C).
     """
-    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    element = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     image = tl.program_id(1).to(tl.int64)
-    exists = place < elements
-    channel = place % CHANNELS
-    column = place // CHANNELS % out_width
-    row = place // CHANNELS // out_width
+    exists = element < elements
+    channel = element % CHANNELS
+    column = element // CHANNELS % out_width
+    row = element // CHANNELS // out_width
     source = values + image * height * width * CHANNELS
     largest = tl.full((BLOCK,), float("-inf"), tl.float32)
     for tap in tl.static_range(9):
@@ -296,4 +296,4 @@ def _pool(  # type: ignore[no-untyped-def]
         value = tl.load(source + (y * width + x) * CHANNELS + channel, inside, float("-inf")).to(tl.float32)
         largest = tl.maximum(largest, value, propagate_nan=tl.PropagateNan.ALL)
     largest += tl.load(bias + channel, exists, 0.0).to(tl.float32)
-    tl.store(out + image * elements + place, tl.where(largest < 0, 0.0, largest), exists)
+    tl.store(out + image * elements + element, tl.where(largest < 0, 0.0, largest), exists)
