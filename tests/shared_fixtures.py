@@ -16,12 +16,12 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.cpu_settings import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
+from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.viewer import recording_file
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.line_decoder import LineDecoderConfig

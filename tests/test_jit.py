@@ -13,7 +13,7 @@ import pytest
 import bevcli
 from bevcli.jit import is_compiled
 
-CODE = "import bevcli.model.kernels.bilinear, bevcli.workshop.synth.renderer; print('ok')"
+CODE = "import bevcli.model.kernels.loops, bevcli.workshop.synth.renderer; print('ok')"
 
 
 @pytest.fixture

@@ -17,9 +17,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
-from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.step import PreparedFrame
+from bevcli.model.step import CameraAssignment, PreparedFrame, assign_cameras
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 

@@ -18,7 +18,6 @@ from bevcli.errors import BevcliError, WeightsError
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import decode
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.image_tokens import ImageTokensConfig
@@ -132,7 +131,7 @@ def test_decoded_boxes_equal_the_decoder_of_the_library(model_and_file):
     found: dict[str, np.ndarray] = {}
     exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
-        expected = decode(step_of_file(exported, small_inputs()), model.config)
+        expected = step_of_file(exported, small_inputs()).boxes(model.config)
     boxes, scores, classes = (found[name] for name in ("boxes", "scores", "classes"))
     np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
     np.testing.assert_allclose(boxes[0, :, :3], expected.centers, atol=1e-5)

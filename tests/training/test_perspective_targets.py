@@ -11,7 +11,7 @@ import torch
 from one_image import ImageTargets, objects_of_image, targets_of_image
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import encode
+from bevcli.model.decoder import encode
 from bevcli.workshop.training.frame_losses import OUTLINE_DEPTH_M, feature_locations
 from bevcli.workshop.training.targets import DetectionTargets
 

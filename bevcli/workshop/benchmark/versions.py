@@ -14,7 +14,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.inference.stage_clock import StageClock
-from bevcli.model.bevformer_v2.window import FeatureWindow
+from bevcli.model.bevformer_v2.bevformer_v2 import FeatureWindow
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame

@@ -214,7 +214,7 @@ class RecurrentForm(ExportForm):
         return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
 
     def feed(self, prepared: PreparedFrame, memory: BevHistory | None) -> dict[str, Tensor]:
-        inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
+        inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
     def memory(self, prepared: PreparedFrame, memory: BevHistory | None, by_name: Mapping[str, Tensor]) -> BevHistory:

@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.box_coding import best_boxes
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_boxes
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
 from bevcli.model.ego_motion import rotate_history
@@ -118,12 +118,12 @@ class RecurrentStep(ExportedStep):
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """`bevcli.model.box_coding.decode` for a batch of one, in the graph.
+    """`ModelOutputs.boxes` for a batch of one, in the graph.
 
     class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
     height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
     """
-    best = best_boxes(class_logits, box_codes, config)
+    best = best_boxes(class_logits, box_codes, config.decoder)
     x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
     # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
     yaw = torch.atan2(-cos, -sin)
@@ -168,7 +168,7 @@ class SlottedSpatialCrossAttention(nn.Module):
     def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
         """As `SpatialCrossAttention.forward`."""
         offsets, logits = (part[:, :, 0] for part in self.attention.predict(query[0]))
-        weights = self.attention.weights(logits)
+        weights = self.attention.sampling.weights(logits)
         heads, levels = self.attention.shape[0], image_features.level_shapes
         values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
         points = hits.reference_points

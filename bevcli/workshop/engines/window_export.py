@@ -8,8 +8,14 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.bevformer_v2.window import FeatureWindow, FrameFeatures, WindowFrame, frames_at, kept
+from bevcli.model.bevformer_v2.bevformer_v2 import (
+    BEVFormerV2Config,
+    FeatureWindow,
+    FrameFeatures,
+    WindowFrame,
+    frames_at,
+    kept,
+)
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.step import PreparedFrame, model_inputs
@@ -103,7 +109,7 @@ class WindowForm(ExportForm):
     def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
         """See `ExportForm`. Of a frame that does not exist no camera has an image."""
         past = self._past(prepared, memory)
-        current = model_inputs([prepared], [None], self.config)
+        current = model_inputs(prepared, None, self.config)
         indices = [len(past) + offset for offset in self.frames[:-1]]
         absent = WindowFrame(
             FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),

@@ -18,15 +18,14 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
 from bevcli.inference.load import weights_file
-from bevcli.model.backbone import Backbone
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.model.bevformer_v2.window import WindowFrame
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network, build_network
+from bevcli.model.resnet import Backbone
 from bevcli.model.step import ModelOutputs
 from bevcli.registry import for_model
 from bevcli.workshop.training.augmentation import renormalised

@@ -162,7 +162,7 @@ def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int
 
     Args:
         image_from_bev: (P, 4, 4), bev metres to pixels of the network's input.
-        codes: (P, G, 10) box codes (see `bevcli.model.box_coding`).
+        codes: (P, G, 10) box codes (see `bevcli.model.decoder`).
         image_size: (height, width) of the network's input, pixels.
     """
     matrix = image_from_bev[:, :3].double()  # on the CPU if image_from_bev is: not every device has float64

@@ -186,7 +186,7 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
-        inputs = tuple(step.to(device, keep_geometry=True) for step in self.inputs)
+        inputs = tuple(inputs.to(device) for inputs in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
         targets = tuple(targets.to(device) for targets in self.targets)
         return Batch(inputs, self.world_from_bev, targets, plain, tuple(upload(x, device) for x in self.distortions))
@@ -273,7 +273,7 @@ def _distortions(prepared: PreparedFrame, drawn: Mapping[str, ColorChange]) -> T
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
     poses = [None, *(prepared.frame.world_from_ego for prepared in frames[:-1])]
-    return tuple(model_inputs([prepared], [pose], config) for prepared, pose in zip(frames, poses, strict=True))
+    return tuple(model_inputs(prepared, pose, config) for prepared, pose in zip(frames, poses, strict=True))
 
 
 def _grey(image: ImageConfig) -> NDArray[np.uint8]:

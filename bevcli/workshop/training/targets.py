@@ -21,8 +21,8 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
-from bevcli.model.box_coding import encode
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import encode
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.temporal_model import model_class
 from bevcli.model.upload import exchanged, pinned, tensors_in, upload
@@ -35,7 +35,7 @@ class DetectionTargets:
 
     Attributes:
         labels: (G,) int64, indices into the model's classes.
-        codes: (G, 10) float32 box codes (see `bevcli.model.box_coding`); unknown velocities are NaN.
+        codes: (G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN.
     """
 
     labels: Tensor

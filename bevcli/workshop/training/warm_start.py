@@ -16,10 +16,10 @@ from bevcli.checkpoints import INTEGER_KEY, Checkpoint, read_checkpoint
 from bevcli.config import load_config
 from bevcli.errors import InputError, WeightsError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.model.camera_assignment import assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import CAMERA_EMBEDDING, Network
+from bevcli.model.step import assign_cameras
 
 LEAST_SHARE = 0.5  # of the model's numbers, that a file must hold
 State = Literal["loaded", "new", "unused"]

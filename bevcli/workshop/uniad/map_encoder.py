@@ -7,9 +7,8 @@ from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig
-from bevcli.model.deformable_attention import DeformableAttention, LevelShapes
-from bevcli.model.encoder import normalized_centers
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sampling_locations
+from bevcli.model.encoder import FeedForward, normalized_centers
 
 TEMPERATURE = 10_000.0  # of the sine position embedding
 
@@ -23,25 +22,26 @@ class FlatListAttention(DeformableAttention):
     point. Their weights are not normalised again.
     """
 
-    def sampling_points(
-        self, query: Tensor, reference_points: Tensor, level_shapes: LevelShapes
-    ) -> tuple[Tensor, Tensor]:
+    def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """See `DeformableAttention`.
 
         reference_points: (B, Q, 2), or (B, Q, 4) with the extent along x and y: then offsets are measured in half
         extents, divided by the number of points.
         """
-        (heads, _, predicted, points), (levels, queries) = self.shape, (len(level_shapes), query.shape[1])
+        (heads, _, predicted, points), levels, (batch, queries, _) = self.shape, len(level_shapes), query.shape
         read = -(-queries * levels // predicted)  # the queries whose offsets and weights are used
         offsets, logits = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
         offsets, reference = offsets[:, :, :, 0], reference_points[:, :read, None, None, None]
         if reference_points.shape[-1] == 2:
-            locations = self.locations(reference, offsets, level_shapes)
+            locations = sampling_locations(reference, offsets, self.sampling.level_sizes(level_shapes, offsets.device))
         else:
             locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
         locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))  # (B, Q or more, heads, L, P, 2)
-        weights = self.weights(logits).flatten(1, 4).unflatten(1, (-1, heads, levels))
-        return locations[:, :queries], weights[:, :queries]
+        weights = self.sampling.weights(logits).flatten(1, 4).unflatten(1, (-1, heads, levels))
+        samples = locations[:, :queries].flatten(0, 1), weights[:, :queries].flatten(0, 1), [queries] * batch
+        sampled = self.sampling(self.values(tokens), level_shapes, *samples)
+        attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
+        return attended
 
 
 class MapEncoder(nn.Module):

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig, best_classes
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward
 from bevcli.model.segmentation import LocationDecoder, map_of_layers, split_heads
 from bevcli.workshop.uniad.map_encoder import FlatListAttention, MapEncoder
 

@@ -1,6 +1,6 @@
 """Key names of the released weights files of UniAD, and ours."""
 
-from bevcli.model.official_keys import OfficialNames, Renames
+from bevcli.model.temporal_model import OfficialNames, Renames
 
 # Keys without effect at inference.
 _UNUSED = (

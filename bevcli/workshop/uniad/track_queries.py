@@ -96,7 +96,7 @@ class TrackQueries:
     Attributes:
         position: (K, C) first half of the queries.
         content: (K, C) second half of the queries.
-        box_codes: (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.box_coding`.
+        box_codes: (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.decoder`.
         ids: (K,) int64 identities.
         misses: (K,) int64 number of misses since the score was last high.
         memories: of the K tracks.

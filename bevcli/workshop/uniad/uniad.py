@@ -13,9 +13,8 @@ from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import boxes_of_codes
 from bevcli.model.config import ModelConfig
-from bevcli.model.decoder import ObjectQueries
+from bevcli.model.decoder import ObjectQueries, boxes_of_codes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
@@ -212,7 +211,7 @@ class UniAD(BEVFormer):
         frame, device = prepared.frame, self.device
         is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
         previous_pose = memory.pose if memory is not None and is_known else None
-        inputs = model_inputs([prepared], [previous_pose], self.config)
+        inputs = model_inputs(prepared, previous_pose, self.config)
         inputs = replace(inputs, images=upload(inputs.images, device))
         history = tracks = motion = None
         if memory is not None:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.decoder import branch, class_branch
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import best_boxes
-from bevcli.model.decoder import best_classes
+from bevcli.model.decoder import best_boxes, best_classes
 from bevcli.model.network import STAGES
-from bevcli.model.official_keys import OfficialNames, Renames
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import ModelOutputs
+from bevcli.model.temporal_model import OfficialNames, Renames
 from bevcli.model.upload import without_autocast
 from bevcli.workshop.vad.config import VADConfig
 from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
@@ -150,8 +149,8 @@ def fix_first_attentions(model: VAD) -> None:
 
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
-    """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config)
+    """The boxes of `ModelOutputs.boxes`, with futures: the places of each object's centre in each mode."""
+    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config.decoder)
     boxes, queries = best.decoded(config.classes), best.query[0]
     offsets = _array(outputs.motion.offsets[0, queries])  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
