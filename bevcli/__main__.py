@@ -13,9 +13,10 @@ def main() -> None:
     signals = EndSignals()
     signals.start()
     atexit.register(signals.stop)  # Python waits for threads before this
-    from bevcli.cli.main import run_app
+    from bevcli.cli.main import app, program
 
-    run_app()
+    with program():
+        app()
 
 
 def _open_streams() -> None:
