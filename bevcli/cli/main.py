@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 from bevcli._version import __version__
 from bevcli.cli.bridge import as_flags, command
 from bevcli.errors import BevcliError, WaitError
-from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
+from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, prepare_output, reason_of, say
 from bevcli.registry import entries, load
 

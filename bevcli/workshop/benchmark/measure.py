@@ -172,7 +172,7 @@ def run_benchmark(
     peak_precision: Precision = "fp32" if model.precision == "int8" else model.precision
     limits = measure_limits(device, peak_precision)
     plain: Any = made_up_model(config) if model.is_exported else model.network
-    fast = Version(model.prepared, device)
+    fast = Version(model.prepared, device, takes_pixels=model.is_exported)
     first = config.past_frames
     timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + frames
     drive = MadeUpDrive(run + 2 * RUNS * max(frames, RUN_FRAMES))

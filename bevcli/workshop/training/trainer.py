@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.inference.cpu_settings import trim_memory
+from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.backbone import Backbone
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
