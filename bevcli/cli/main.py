@@ -116,7 +116,7 @@ class _Group(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of this name, None for an unknown one."""
-        if cmd_name in self.list_commands(ctx) and self.commands[cmd_name] is None:
+        if self.commands.get(cmd_name) is None and cmd_name in entries(GROUP):
             app = load(GROUP, cmd_name)  # a function, or a Typer with several
             if not isinstance(app, typer.Typer):
                 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)

@@ -3,8 +3,9 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from itertools import islice
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, TypeVar
 
 from bevcli.waiting import result_within
 
@@ -51,7 +52,7 @@ def read_ahead(
                 threaded.shutdown(wait=False, cancel_futures=True)
 
 
-class WriteBehind(Generic[S]):
+class WriteBehind(AbstractContextManager["WriteBehind[S]"], Generic[S]):
     """`with WriteBehind(work) as writer: writer.put(item)`: work(item) of every item, in order, in a background thread.
 
     Nothing more is done once `work` has returned False or raised. `put` or the end of the block raises its exception.
@@ -64,9 +65,6 @@ class WriteBehind(Generic[S]):
         self._work, self._depth, self._goes_on = work, depth, True
         self._pending: deque[Future[None]] = deque()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
-
-    def __enter__(self) -> Self:
-        return self
 
     def put(self, item: S) -> bool:
         """Add an item, and wait while too many of them are pending. False once `work` has returned False."""

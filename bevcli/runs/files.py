@@ -144,7 +144,8 @@ class RunFiles:
         for kind, writer in self._results.items():
             writer.write(ground, result_of(kind, prediction.results))
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
-        self._check_that_files_exist()
+        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
+            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
 
     def _boxes_of(self, frame: Frame, prediction: Prediction) -> FrameBoxes:
@@ -191,10 +192,6 @@ class RunFiles:
 
     def _open_submission(self) -> SubmissionWriter:
         return self._open(SUBMISSION, SubmissionWriter)
-
-    def _check_that_files_exist(self) -> None:
-        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
-            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""

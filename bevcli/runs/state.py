@@ -5,12 +5,13 @@ are tensors of the file. Everything else is one more tensor, MessagePack that ms
 the type that it expects, so that nothing in a file decides what is made of it.
 """
 
+import contextlib
 import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, Self, TypeVar, get_origin
+from typing import Any, Generic, Protocol, TypeVar, get_origin
 
 import msgspec
 import numpy as np
@@ -65,11 +66,6 @@ class RunState(Generic[Memory]):
     counts: Counts
     runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
-    @property
-    def frames(self) -> int:
-        """Number of finished frames."""
-        return self.counts.whole.count
-
 
 def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, str]:
     """Name -> hash or value of all that the results of a run depend on.
@@ -111,7 +107,7 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
     return state
 
 
-class RunWriter:
+class RunWriter(contextlib.AbstractContextManager["RunWriter"]):
     """`with RunWriter(…) as writer: writer.write(frame, prediction, after)`.
 
     Writes frames to the files of a run, counts them, and saves the state as often as SHARE of its time allows. The end
@@ -126,9 +122,6 @@ class RunWriter:
         self._longest_s: float | None = None
         self._after: RunnerState[Any] | None = None  # the state after a frame that is not saved yet
         self._is_whole = True
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_error: object) -> None:
         if self._is_whole and self._after is not None:
