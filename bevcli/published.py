@@ -17,8 +17,7 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.user_folders import user_cache, user_folder
-from bevcli.writing import write_whole
+from bevcli.writing import user_cache, user_folder, write_whole
 
 FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
 HASHES = "hashes.json"

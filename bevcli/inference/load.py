@@ -1,12 +1,11 @@
 """`load_model`: a configured model with its weights, on a device."""
 
-import copy
 import hashlib
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +19,6 @@ from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
-from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes
@@ -105,12 +103,6 @@ class Model:
     def contents(self) -> dict[str, Any]:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
-
-    def for_rig(self, rig: CameraRig) -> "Model":
-        """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
-        network = copy.copy(self.network)  # the copy has the same weights
-        network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
-        return replace(self, network=network)
 
     def training_notes(self, rig: CameraRig) -> tuple[str, ...]:
         """Warnings where the rig or the model's file differs from the training; none for random weights."""
@@ -307,6 +299,8 @@ def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -
 def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torch.device, Precision | Literal["int8"]]:
     """The engine, device and precision that the options ask for; by default PyTorch, or for INT8 one that has it.
 
+    The default precision of PyTorch is fp32 on the CPU and bf16 on a GPU.
+
     Raises BevcliError for what is not there, does not fit the model, or excludes each other.
     """
     engine, device, is_int8 = options.engine, choose_device(options.device), options.precision == "int8"
@@ -319,7 +313,8 @@ def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torc
         if engine is None:
             raise BevcliError("`precision=int8`: no engine is installed: run pip install 'bevcli[openvino]'")
     if engine in (None, TORCH):
-        return TORCH, device, choose_precision(options.precision, device)
+        assert options.precision != "int8"
+        return TORCH, device, options.precision or ("bf16" if device.type == "cuda" else "fp32")
     _engine(engine).check_options(engine, options, config)
     return engine, torch.device("cpu"), options.precision or "fp32"
 
@@ -375,9 +370,3 @@ def choose_device(name: str | torch.device) -> torch.device:
     if name == "auto":
         name = "cuda" if available else "cpu"
     return torch.device(name)
-
-
-def choose_precision(chosen: Precision | Literal["int8"] | None, device: torch.device) -> Precision:
-    """The chosen precision of PyTorch, or by default fp32 on the CPU and bf16 on a GPU."""
-    assert chosen != "int8"
-    return chosen or ("bf16" if device.type == "cuda" else "fp32")

@@ -16,8 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, Frame, FrameResult, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
-from bevcli.inference.background import read_ahead
-from bevcli.inference.device import StageClock, image_uploader, origin, read_back
+from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.model.config import ImageConfig, ModelConfig

@@ -164,7 +164,10 @@ def step(
     matches = _match(config, tracks, boxes, usable, stamp)
     born = usable[(matches[usable] < 0) & (scores[usable] >= config.birth_score)]
     matches[born] = len(tracks) + np.arange(len(born))
-    tracks = _with_births(tracks, boxes, born, number)
+    nothing, nowhere = np.zeros(len(born), dtype=np.int64), np.zeros((len(born), 2))
+    numbers, no_scores = number + np.arange(len(born)), np.zeros(len(born))
+    new = Tracks(numbers, boxes.classes[born], nowhere, nowhere, nothing, nothing, no_scores)
+    tracks = Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
     owned = np.flatnonzero(matches >= 0)
     owners = matches[owned]
     tracks.centers_xy[owners] = boxes.centers[owned, :2]
@@ -227,11 +230,3 @@ def _match(
             matches[box] = nearest
             away[:, nearest] = np.inf
     return matches
-
-
-def _with_births(tracks: Tracks, boxes: Boxes3D, born: NDArray[np.int64], number: int) -> Tracks:
-    """The tracks, followed by a new one, without any box so far, for each of these boxes."""
-    count = len(born)
-    nothing, nowhere = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
-    new = Tracks(number + np.arange(count), boxes.classes[born], nowhere, nowhere, nothing, nothing, np.zeros(count))
-    return Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))

@@ -7,8 +7,8 @@ from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
+from bevcli.inference.pipeline import WriteBehind
 from bevcli.inference.runner import RunnerState, read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, result_within
 from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
@@ -22,7 +22,6 @@ from bevcli.parsing.files import MIB, open_regular, plain_name, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.options import SequenceOptions
-from bevcli.waiting import result_within
 
 # Where the beginning of a file shows its container: offset and bytes. The last row is that of streams in bags.
 CONTAINERS = (

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
+from bevcli.inference.pipeline import WriteBehind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.prepare import DTYPES, Precision

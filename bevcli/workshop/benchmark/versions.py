@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from bevcli.frame import FrameStamp, Prediction
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.device import StageClock
 from bevcli.inference.machine import keep_freed_memory, return_freed_memory
+from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
 from bevcli.model.bevformer_v2.window import FeatureWindow
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps

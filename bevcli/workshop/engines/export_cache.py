@@ -4,6 +4,7 @@ The files lie in $XDG_CACHE_HOME/bevcli/engines (default ~/.cache/bevcli/engines
 so that several processes may make it at the same time. Files that nobody has used for some months are removed.
 """
 
+import copy
 import hashlib
 import json
 import os
@@ -23,19 +24,18 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, image_for_rig
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.step import PreparedFrame
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence, select_range
-from bevcli.user_folders import user_cache
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.export_step import DeformableConvolution
 from bevcli.workshop.engines.exported import ExportedModel
 from bevcli.workshop.engines.options import OnnxOptions
-from bevcli.writing import whole_file, write_whole
+from bevcli.writing import user_cache, whole_file, write_whole
 
 FORMAT = 1  # of the files in the cache; increase it when they change in one version of bevcli
 KEY_DIGITS = 20
@@ -57,7 +57,7 @@ def exported_for_rig(
 
     open_file: of the engine. deformable_convolution: of a file for it, see `OnnxOptions`.
     """
-    sized = model.for_rig(rig)
+    sized = for_rig(model, rig)
     options = _options(sized, rig, deformable_convolution)
     exact = CachedFile(_key(sized, options, "fp32"))
 
@@ -210,3 +210,10 @@ def _cameras_per_cell(frame: PreparedFrame, model: Model) -> int:
     height, width = frame.images.shape[-2:]
     hit = Pillars(model.config.bev_grid).project(frame.image_from_bev.float(), (height, width), everywhere).hit
     return max(int(hit.sum(1).max()), OnnxOptions.cameras_per_cell)
+
+
+def for_rig(model: Model, rig: CameraRig) -> Model:
+    """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
+    network = copy.copy(model.network)  # the copy has the same weights
+    network.config = replace(model.config, image=image_for_rig(rig, model.config.image))
+    return replace(model, network=network)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
@@ -13,7 +13,7 @@ import cv2
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import load_form
 from bevcli.sequences.options import WriteOptions
-from bevcli.writing import remove_parts, whole_folder, write_whole
+from bevcli.writing import output_errors, remove_parts, write_whole
 
 if TYPE_CHECKING:
     from bevcli.frame import CameraImage, Frame, Sequence
@@ -123,3 +123,23 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     return chosen.opener(path, sequence, options)
+
+
+@contextmanager
+def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
+    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
+
+    So is the folder itself if it was missing before. Other files in it are kept.
+    Raises OutputError where the folder cannot be made.
+    """
+    is_new = not folder.exists()
+    with output_errors(folder, "created"):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            remove_parts(folder, parts)
+            if is_new:
+                folder.rmdir()
+        raise

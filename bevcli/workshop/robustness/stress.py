@@ -16,7 +16,7 @@ from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
 from bevcli.runs.folder import RunFolder
-from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
+from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
 from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
 from bevcli.workshop.robustness.conditions import KEPT_BYTES, Condition, KeptFrames, choose_conditions
@@ -130,7 +130,7 @@ class _StressRun:
         weights = self.model.weights
         return {
             "model": self.model.name,
-            "weights": {"file": weights.name if weights else "random", "hash": short_hash(self.model.weights_hash)},
+            "weights": {"file": weights.name if weights else "random", "hash": self.model.weights_hash[:DIGITS]},
             "precision": self.model.precision,
             "temporal": self.options.temporal,
             "seed": self.options.seed,

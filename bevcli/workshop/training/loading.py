@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import OutputError
-from bevcli.inference.background import read_ahead
+from bevcli.inference.pipeline import read_ahead
 from bevcli.model.config import ModelConfig
 from bevcli.workshop.synth.drives import Drives
 from bevcli.workshop.training.augmentation import AugmentationConfig

@@ -1,18 +1,110 @@
-"""A model's device: images go up meanwhile, results come back with one wait and are checked, stages are timed."""
+"""Around the model: other threads read and write frames, images go up, results come back, stages are timed.
+
+While the model computes a frame, threads prepare the next ones and write those before. Results come back from a GPU
+with one wait, and are checked.
+"""
 
 import re
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import fields, replace
-from itertools import pairwise
-from typing import Any
+from itertools import islice, pairwise
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.errors import result_within
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.upload import exchanged, packed, tensors_in, unpacked, upload
+
+S = TypeVar("S")
+T = TypeVar("T")
+READING_TIMEOUT_S = 1800.0  # of all images of a frame, or of a training step
+WRITING_TIMEOUT_S = 120.0  # of one frame
+QUEUE = 4  # frames that wait to be written; each of them keeps its images and its BEV map in memory
+
+
+def read_ahead(
+    work: Callable[[T], S],
+    items: Iterable[Any],
+    depth: int = 2,
+    threads: int = 1,
+    load: Callable[[Any], T] | None = None,
+) -> Generator[S]:
+    """Yields work(item) for every item, in order, computed in background threads up to `depth` items ahead.
+
+    An exception in `work` or `load` is raised when its item is due. If the caller stops early, the items that have not
+    begun are cancelled. Raises WaitError if an item is not there READING_TIMEOUT_S after it is due.
+
+    load: makes what `work` takes of an item, in one more thread, in order. None: `work` takes the items.
+    """
+    what, source = "reading and preparing a frame", iter(items)
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
+    loader = None if load is None else ThreadPoolExecutor(1, thread_name_prefix="load-ahead")
+
+    def begun(item: Any) -> Future[S]:
+        if loader is None or load is None:
+            return pool.submit(work, item)
+        loaded = loader.submit(load, item)
+        return pool.submit(lambda: work(result_within(loaded, READING_TIMEOUT_S, what)))
+
+    pending = deque(map(begun, islice(source, depth)))
+    try:
+        while pending:
+            result = result_within(pending.popleft(), READING_TIMEOUT_S, what)
+            pending.extend(map(begun, islice(source, 1)))
+            yield result
+    finally:
+        for threaded in (pool, loader):
+            if threaded is not None:
+                threaded.shutdown(wait=False, cancel_futures=True)
+
+
+class WriteBehind(AbstractContextManager["WriteBehind[S]"], Generic[S]):
+    """`with WriteBehind(work) as writer: writer.put(item)`: work(item) of every item, in order, in a background thread.
+
+    Nothing more is done once `work` has returned False or raised. `put` or the end of the block raises its exception.
+    The end of the block waits for all items, also after an error in the block.
+    Raises WaitError if an item takes more than WRITING_TIMEOUT_S.
+    """
+
+    def __init__(self, work: Callable[[S], bool], depth: int = QUEUE) -> None:
+        """depth: items that may wait, beside the one that is worked on."""
+        self._work, self._depth, self._goes_on = work, depth, True
+        self._pending: deque[Future[None]] = deque()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
+
+    def put(self, item: S) -> bool:
+        """Add an item, and wait while too many of them are pending. False once `work` has returned False."""
+        self._pending.append(self._pool.submit(self._write, item))
+        self._finish(1 + self._depth)
+        return self._goes_on
+
+    def __exit__(self, *_error: object) -> None:
+        try:
+            self._finish(0)
+        finally:
+            for task in self._pending:
+                task.cancel()
+            wait(self._pending, WRITING_TIMEOUT_S)
+            self._pool.shutdown(wait=False)
+
+    def _write(self, item: S) -> None:
+        try:
+            self._goes_on = self._goes_on and self._work(item)
+        except BaseException:
+            self._goes_on = False
+            raise
+
+    def _finish(self, allowed: int) -> None:
+        """Wait until at most `allowed` items are pending. An exception of a finished item is raised."""
+        while self._pending and (len(self._pending) > allowed or self._pending[0].done()):
+            result_within(self._pending[0], WRITING_TIMEOUT_S, "writing a frame")
+            self._pending.popleft()
 
 
 def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:
@@ -94,7 +186,7 @@ def describe(name: str) -> str:
     return part if part == name else f"{part} ({name})"
 
 
-class StageClock:
+class StageClock(ExitStack):
     """Seconds of each stage of one step. The model has hooks inside the `with` block only:
 
         with clock:
@@ -123,10 +215,10 @@ class StageClock:
             stages: module name -> stage that is marked when the module ends.
             starts: module name -> stage that is marked before the module begins.
         """
+        super().__init__()
         self._device = device
         self._marks: list[tuple[str, Any]] = []  # with seconds, or events of a GPU's queue
         self._has_waited = False
-        self._hooks = ExitStack()
         modules = dict(model.named_modules())
         ends = [(modules[name].register_forward_hook, stage) for name, stage in stages.items() if name in modules]
         begins = [(modules[name].register_forward_pre_hook, stage) for name, stage in (starts or {}).items()]
@@ -135,13 +227,10 @@ class StageClock:
     def __enter__(self) -> "StageClock":
         """A new step begins now."""
         for register, stage in self._marked:
-            self._hooks.enter_context(register(lambda *_, stage=stage: self.mark(stage)))
+            self.enter_context(register(lambda *_, stage=stage: self.mark(stage)))
         self._marks, self._has_waited = [], False
         self.mark("")
         return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._hooks.close()
 
     def mark(self, stage: str) -> None:
         """The time since the last mark belongs to this stage."""
