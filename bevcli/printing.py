@@ -33,7 +33,7 @@ def reason_of(error: BaseException) -> str:
 def say(*texts: object, err: bool = False) -> None:
     """Print texts, each on lines of its own. err: on stderr."""
     text = "\n".join(map(str, texts))
-    if not text.isprintable():
+    if not text.replace("\n", "").isprintable():
         text = "".join(char if char in "\n\t" else _escaped(char) for char in text)
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 

@@ -5,6 +5,7 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from types import FrameType
 from typing import Self
@@ -23,10 +24,8 @@ class _Signals:
 
     limit_s: float | None = None
     keeps_ignored = False
-
-    def __init__(self) -> None:
-        self._number = 0
-        self._before: dict[signal.Signals, object] = {}
+    _number = 0  # of the first signal
+    _before: Mapping[signal.Signals, object] = {}  # number of a signal -> its handler before
 
     def start(self) -> Self:
         """Handle signals from now on."""
@@ -87,7 +86,6 @@ class StopSignals(_Signals):
     """
 
     def __init__(self, work: str, *, at_once: bool = False) -> None:
-        super().__init__()
         self._work, self._at_once = work, at_once
 
     def received(self) -> bool:

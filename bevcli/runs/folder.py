@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 from bevcli.errors import OutputError
 from bevcli.parsing.files import MIB, read_bytes
@@ -107,8 +106,19 @@ def folder_lock(out: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with output_errors(out):
             (out / OWN).mkdir(parents=True, exist_ok=True)
-            held = stack.enter_context(_locked(out / OWN / "lock", out))
-            stack.callback(_remove, held.name)
+            path, is_ours = out / OWN / "lock", False
+            while not is_ours:  # else the run before has just ended and removed its lock file
+                file = stack.enter_context(path.open("a+", errors="replace"))
+                if not lock(file.fileno()):
+                    file.seek(0)
+                    holder = file.read(500).strip() or "an unknown process"
+                    raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
+                with contextlib.suppress(FileNotFoundError):
+                    is_ours = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            file.truncate(0)
+            file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
+            file.flush()
+            stack.callback(_remove, file.name)
             if sys.platform != "win32":
                 folder = os.open(out, os.O_RDONLY)
                 stack.callback(os.close, folder)
@@ -120,22 +130,3 @@ def folder_lock(out: Path) -> Iterator[None]:
 def _remove(path: str) -> None:
     with contextlib.suppress(OSError):
         os.unlink(path)
-
-
-def _locked(path: Path, out: Path) -> IO[str]:
-    """The open lock file, which holds the number and the command of this process. Raises OutputError."""
-    while True:
-        file = path.open("a+", errors="replace")
-        if not lock(file.fileno()):
-            file.seek(0)
-            holder = file.read(500).strip() or "an unknown process"
-            file.close()
-            raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
-        file.close()  # the run before has just ended and removed its lock file
-    file.truncate(0)
-    file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
-    file.flush()
-    return file
