@@ -97,7 +97,7 @@ def remove_parts(folder: Path, parts: Iterable[str]) -> None:
 
 def check_output(path: Path, *inputs: Path) -> None:
     """Raises OutputError where a file to be written is one that the command reads."""
-    if path.exists() and any(each.exists() and path.samefile(each) for each in inputs):
+    if path.exists() and any(source.exists() and path.samefile(source) for source in inputs):
         raise OutputError(f"{path}: is the input (expected another file to write)")
 
 

@@ -59,11 +59,11 @@ class PlainCommand(TyperCommand):
         given, *_ = self.make_parser(ctx).parse_args(args=list(args))
         takes = inspect.signature(self._arguments).parameters
         parameters: list[Any] = self.get_params(ctx)
-        for each in parameters:
-            value = given.get(each.name)
+        for param in parameters:
+            value = given.get(param.name)
             empty = "" in (value if isinstance(value, list | tuple) else [value])
-            if empty and each.name in takes and _takes_path(takes[each.name].annotation):
-                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=each)
+            if empty and param.name in takes and _takes_path(takes[param.name].annotation):
+                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=param)
         rest = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:  # as for completion in a shell
             try:
@@ -75,25 +75,25 @@ class PlainCommand(TyperCommand):
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The options and the arguments, without hidden ones."""
-        shown = [each for each in self.get_params(ctx) if not getattr(each, "hidden", False)]
-        return ["[OPTIONS]", *(piece.strip("{}") for each in shown for piece in each.get_usage_pieces(ctx))]
+        shown = [param for param in self.get_params(ctx) if not getattr(param, "hidden", False)]
+        return ["[OPTIONS]", *(piece.strip("{}") for param in shown for piece in param.get_usage_pieces(ctx))]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options by panels, last those without one."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
-        for each in self.get_params(ctx):
-            is_argument = each.param_type_name == "argument"
-            panel = "Arguments" if is_argument else getattr(each, "rich_help_panel", None)
-            row = each.get_help_record(ctx)
+        for param in self.get_params(ctx):
+            is_argument = param.param_type_name == "argument"
+            panel = "Arguments" if is_argument else getattr(param, "rich_help_panel", None)
+            row = param.get_help_record(ctx)
             if row is not None:
-                name = each.metavar if is_argument and each.metavar else row[0]
+                name = param.metavar if is_argument and param.metavar else row[0]
                 panels.setdefault(panel or "Options", []).append((name, row[1]))
         panels["Options"] = panels.pop("Options", [])
         write_panels(panels, formatter)
 
 
 def _takes_path(hint: Any) -> bool:
-    return hint is Path or any(_takes_path(each) for each in get_args(hint))
+    return hint is Path or any(_takes_path(part) for part in get_args(hint))
 
 
 def write_panels(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
@@ -132,8 +132,8 @@ class _Group(TyperGroup):
         """Write the commands by panels, with the summaries of their docstrings."""
         panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
         for name, entry in entries(GROUP).items():
-            found = load(GROUP, name)
-            text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+            command = load(GROUP, name)
+            text = command.info.help if isinstance(command, typer.Typer) else command.__doc__
             summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
             panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
             panel = panel if isinstance(panel, str) else panel[name]

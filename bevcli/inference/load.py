@@ -321,9 +321,9 @@ def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torc
 
 def _engine(name: str) -> Any:
     """The class of another engine than PyTorch, see `bevcli.workshop.engines.engine.Engine`. Raises BevcliError."""
-    known = list(entries("bevcli.engines"))
-    if name not in known:
-        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *known))})")
+    engines = list(entries("bevcli.engines"))
+    if name not in engines:
+        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *engines))})")
     return load("bevcli.engines", name)
 
 

@@ -161,13 +161,13 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
 
     model: the model that the step is made with. step: makes the step once more; every module is checked meanwhile.
     """
-    found: list[str] = []
+    origins: list[str] = []
 
-    def check(value: object, place: str = "") -> None:
+    def check(value: object, part: str = "") -> None:
         tensors = [(name, tensor) for name, tensor in tensors_in(value, "history") if tensor.is_floating_point()]
         bad = [name for name, tensor in tensors if not torch.isfinite(tensor).all()]
-        if bad and not found:
-            found.append(place or f"input {bad[0]}")
+        if bad and not origins:
+            origins.append(part or f"input {bad[0]}")
 
     with ExitStack() as hooks:
         hooks.enter_context(model.register_forward_pre_hook(lambda module, arguments: check(arguments)))
@@ -176,7 +176,7 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
                 hook = module.register_forward_hook(lambda *call, name=name: check(call[2], describe(name)))
                 hooks.enter_context(hook)
         step()
-    return found[0] if found else "the whole model"
+    return origins[0] if origins else "the whole model"
 
 
 def describe(name: str) -> str:

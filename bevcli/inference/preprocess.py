@@ -78,7 +78,7 @@ class Preprocessor:
             for camera, name in present:
                 write(camera, name)
         else:
-            for task in wait([self._threads.submit(write, *each) for each in present]).done:
+            for task in wait([self._threads.submit(write, *camera) for camera in present]).done:
                 task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
@@ -94,16 +94,16 @@ class Preprocessor:
         )
 
     def _facts_of(self, rig: CameraRig) -> "_OfRig":
-        known = self._of_rig
-        if known is None or known.rig is not rig:
+        rig_facts = self._of_rig
+        if rig_facts is None or rig_facts.rig is not rig:
             bev_frame = self.config.bev_frame
             model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
             assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
             image = image_for_rig(rig, self.config.image)
             if self.pixels:
                 image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
-            known = self._of_rig = _OfRig(rig, model_rig, assignment, image)
-        return known
+            rig_facts = self._of_rig = _OfRig(rig, model_rig, assignment, image)
+        return rig_facts
 
 
 class _OfRig(NamedTuple):

@@ -257,22 +257,22 @@ def read_commands(command: str | None, config: ModelConfig) -> Commands:
     path = Path(command)
     if path.suffix != ".json":
         return one_command(command, config)
-    known = _known(command, config)
-    found = read_json(path)
-    if not isinstance(found, dict) or not found:
-        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{known[0]}"}}, by frame index)')
-    for frame, name in found.items():
-        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
-            expected = f"expected {', '.join(known)}, by frame index"
+    names = _known(command, config)
+    commands = read_json(path)
+    if not isinstance(commands, dict) or not commands:
+        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{names[0]}"}}, by frame index)')
+    for frame, name in commands.items():
+        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in names:
+            expected = f"expected {', '.join(names)}, by frame index"
             raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected})')
-    return tuple(sorted((int(frame), name) for frame, name in found.items()))
+    return tuple(sorted((int(frame), name) for frame, name in commands.items()))
 
 
 def one_command(command: str, config: ModelConfig) -> Commands:
     """A command by its name, for all frames. Raises InputError for a model that does not plan, or another name."""
-    known = _known(command, config)
-    if command not in known:
-        raise InputError(f"`command={command}`: is unknown (expected {', '.join(known)} or a FILE.json)")
+    names = _known(command, config)
+    if command not in names:
+        raise InputError(f"`command={command}`: is unknown (expected {', '.join(names)} or a FILE.json)")
     return ((0, command),)
 
 

@@ -65,7 +65,7 @@ class TrackerConfig:
         unknown = self.gates_m.keys() - {OTHER, *classes, *NUSCENES_CLASSES}
         if unknown:
             raise ValueError(f'gates_m.{min(unknown)}: the model has no class "{min(unknown)}"')
-        return replace(self, gates_m={name: one.gate_m for name, one in classes.items()} | dict(self.gates_m))
+        return replace(self, gates_m={name: of_class.gate_m for name, of_class in classes.items()} | dict(self.gates_m))
 
     def gates_of(self, classes: NDArray[np.str_]) -> Array:
         """(N,) the gates of boxes of these classes (N,), metres."""

@@ -201,11 +201,11 @@ class RunFiles:
 
 
 def _check_size(path: Path, size: int) -> None:
-    found = path.stat().st_size if path.is_file() else 0
-    if found < size:
+    size_now = path.stat().st_size if path.is_file() else 0
+    if size_now < size:
         raise OutputError(
             f"{path}: `resume`: was cut or removed since the interruption (expected {size} bytes or more, found "
-            f"{found}): pass `force=True` to start anew"
+            f"{size_now}): pass `force=True` to start anew"
         )
 
 

@@ -206,11 +206,11 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
     if _TREE not in tensors or metadata.get("sha256") != hash_of(sorted(tensors.items())):
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
 
-    def decoded(expected: type, found: Any) -> Any:
+    def decoded(expected: type, packed: Any) -> Any:
         if expected is Tensor:
-            return tensors[found]
+            return tensors[packed]
         assert get_origin(expected) is np.ndarray, expected
-        return tensors[found].numpy() if isinstance(found, str) else _strings(*found)
+        return tensors[packed].numpy() if isinstance(packed, str) else _strings(*packed)
 
     try:
         return msgspec.msgpack.decode(tensors[_TREE].numpy().tobytes(), type=kind, dec_hook=decoded)
