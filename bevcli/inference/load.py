@@ -1,11 +1,12 @@
 """`load_model`: a configured model with its weights, on a device."""
 
+import copy
 import hashlib
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
+from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes
@@ -103,6 +105,12 @@ class Model:
     def contents(self) -> dict[str, Any]:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
+
+    def for_rig(self, rig: CameraRig) -> "Model":
+        """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
+        network = copy.copy(self.network)  # the copy has the same weights
+        network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
+        return replace(self, network=network)
 
     def training_notes(self, rig: CameraRig) -> tuple[str, ...]:
         """Warnings where the rig or the model's file differs from the training; none for random weights."""

@@ -39,7 +39,6 @@ def export_onnx(
     from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
     from bevcli.workshop.engines.differences import check_exported, difference_lines
-    from bevcli.workshop.engines.export_cache import for_rig
     from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
 
     loaded = load_model(model, options=replace(model_options, device="cpu"))
@@ -48,7 +47,7 @@ def export_onnx(
         if options.cameras is not None:
             raise BevcliError("`rig` states the number of cameras: leave `cameras` out")
         rig = read_calibration(options.rig)
-        loaded, options = for_rig(loaded, rig), replace(options, cameras=len(rig.cameras))
+        loaded, options = loaded.for_rig(rig), replace(options, cameras=len(rig.cameras))
     target = file.target(Path(f"{loaded.name}.onnx"))
     drive = None if options.check is None else open_sequence(options.check, rate_hz=loaded.config.rate_hz)
     write_onnx(

@@ -4,7 +4,6 @@ The files lie in $XDG_CACHE_HOME/bevcli/engines (default ~/.cache/bevcli/engines
 so that several processes may make it at the same time. Files that nobody has used for some months are removed.
 """
 
-import copy
 import hashlib
 import json
 import os
@@ -24,7 +23,7 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor, image_for_rig
+from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.step import PreparedFrame
@@ -57,7 +56,7 @@ def exported_for_rig(
 
     open_file: of the engine. deformable_convolution: of a file for it, see `OnnxOptions`.
     """
-    sized = for_rig(model, rig)
+    sized = model.for_rig(rig)
     options = _options(sized, rig, deformable_convolution)
     exact = CachedFile(_key(sized, options, "fp32"))
 
@@ -210,10 +209,3 @@ def _cameras_per_cell(frame: PreparedFrame, model: Model) -> int:
     height, width = frame.images.shape[-2:]
     hit = Pillars(model.config.bev_grid).project(frame.image_from_bev.float(), (height, width), everywhere).hit
     return max(int(hit.sum(1).max()), OnnxOptions.cameras_per_cell)
-
-
-def for_rig(model: Model, rig: CameraRig) -> Model:
-    """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
-    network = copy.copy(model.network)  # the copy has the same weights
-    network.config = replace(model.config, image=image_for_rig(rig, model.config.image))
-    return replace(model, network=network)

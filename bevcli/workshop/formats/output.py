@@ -33,6 +33,26 @@ class DriveWriter(AbstractContextManager["DriveWriter"], Protocol):
         """Write a frame and its images. Raises InputError for one that the format cannot hold, and OutputError."""
 
 
+@contextmanager
+def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
+    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
+
+    So is the folder itself if it was missing before. Other files in it are kept.
+    Raises OutputError where the folder cannot be made.
+    """
+    is_new = not folder.exists()
+    with output_errors(folder, "created"):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            remove_parts(folder, parts)
+            if is_new:
+                folder.rmdir()
+        raise
+
+
 class FolderWriter(ExitStack):
     """Base of a `DriveWriter` of a folder: a subclass has `write` and `_finish`. After an error, its parts are deleted.
 
@@ -123,23 +143,3 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     return chosen.opener(path, sequence, options)
-
-
-@contextmanager
-def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
-    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
-
-    So is the folder itself if it was missing before. Other files in it are kept.
-    Raises OutputError where the folder cannot be made.
-    """
-    is_new = not folder.exists()
-    with output_errors(folder, "created"):
-        folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            remove_parts(folder, parts)
-            if is_new:
-                folder.rmdir()
-        raise

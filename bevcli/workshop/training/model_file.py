@@ -146,6 +146,21 @@ PRESETS: Mapping[Preset, tuple[str, Changes]] = {
 }
 
 
+def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
+    """The table [training_rigs] of a model that is trained on some rigs."""
+    rigs = [rig for rig in rigs if rig.cameras]
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    counts = [len(rig.cameras) for rig in rigs]
+    fovs = [fov_deg(camera) for camera in cameras]
+    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
+    return {
+        "cameras": [min(counts), max(counts)],
+        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
+        "height_m": [round(min(heights), 2), round(max(heights), 2)],
+        "tilt_deg": round(max(map(tilt_deg, cameras)), 1),
+    }
+
+
 def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     """The contents of a model's file for a data set.
 
@@ -379,18 +394,3 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0) if job.loaders == 1 else 0.0  # processes take seconds to start
     return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))
-
-
-def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
-    """The table [training_rigs] of a model that is trained on some rigs."""
-    rigs = [rig for rig in rigs if rig.cameras]
-    cameras = [camera for rig in rigs for camera in rig.cameras]
-    counts = [len(rig.cameras) for rig in rigs]
-    fovs = [fov_deg(camera) for camera in cameras]
-    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
-    return {
-        "cameras": [min(counts), max(counts)],
-        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
-        "height_m": [round(min(heights), 2), round(max(heights), 2)],
-        "tilt_deg": round(max(map(tilt_deg, cameras)), 1),
-    }
