@@ -13,7 +13,7 @@ from warm_python import WarmPython
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.inference.cpu_settings import keep_freed_memory
+from bevcli.inference.machine import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.model.config import ImageConfig, ModelConfig

@@ -309,7 +309,7 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     """
     device = SimulatedDevice(name)
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
-    monkeypatch.setattr("bevcli.inference.transfer.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
+    monkeypatch.setattr("bevcli.inference.pipeline.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
     monkeypatch.setattr(torch.mps, "synchronize", lambda: None)
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)

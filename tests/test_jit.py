@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import bevcli
-from bevcli.jit import is_compiled
+from bevcli.workshop.synth.commands import is_compiled
 
 CODE = "import bevcli.model.kernels.loops, bevcli.workshop.synth.renderer; print('ok')"
 

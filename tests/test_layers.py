@@ -21,7 +21,7 @@ LAYERS = (
     {"_version", "findings", "printing"},
     {"errors", "registered"},
     {"options", "registry"},
-    {"parsing", "jit", "user_folders", "waiting", "writing"},
+    {"parsing", "jit", "writing"},
     {"published"},
     {"geometry"},
     {"frame"},

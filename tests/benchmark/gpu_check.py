@@ -34,9 +34,9 @@ from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import choose_device
 from bevcli.inference.machine import describe_machine
+from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
-from bevcli.inference.transfer import image_uploader
 from bevcli.model.network import Network
 from bevcli.model.prepare import Precision, methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame

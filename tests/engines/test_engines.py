@@ -28,7 +28,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run
-from bevcli.inference.runner import Runner
+from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.registry import entries
@@ -86,7 +86,7 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     frame = drive.load(0)
     pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
     frame = replace(frame, images={"FRONT": replace(frame.images["FRONT"], pixels_bgr=pixels)})
-    runner, feeds = Runner(exported, torch.device("cpu")), []
+    runner, feeds = Runner(exported, torch.device("cpu"), StepOptions(takes_pixels=True)), []
     run_file = exported.outputs_by_name
     monkeypatch.setattr(exported, "outputs_by_name", lambda feed: feeds.append(feed) or run_file(feed))
     runner.step(None, (runner.preprocessor() if in_a_run else Preprocessor(exported.config))(frame))

@@ -35,8 +35,8 @@ from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyfr
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
-from bevcli.user_folders import user_cache
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
+from bevcli.writing import user_cache
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
 LONGEST_NAME = 80

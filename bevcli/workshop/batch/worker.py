@@ -26,8 +26,8 @@ import torch
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.inference.load import Model
+from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.parsing.files import is_there
 from bevcli.printing import reason_of, valid_text
 from bevcli.rig.sequence_checks import CheckedDrive

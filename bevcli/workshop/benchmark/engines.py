@@ -96,7 +96,7 @@ def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], No
         except BevcliError as error:
             failed.append(EngineRow(engine, precision, problem=str(error)))
         else:
-            versions[engine, precision] = Version(model.prepared, CPU)
+            versions[engine, precision] = Version(model.prepared, CPU, takes_pixels=model.is_exported)
     first = config.past_frames
     drive = MadeUpDrive(first + WARM_UP_FRAMES + frames)
     preprocessors = {name: version.runner.preprocessor() for name, version in versions.items()}

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
+from bevcli.inference.pipeline import WriteBehind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.prepare import DTYPES, Precision
@@ -172,7 +172,7 @@ def run_benchmark(
     peak_precision: Precision = "fp32" if model.precision == "int8" else model.precision
     limits = measure_limits(device, peak_precision)
     plain: Any = made_up_model(config) if model.is_exported else model.network
-    fast = Version(model.prepared, device)
+    fast = Version(model.prepared, device, takes_pixels=model.is_exported)
     first = config.past_frames
     timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + frames
     drive = MadeUpDrive(run + 2 * RUNS * max(frames, RUN_FRAMES))

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from bevcli.frame import FrameStamp, Prediction
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
+from bevcli.inference.machine import keep_freed_memory, return_freed_memory
+from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
-from bevcli.inference.stage_clock import StageClock
 from bevcli.model.bevformer_v2.bevformer_v2 import FeatureWindow
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
@@ -53,8 +53,8 @@ class Version:
         state: after the last timed step.
     """
 
-    def __init__(self, model: TemporalModel, device: torch.device) -> None:
-        self.runner = Runner(model, device, StepOptions())
+    def __init__(self, model: TemporalModel, device: torch.device, *, takes_pixels: bool = False) -> None:
+        self.runner = Runner(model, device, StepOptions(takes_pixels=takes_pixels))
         self.runner.clock = StageClock(model, device, *fine_stages(model))
         self.seconds: list[float] = []
         self.queries: QueryResults = (torch.empty(0), torch.empty(0))

@@ -30,12 +30,11 @@ from bevcli.model.step import PreparedFrame
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence, select_range
-from bevcli.user_folders import user_cache
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.export_step import DeformableConvolution
 from bevcli.workshop.engines.exported import ExportedModel
 from bevcli.workshop.engines.options import OnnxOptions
-from bevcli.writing import whole_file, write_whole
+from bevcli.writing import user_cache, whole_file, write_whole
 
 FORMAT = 1  # of the files in the cache; increase it when they change in one version of bevcli
 KEY_DIGITS = 20

@@ -47,7 +47,6 @@ class ExportedModel(TemporalModel):
     """
 
     stages: Mapping[str, str] = {"engine": "engine"}
-    takes_pixels = True
     device = torch.device("cpu")
     digest: Tensor
 

@@ -22,7 +22,7 @@ from bevcli.inference.runner import Runner
 from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
 from bevcli.runs.folder import RunFolder
-from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
+from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
 from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
@@ -236,7 +236,7 @@ class _StressRun:
         weights = self.model.weights
         return {
             "model": self.model.name,
-            "weights": {"file": weights.name if weights else "random", "hash": short_hash(self.model.weights_hash)},
+            "weights": {"file": weights.name if weights else "random", "hash": self.model.weights_hash[:DIGITS]},
             "precision": self.model.precision,
             "temporal": self.options.temporal,
             "seed": self.options.seed,

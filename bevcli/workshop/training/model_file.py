@@ -8,7 +8,7 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence as Items
+from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +25,7 @@ from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.inference.machine import peak_memory
-from bevcli.inference.training_rigs import rigs_of
+from bevcli.inference.training_rigs import fov_deg, tilt_deg
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
@@ -157,6 +157,21 @@ PRESETS: Mapping[Preset, tuple[str, Changes]] = {
     "tiny": ("tiny", _ONE_CLIP),
     "base": ("base", _ONE_CLIP),
 }
+
+
+def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
+    """The table [training_rigs] of a model that is trained on some rigs."""
+    rigs = [rig for rig in rigs if rig.cameras]
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    counts = [len(rig.cameras) for rig in rigs]
+    fovs = [fov_deg(camera) for camera in cameras]
+    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
+    return {
+        "cameras": [min(counts), max(counts)],
+        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
+        "height_m": [round(min(heights), 2), round(max(heights), 2)],
+        "tilt_deg": round(max(map(tilt_deg, cameras)), 1),
+    }
 
 
 def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:

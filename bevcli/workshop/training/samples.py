@@ -35,7 +35,7 @@ from torch import Tensor
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Sequence
-from bevcli.inference.background import read_ahead
+from bevcli.inference.pipeline import read_ahead
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs

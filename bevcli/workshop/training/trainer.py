@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError, WeightsError
-from bevcli.inference.cpu_settings import trim_memory
+from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.kernels.choose import choose_kernels
