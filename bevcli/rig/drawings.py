@@ -22,7 +22,7 @@ from bevcli.findings import Finding
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.recording.colors import Color, colormap
+from bevcli.recording.entities import Color, colormap
 from bevcli.rig.pose_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
 from bevcli.writing import whole_file

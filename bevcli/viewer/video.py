@@ -24,7 +24,7 @@ from bevcli.parsing.files import plain_name
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
-from bevcli.recording.colors import Color, class_colors, map_colors
+from bevcli.recording.entities import Color, class_colors, map_colors
 from bevcli.recording.options import has_av, require_av
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
