@@ -63,6 +63,8 @@ class FrameLog:
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
+        object_classes = recorded.model.config.object_classes
+        self._with_meshes = [name for name, settings in object_classes.items() if settings.mesh]
         self._images = log_cameras.CameraImages(stream, self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
         # Its stamps are predictions.
@@ -106,7 +108,12 @@ class FrameLog:
         if self._recorded.model.config.results:
             self._log_results(prediction, moved, cameras)
         if is_first:
-            log_static.log_curve_names(stream, prediction.stage_seconds, self._recorded.classes)
+            stages, classes, bright = list(prediction.stage_seconds), self._recorded.classes, entities.STAGE_COLORS
+            colors = [bright[i % len(bright)] for i in range(len(stages))]
+            stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
+            of_classes = rr.SeriesLines(names=list(classes), colors=list(classes.values()))
+            stream.log(entities.BOX_CURVES, of_classes, static=True)
+            stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
         seconds = np.array(list(prediction.stage_seconds.values()))
         log(stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
         self._log_events(frame, prediction)
@@ -179,7 +186,8 @@ class FrameLog:
         near = set(np.argsort(away)[: log_boxes.LABELS_IN_SCENE].tolist())
         labels = [text if i in near else "" for i, text in enumerate(texts)]
         log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
-        log_boxes.log_class_meshes(stream, in_world, self._recorded.model.config.object_classes)
+        for name in self._with_meshes:
+            log_boxes.log_class_mesh(stream, name, in_world[in_world.classes == name])
         log_boxes.log_boxes_bev(stream, shown, shown.corners(), marks, colors)
         log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, frame.stamp, bev_from_world)
         if self._geo_origin is not None:

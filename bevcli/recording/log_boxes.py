@@ -17,7 +17,7 @@ from bevcli.evaluation.matching import ScoredBoxes, descending_scores, match_gre
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.object_classes import Color, ObjectClass
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
 from bevcli.recording.components import Components, any_values, components, line_strips, log, ui_points
@@ -234,18 +234,16 @@ def _marks(corners: Array, marks: Marks) -> list[tuple[NDArray[np.float32], Colo
     return [(false, entities.FALSE_COLOR), (diagonals[marks.duplicate, 0], entities.DUPLICATE_COLOR)]
 
 
-def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
-    """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
-    for name in (name for name, settings in classes.items() if settings.mesh):
-        own = boxes[boxes.classes == name]
-        # The last one has no size: an entity without poses would show its mesh at the origin.
-        poses = components(
-            rr.InstancePoses3D,
-            translations=np.append(own.centers, [[0, 0, 0]], axis=0),
-            quaternions=np.append(quaternions(own), [[0, 0, 0, 1]], axis=0),
-            scales=np.append(own.sizes_lwh, [[0, 0, 0]], axis=0),
-        )
-        log(stream, entities.class_mesh(name), poses)
+def log_class_mesh(stream: rr.RecordingStream, name: str, boxes: Boxes3D) -> None:
+    """Writes where the mesh of a class stands: one in each box of the class. boxes: in the recording's world."""
+    # The last one has no size: an entity without poses would show its mesh at the origin.
+    poses = components(
+        rr.InstancePoses3D,
+        translations=np.append(boxes.centers, [[0, 0, 0]], axis=0),
+        quaternions=np.append(quaternions(boxes), [[0, 0, 0, 1]], axis=0),
+        scales=np.append(boxes.sizes_lwh, [[0, 0, 0]], axis=0),
+    )
+    log(stream, entities.class_mesh(name), poses)
 
 
 def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, before: Array | None) -> None:

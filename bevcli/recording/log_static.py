@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -176,7 +176,25 @@ def log_scene(
     log_mesh(stream, entities.VEHICLE, vehicle.mesh)
     strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
     stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=entities.EGO_COLOR, draw_order=40), static=True)
-    _log_rings(stream, rig, grid)
+    angles = np.linspace(0, 2 * np.pi, 121)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
+    lines = rings = [circle * distance for distance in distances]
+    if grid is not None:
+        border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
+        lines = [*rings, apply(rig.ego_from_bev, border)[:, :2]]
+    in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
+    stream.log(
+        entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*entities.RING_COLOR, 140], radii=width), static=True
+    )
+    flat = [_bev_image_points(rig, line) for line in lines]
+    stream.log(
+        entities.BEV_RINGS, rr.LineStrips2D(flat, colors=entities.RING_COLOR, radii=width, draw_order=5), static=True
+    )
+    # The labels are on the circles, ahead to the right, where they cover little.
+    positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
+    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=RING_LABEL_COLOR, draw_order=6)
+    log(stream, f"{entities.BEV_RINGS}/labels", labels, static=True)
 
 
 def default_vehicle() -> VehicleMesh:
@@ -184,27 +202,23 @@ def default_vehicle() -> VehicleMesh:
 
     It is made with NumPy, because trimesh would take half a second to load at the start of every run.
     """
-    cabin = _box(2.5, 1.66, 0.6)
+    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    cabin = _prism(square * (2.5, 1.66), 0.6)
     cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
     turns = np.arange(20) / 20 * 2 * np.pi
     wheel = _prism(0.34 * np.stack([np.cos(turns), np.sin(turns)], -1), 0.24)[..., [1, 2, 0]]
     parts = [
-        (_box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62), entities.EGO_COLOR),
+        (_prism(square * BODY_LWH[:2], BODY_LWH[2]) + (REAR_AXLE_TO_MIDDLE, 0, 0.62), entities.EGO_COLOR),
         (cabin + (1.0, 0, 1.28), GLASS),
         *((wheel + (x, y, 0.34), RUBBER) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)),
     ]
     triangles = np.concatenate([part for part, _ in parts])
-    normals = _normals(triangles)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
     return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
-
-
-def _box(length: float, width: float, height: float) -> Array:
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
-    return _prism(corners * (length, width), height)
 
 
 def _prism(outline: Array, height: float) -> Array:
@@ -215,14 +229,9 @@ def _prism(outline: Array, height: float) -> Array:
     low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
     low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
     sides = [(low, low_next, high_next), (low, high_next, high)]
-    caps = [(low[:1].repeat(len(low), 0), low_next, low), (high[:1].repeat(len(high), 0), high, high_next)]
-    triangles = np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
-    # The first and the last triangle of each cap's fan have no area.
-    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]
-
-
-def _normals(triangles: Array) -> Array:
-    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    first_low, first_high = (side[:1].repeat(len(side) - 2, 0) for side in (low, high))
+    caps = [(first_low, low[2:], low[1:-1]), (first_high, high[1:-1], high[2:])]  # fans
+    return np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
 
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
@@ -251,15 +260,6 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     )
     page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
     stream.log(entities.RUN, page, facts, static=True)
-
-
-def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
-    """Writes names and colours of the curves: seconds per stage, boxes per class, speed."""
-    stages = list(stages)
-    colors = [entities.STAGE_COLORS[i % len(entities.STAGE_COLORS)] for i in range(len(stages))]
-    stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
-    stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(classes), colors=list(classes.values())), static=True)
-    stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
 
 
 def log_pillars(
@@ -292,28 +292,6 @@ def ring_distances_m(grid: BevGrid | None) -> list[int]:
     """The radii of the range rings: every 10 m up to the nearest side of the grid."""
     reach = DEFAULT_RANGE_M if grid is None else grid.nearest_side_m
     return list(range(RING_STEP_M, int(reach) + 1, RING_STEP_M))
-
-
-def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None) -> None:
-    angles = np.linspace(0, 2 * np.pi, 121)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
-    lines = rings = [circle * distance for distance in distances]
-    if grid is not None:
-        border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
-        lines = [*rings, apply(rig.ego_from_bev, border)[:, :2]]
-    in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
-    stream.log(
-        entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*entities.RING_COLOR, 140], radii=width), static=True
-    )
-    flat = [_bev_image_points(rig, line) for line in lines]
-    stream.log(
-        entities.BEV_RINGS, rr.LineStrips2D(flat, colors=entities.RING_COLOR, radii=width, draw_order=5), static=True
-    )
-    # The labels are on the circles, ahead to the right, where they cover little.
-    positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
-    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=RING_LABEL_COLOR, draw_order=6)
-    log(stream, f"{entities.BEV_RINGS}/labels", labels, static=True)
 
 
 def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:

@@ -83,7 +83,14 @@ class RrdFile(GrowingFile):
         Raises OutputError if it could not be written, and WaitError if the disk does not answer.
         """
         deadline = time.monotonic() + TIMEOUT_S
-        while self._error is None and self._thread.is_alive() and not self._is_drained():
+        while self._error is None and self._thread.is_alive():
+            if not self._busy.acquire(timeout=TIMEOUT_S):
+                raise self._no_answer()
+            try:
+                if not select.select([self._pipe], [], [], 0)[0]:
+                    break
+            finally:
+                self._busy.release()
             if time.monotonic() > deadline:
                 raise self._no_answer()
             time.sleep(0.0005)
@@ -114,15 +121,6 @@ class RrdFile(GrowingFile):
 
     def _no_answer(self) -> WaitError:
         return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
-
-    def _is_drained(self) -> bool:
-        """True if all that is in the pipe has been written."""
-        if not self._busy.acquire(timeout=TIMEOUT_S):
-            raise self._no_answer()
-        try:
-            return not select.select([self._pipe], [], [], 0)[0]
-        finally:
-            self._busy.release()
 
     def _move_all(self, pipe: int) -> None:
         """Moves a stream into the file, until rerun closes it."""
