@@ -64,17 +64,10 @@ def ui_points(width: float) -> pa.Array:
     return rr.components.RadiusBatch(rr.Radius.ui_points(width)).as_arrow_array()
 
 
-def line_strips(strips: Sequence[Array], dimensions: int) -> pa.Array:
-    """Strips (points, 2 or 3), each with a number of points of its own."""
-    _, kind = _field(rr.LineStrips2D if dimensions == 2 else rr.LineStrips3D, "strips")
-    points = np.concatenate(strips) if len(strips) else np.zeros((0, dimensions))
-    return _lists(points, np.cumsum([0, *map(len, strips)], dtype=np.int32), kind)
-
-
-def blob(data: bytes | NDArray[np.uint8]) -> pa.Array:
-    """Bytes, such as those of a file or of an image, as one component."""
-    numbers = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else np.ascontiguousarray(data).reshape(-1)
-    return _lists(numbers, np.array([0, len(numbers)], dtype=np.int32), _field(rr.EncodedImage, "blob")[1])
+def line_strips(points: Array, lengths: Sequence[int]) -> pa.Array:
+    """Strips, each with a number of points of its own. points: (P, 2 or 3) of all of them, one after the other."""
+    _, kind = _field(rr.LineStrips2D if points.shape[1] == 2 else rr.LineStrips3D, "strips")
+    return _lists(points, np.cumsum([0, *lengths], dtype=np.int32), kind)
 
 
 @lru_cache(maxsize=64)
@@ -99,7 +92,9 @@ def _constant(archetype: Any, name: str, value: Hashable) -> pa.Array:
 def _numbers(value: NDArray[Any], kind: pa.DataType) -> pa.Array:
     if pa.types.is_uint32(kind) and value.dtype == np.uint8:
         return pa.array(packed(value))
-    if pa.types.is_list(kind):  # strips (N, points, 2 or 3)
+    if pa.types.is_list(kind):  # strips (N, points, 2 or 3), or the bytes (N,) of a file or an image
+        if value.ndim == 1:
+            return _lists(value, np.array([0, len(value)], np.int32), kind)
         offsets = np.arange(len(value) + 1, dtype=np.int32) * np.int32(value.shape[1])
         return _lists(value.reshape(-1, value.shape[2]), offsets, kind)
     is_vector = pa.types.is_fixed_size_list(kind)

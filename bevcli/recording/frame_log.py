@@ -18,7 +18,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_boxes, log_cameras, log_static
-from bevcli.recording.components import any_values, blob, components, line_strips, log, rgb_format, ui_points
+from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
 from bevcli.recording.log_cameras import PosedCamera
 
 Features = NDArray[np.float32]
@@ -369,7 +369,7 @@ def log_flat_image(
     (rows, columns, _), ((left, right), (low, high)) = image.shape, ranges
     cell = ((right - left) / columns, (high - low) / rows, 1.0)
     placed = components(rr.Transform3D, translation=(left, -high, 0), scale=cell)
-    pixels = components(rr.Image, buffer=blob(image), format=rgb_format(columns, rows), draw_order=draw_order)
+    pixels = components(rr.Image, buffer=image.reshape(-1), format=rgb_format(columns, rows), draw_order=draw_order)
     log(stream, entity, pixels | placed)
 
 
@@ -384,7 +384,7 @@ def log_on_ground(
         vertex_positions=corners,
         triangle_indices=((0, 1, 2), (0, 2, 3)),
         vertex_texcoords=((0, 1), (1, 1), (1, 0), (0, 0)),
-        albedo_texture_buffer=blob(image),
+        albedo_texture_buffer=image.reshape(-1),
         albedo_texture_format=rgb_format(image.shape[1], image.shape[0]),
         albedo_factor=(255, 255, 255, opacity),
     )
@@ -432,11 +432,11 @@ def log_ground_lines(
     """
     colors = np.array(lines.colors, np.uint8) if len(lines.colors) else None
     radii = ui_points(lines.width)
-    in_space = line_strips([strip + ABOVE_GROUND for strip in lines.strips], 3)
+    points, lengths = np.concatenate([np.zeros((0, 3)), *lines.strips]), list(map(len, lines.strips))
+    in_space = line_strips(points + ABOVE_GROUND, lengths)
     solid = components(rr.LineStrips3D, strips=in_space, colors=colors, radii=radii)
     log(stream, f"{entities.WORLD}/{kind}", solid)
-    bev_from_world = inverse(world_from_bev)
-    flat = line_strips([apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in lines.strips], 2)
+    flat = line_strips(apply(inverse(world_from_bev), points)[:, :2] * (1, -1), lengths)
     from_above = components(rr.LineStrips2D, strips=flat, colors=colors, radii=radii, draw_order=24)
     log(stream, f"{entities.BEV}/{kind}", from_above)
     pieces = [np.stack([strip[:-1], strip[1:]], axis=1) for strip in lines.strips]

@@ -204,9 +204,9 @@ def footprints(corners: Array) -> pa.Array:
     corners: (N, 8, 3). Returns N closed outlines, then N lines from the centre to the front.
     """
     ground = corners[:, :4, :2] * (1, -1)
-    outlines = np.concatenate([ground, ground[:, :1]], axis=1)
-    front = (ground[:, 0] + ground[:, 3]) / 2
-    return line_strips([*outlines, *np.stack([ground.mean(1), front], axis=1)], 2)
+    outlines = ground[:, [0, 1, 2, 3, 0]].reshape(-1, 2)
+    directions = np.stack([ground.mean(1), (ground[:, 0] + ground[:, 3]) / 2], axis=1).reshape(-1, 2)
+    return line_strips(np.concatenate([outlines, directions]), [5] * len(ground) + [2] * len(ground))
 
 
 def _solid(boxes: Boxes3D, **fields: Any) -> Components:
@@ -284,17 +284,13 @@ class TrackHistory:
     shown: list[str] = field(default_factory=list)
 
     def add(self, identities: list[str], feet: Array, stamp: FrameStamp) -> None:
-        """Adds the positions of a frame, and forgets what is too old.
-
-        identities: N texts, "" for a box without a track. feet: (N, 3) on the ground, in the recording's world.
-        """
+        """Adds the positions of T tracks, and forgets what is too old. feet: (T, 3), in the recording's world."""
         if stamp.scene != self.scene:
             self.times_ns, self.positions = {}, {}
         self.scene = stamp.scene
         for name, foot in zip(identities, feet, strict=True):
-            if name:
-                self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
-                self.positions.setdefault(name, []).append(foot)
+            self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
+            self.positions.setdefault(name, []).append(foot)
         for name, times in list(self.times_ns.items()):
             kept = sum(stamp.timestamp_ns - time <= PAST_S * 1e9 for time in times)
             self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
@@ -320,36 +316,41 @@ def log_tracks(
         return
     # Anew in each scene: the times of a scene may lie before those of the one before.
     styled = history.shown if stamp.scene == history.scene else []
-    identities, classes = boxes.instances.tolist(), boxes.classes.tolist()
-    heights = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2 + ABOVE_GROUND_M
-    feet = np.column_stack([boxes.centers[:, :2], heights])
+    tracked = boxes.instances != ""
+    identities, classes = boxes.instances[tracked].tolist(), boxes.classes[tracked].tolist()
+    centers, velocities = boxes.centers[tracked], np.nan_to_num(boxes.velocities[tracked])
+    feet = np.column_stack([centers[:, :2], centers[:, 2] - boxes.sizes_lwh[tracked, 2] / 2 + ABOVE_GROUND_M])
     history.add(identities, feet, stamp)
-    steps = np.pad(np.nan_to_num(boxes.velocities), ((0, 0), (0, 1))) * AHEAD_S
-    ahead = np.stack([feet, feet + steps], axis=1)  # (N, 2, 3) to where each will be a second later
-    bottoms = corners[:, :4] + [0, 0, ABOVE_GROUND_M]
-    outlines = np.concatenate([bottoms, bottoms[:, :1]], axis=1)  # (N, 5, 3) closed
+    feet_later = feet + np.column_stack([velocities, np.zeros(len(feet))]) * AHEAD_S
+    ahead = np.stack([feet, feet_later], axis=1)  # (T, 2, 3)
+    outlines = corners[tracked][:, [0, 1, 2, 3, 0]] + [0, 0, ABOVE_GROUND_M]  # (T, 5, 3) closed
+    pasts = [history.positions[name] for name in identities]
+    trails = [np.array(past if len(past) > 1 else []).reshape(-1, 3) for past in pasts]  # (K, 3) each
+    no_points = np.zeros((0, 3))
+    points = [part for of_track in zip(ahead, outlines, trails, strict=True) for part in of_track]
+    lengths = [length for trail in trails for length in (2, 5, len(trail)) if length]
+    of_tracks, start = line_strips(np.concatenate([no_points, *points]), lengths), 0
     shown: set[str] = set()
-    drawn, flat_colors = [], []
-    for i, name in enumerate(identities):
-        if not name:
-            continue
-        entity = entities.track(classes[i], name)
-        past = np.array(history.positions[name])  # (K, 3)
-        trail = [past] if len(past) > 1 else []
-        row = components(rr.LineStrips3D, strips=line_strips([ahead[i], outlines[i], *trail], 3))
-        own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+    flat_colors: list[tuple[int, ...]] = []
+    for name, class_name, color, trail in zip(identities, classes, colors[tracked].tolist(), trails, strict=True):
+        count = 3 if len(trail) else 2
+        entity = entities.track(class_name, name)
+        row = components(rr.LineStrips3D, strips=of_tracks.slice(start, count))
+        own_colors = [(*color, opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
             row |= components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
             row |= any_values(track=name)
         log(stream, entity, row)
         shown.add(entity)
-        drawn += [ahead[i], *trail]
-        flat_colors += own_colors[:: 2 if trail else 3]
+        start += count
+        flat_colors += own_colors[: count - 1]
+    points = [part for of_track in zip(ahead, trails, strict=True) for part in of_track]
+    flat = apply(bev_from_world, np.concatenate([no_points, *points]))[:, :2] * (1, -1)
+    lengths = [length for trail in trails for length in (2, len(trail)) if length]
     of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
-    flat = apply(bev_from_world, np.concatenate([np.zeros((0, 3)), *drawn]))[:, :2] * (1, -1)
-    strips = line_strips(np.split(flat, np.cumsum([len(strip) for strip in drawn])[:-1]) if drawn else (), 2)
-    trails = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
-    log(stream, entities.BEV_TRACKS, trails)
+    strips = line_strips(flat, lengths)
+    of_bev = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
+    log(stream, entities.BEV_TRACKS, of_bev)
     for entity in set(history.shown) - shown:
         stream.log(entity, rr.Clear(recursive=False))
     history.shown = sorted(shown)

@@ -16,7 +16,7 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.components import Components, blob, components, log, ui_points
+from bevcli.recording.components import Components, components, log, ui_points
 
 NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
@@ -68,10 +68,23 @@ def lines_in_images(corners: Array, cameras: Sequence[PosedCamera]) -> list[Imag
     corners: (N, 8, 3) of the boxes in the recording's world.
     """
     of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])
-    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1))
+    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1) & ~_are_beside(of_cameras, cameras))
     edges = of_cameras[camera, before][:, _EDGES]  # (K, 14, 2, 3)
     counts = np.bincount(camera, minlength=len(cameras)) * len(_EDGES)
     return cut_to_images(edges.reshape(-1, 2, 3), np.repeat(before, len(_EDGES)), counts, cameras)
+
+
+def _are_beside(corners: Array, cameras: Sequence[PosedCamera]) -> NDArray[np.bool_]:
+    """(C, N) bool: boxes that project to one side of the image as a whole, by a pixel at least; never with distortion.
+
+    corners: (C, N, 8, 3) in the frame of each camera. A side of the image is a plane through the camera.
+    """
+    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
+    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
+    pixels, depth = corners @ intrinsics[:, None], corners[..., 2:]  # pixels times depth, (C, N, 8, 2)
+    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
+    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
+    return beside.any(-1) & is_straight[:, None]
 
 
 def cut_to_images(
@@ -244,7 +257,8 @@ class CameraImages:
             if contents is None or media_type is None:
                 _, jpeg = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
                 contents, media_type = jpeg.tobytes(), "image/jpeg"
-            log(self.stream, entity, components(rr.EncodedImage, blob=blob(contents), media_type=media_type))
+            data = np.frombuffer(contents, np.uint8)
+            log(self.stream, entity, components(rr.EncodedImage, blob=data, media_type=media_type))
 
     def close(self) -> None:
         """Ends all video streams."""

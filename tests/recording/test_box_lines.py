@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.recording.log_cameras import NEAR_CLIP_M, PosedCamera, clip_near, clip_to_image, lines_in_images
 
@@ -56,6 +56,25 @@ def test_a_box_ahead_is_where_the_pinhole_model_projects_it():
     # Its nearest face is 9 m away and 2 m wide: 400 px/m at 1 m, 44.4 px at 9 m to each side.
     np.testing.assert_allclose(lines.segments.reshape(-1, 2).max(0), [320 + 400 / 9, 180 + 400 / 9])
     assert set(lines.owners) == {0}
+
+
+def test_every_box_of_which_an_edge_is_inside_the_image_is_drawn():
+    random = np.random.default_rng(0)
+    count = 400
+    sizes, yaws = random.uniform(0.5, 12, (count, 3)), random.uniform(-np.pi, np.pi, count)
+    boxes = Boxes3D(random.normal(size=(count, 3)) * 12, sizes, yaws, np.zeros((count, 2)), np.array(["car"] * count))
+    (lines,) = lines_in_images(boxes.corners(), [AT_ORIGIN])
+    shares = np.linspace(0, 1, 200)[:, None]
+    expected = set()
+    for index, corners in enumerate(boxes.corners()):
+        for start, end in BOX_EDGES:
+            x, y, z = (corners[start] + shares * (corners[end] - corners[start])).T
+            ahead = z > NEAR_CLIP_M
+            u, v = 320 + 400 * x[ahead] / z[ahead], 180 + 400 * y[ahead] / z[ahead]
+            if ((u > 0) & (u < 640) & (v > 0) & (v < 360)).any():
+                expected.add(index)
+    assert 50 < len(expected) < 350
+    assert expected <= set(lines.owners)
 
 
 def test_a_distorted_edge_is_curved():
