@@ -168,7 +168,7 @@ class FrameLog:
         moved_from_ego = moved @ prediction.world_from_ego.matrix
         world_from_bev = moved_from_ego @ prediction.ego_from_bev
         bev_from_world = inverse(world_from_bev)
-        marks = log_boxes.false_and_duplicate(shown, None)
+        marks, drawn_truth = log_boxes.false_and_duplicate(shown, None), None
         if frame.ground_truth is not None:
             truth = frame.ground_truth.transformed(moved).transformed(bev_from_world)
             truth = log_boxes.detectable(truth, prediction.grid)
@@ -179,7 +179,7 @@ class FrameLog:
                 found = marks.found | other
             in_world, colors = truth.transformed(world_from_bev), log_boxes.ground_truth_colors(found, other)
             log_boxes.log_ground_truth(stream, in_world, truth.corners(), found, colors)
-            log_cameras.log_boxes_in_images(stream, cameras, in_world.corners(), colors, "ground_truth")
+            drawn_truth = in_world.corners(), colors
         in_world, colors = shown.transformed(world_from_bev), log_boxes.box_colors(shown, classes)
         corners, texts = in_world.corners(), log_cameras.box_labels(shown)
         away = np.linalg.norm(in_world.centers[:, :2] - moved_from_ego[:2, 3], axis=-1)
@@ -193,7 +193,7 @@ class FrameLog:
         if self._geo_origin is not None:
             centers = apply(prediction.world_from_ego.matrix @ prediction.ego_from_bev, shown.centers)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, centers, colors if len(shown) else None)
-        log_cameras.log_boxes_in_images(stream, cameras, corners, colors, "boxes", texts)
+        log_cameras.log_boxes_in_images(stream, cameras, corners, colors, texts, drawn_truth)
         counts = np.array([(shown.classes == name).sum() for name in classes])
         log(stream, entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 

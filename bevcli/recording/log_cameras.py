@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,6 @@ NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project fa
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
-LINE_WIDTH, DRAW_ORDER = {"boxes": 1.0, "ground_truth": 0.6}, {"boxes": 30, "ground_truth": 20}  # by kind of boxes
 LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 # Of the image's width and height, for a view that is a third of the screen wide.
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
@@ -126,14 +125,15 @@ def clip_to_image(segments: Array, width: ArrayLike, height: ArrayLike) -> tuple
     A line whose start or end is NaN counts as outside. width, height: of the image, or (M,) of the image of each line.
     """
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
-    slope = np.concatenate([-step, step], axis=-1)  # (M, 4): against left, top, right, bottom
-    room = np.concatenate([start, np.stack([width, height], axis=-1) - start], axis=-1)
+    (x, y), (x_step, y_step) = start.T, step.T
+    slope = np.stack([-x_step, -y_step, x_step, y_step])  # (4, M): against left, top, right, bottom
+    room = np.stack([x, y, width - x, height - y])
     with np.errstate(divide="ignore", invalid="ignore"):
         share = room / slope
-    enter = np.max(np.where(slope < 0, share, 0.0), axis=-1, initial=0.0)
-    leave = np.min(np.where(slope > 0, share, 1.0), axis=-1, initial=1.0)
-    outside = ((slope == 0) & (room < 0)).any(-1)
-    kept = (enter < leave) & ~outside & np.isfinite(segments).all((-1, -2))
+    enter = np.max(np.where(slope < 0, share, 0.0), axis=0, initial=0.0)
+    leave = np.min(np.where(slope > 0, share, 1.0), axis=0, initial=1.0)
+    outside = ((slope == 0) & (room < 0)).any(0)
+    kept = (enter < leave) & ~outside & np.isfinite(slope).all(0) & np.isfinite(room).all(0)
     shares = np.stack([enter, leave], axis=-1)
     return start[:, None] + shares[..., None] * step[:, None], kept
 
@@ -169,8 +169,9 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
     Returns the centres of the labels (L, 2), pixels, and the boxes (L,) that they belong to.
     """
     boxes, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
-    lows = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
-    highs = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
+    ends = lines.segments.reshape(-1, 2)
+    lows = np.minimum.reduceat(ends, 2 * first).tolist() if len(first) else ()
+    highs = np.maximum.reduceat(ends, 2 * first).tolist() if len(first) else ()
     rectangles = zip(boxes.tolist(), lows, highs, strict=True)
     taken: list[tuple[float, float, float, float]] = []
     centers, owners = [], []
@@ -178,7 +179,7 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
         if high[1] - low[1] < LOWEST_LABELLED * height:
             break
         half = len(texts[owner]) * LETTER_WIDTH * width / 2
-        middle = float(np.clip((low[0] + high[0]) / 2, half, width - half))
+        middle = min(max((low[0] + high[0]) / 2, half), width - half)
         left, top, right, bottom = middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1]
         if not any(left < other[2] and other[0] < right and top < other[3] and other[1] < bottom for other in taken):
             taken.append((left, top, right, bottom))
@@ -271,22 +272,31 @@ def log_boxes_in_images(
     cameras: Sequence[PosedCamera],
     corners: Array,
     colors: NDArray[np.uint8],
-    kind: Literal["boxes", "ground_truth"],
-    texts: list[str] | None = None,
+    texts: list[str],
+    truth: tuple[Array, NDArray[np.uint8]] | None,
 ) -> None:
-    """Draws boxes into the images: lines, and labels if there are any.
+    """Draws predicted boxes with labels, and ground-truth boxes, into the images.
 
-    corners: (N, 8, 3) in the recording's world. colors: (N, 3). texts: the label of each box.
+    corners: (N, 8, 3) in the recording's world. colors: (N, 3). texts: N labels. truth: corners (M, 8, 3) and colours
+    (M, 3) of ground-truth boxes; None without ground truth.
     """
-    width, order = ui_points(LINE_WIDTH[kind]), DRAW_ORDER[kind]
-    for posed, lines in zip(cameras, lines_in_images(corners, cameras), strict=True):
-        camera, own = posed.camera, colors[lines.owners]
-        strips = components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=width, draw_order=order)
-        log(stream, entities.overlay(camera.name, kind), strips)
-        if texts is not None:
-            positions, owners = labels_in_image(lines, texts, camera.width, camera.height)
-            labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-            log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
+    true_corners, true_colors = (corners[:0], colors[:0]) if truth is None else truth
+    all_corners, all_colors = np.concatenate([corners, true_corners]), np.concatenate([colors, true_colors])
+    for posed, lines in zip(cameras, lines_in_images(all_corners, cameras), strict=True):
+        camera, count = posed.camera, np.searchsorted(lines.owners, len(corners))
+        predicted = ImageLines(lines.segments[:count], lines.owners[:count])
+        true = ImageLines(lines.segments[count:], lines.owners[count:])
+        log(stream, entities.overlay(camera.name, "boxes"), _strips(predicted, all_colors, 1.0, draw_order=30))
+        positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
+        labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
+        log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
+        if truth is not None:
+            log(stream, entities.overlay(camera.name, "ground_truth"), _strips(true, all_colors, 0.6, draw_order=20))
+
+
+def _strips(lines: ImageLines, colors: NDArray[np.uint8], width: float, draw_order: int) -> Components:
+    own, radii = colors[lines.owners], ui_points(width)
+    return components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=radii, draw_order=draw_order)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
@@ -294,10 +304,12 @@ def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world
 
     points_world: (K, 3) in the recording's world, metres. colors: (K,) of `packed`.
     """
-    pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
+    points = apply(posed.camera_from_world, points_world)
+    ahead = points[:, 2] > 0
+    pixels, depth = posed.camera.project(points[ahead])
     hits = posed.camera.contains(pixels, depth)
-    points = components(rr.Points2D, positions=pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
-    log(stream, entities.overlay(posed.camera.name, "pillars"), points)
+    row = components(rr.Points2D, positions=pixels[hits], colors=colors[ahead][hits], radii=POINT, draw_order=10)
+    log(stream, entities.overlay(posed.camera.name, "pillars"), row)
 
 
 def log_samples(stream: rr.RecordingStream, posed: PosedCamera, samples: Sequence[CameraSamples]) -> None:
