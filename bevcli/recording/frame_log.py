@@ -82,10 +82,11 @@ class FrameLog:
         return None if self._kept.origin is None else deepcopy(self._kept)
 
     def finish(self) -> None:
-        """Logs what waits for later frames."""
+        """Logs what waits for later frames, and ends the video streams."""
         if self._bev_images is not None:
             self._log_bev_images(self._bev_images.finish())
-        self._images.close()
+        for encoder in self._images.encoders.values():
+            encoder.close()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Logs one frame: images, shown boxes, ground truth, curves, events and the model's internals."""

@@ -258,13 +258,8 @@ class CameraImages:
             if contents is None or media_type is None:
                 _, jpeg = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
                 contents, media_type = jpeg.tobytes(), "image/jpeg"
-            data = np.frombuffer(contents, np.uint8)
-            log(self.stream, entity, components(rr.EncodedImage, blob=data, media_type=media_type))
-
-    def close(self) -> None:
-        """Ends all video streams."""
-        for encoder in self.encoders.values():
-            encoder.close()
+            file = np.frombuffer(contents, np.uint8)
+            log(self.stream, entity, components(rr.EncodedImage, blob=file, media_type=media_type))
 
 
 def log_boxes_in_images(
@@ -283,20 +278,18 @@ def log_boxes_in_images(
     true_corners, true_colors = (corners[:0], colors[:0]) if truth is None else truth
     all_corners, all_colors = np.concatenate([corners, true_corners]), np.concatenate([colors, true_colors])
     for posed, lines in zip(cameras, lines_in_images(all_corners, cameras), strict=True):
-        camera, count = posed.camera, np.searchsorted(lines.owners, len(corners))
+        camera, count = posed.camera, int(np.searchsorted(lines.owners, len(corners)))
+        parts = [("boxes", slice(0, count), 1.0, 30)]
+        if truth is not None:
+            parts.append(("ground_truth", slice(count, None), 0.6, 20))
+        for kind, part, width, order in parts:
+            segments, own, radii = lines.segments[part], all_colors[lines.owners[part]], ui_points(width)
+            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=order)
+            log(stream, entities.overlay(camera.name, kind), strips)
         predicted = ImageLines(lines.segments[:count], lines.owners[:count])
-        true = ImageLines(lines.segments[count:], lines.owners[count:])
-        log(stream, entities.overlay(camera.name, "boxes"), _strips(predicted, all_colors, 1.0, draw_order=30))
         positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
         labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
         log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
-        if truth is not None:
-            log(stream, entities.overlay(camera.name, "ground_truth"), _strips(true, all_colors, 0.6, draw_order=20))
-
-
-def _strips(lines: ImageLines, colors: NDArray[np.uint8], width: float, draw_order: int) -> Components:
-    own, radii = colors[lines.owners], ui_points(width)
-    return components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=radii, draw_order=draw_order)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
