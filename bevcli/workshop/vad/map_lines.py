@@ -12,8 +12,13 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.recording.colors import map_colors
-from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
+from bevcli.recording.entities import map_colors
+from bevcli.sequences.files.incremental_json import (
+    IncrementalJson,
+    read_frames,
+    stamp_from_json,
+    stamp_to_json,
+)
 from bevcli.sequences.files.json_fields import array_of_numbers
 
 FORMAT = "bevcli-map-lines/1"
