@@ -19,9 +19,9 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.load import Model, installed_engines, load_model
 from bevcli.inference.run import Session, run
 from bevcli.sequences.open import select_range
-from bevcli.workshop.engines import export_cache as module
-from bevcli.workshop.engines.engine import OnnxRuntimeEngine, OpenVinoEngine, load_exported
-from bevcli.workshop.engines.export_cache import CachedFile, cache_folder
+from bevcli.workshop.engines import engine as module
+from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine, cache_folder
+from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from memory_drive import MemorySequence, make_rig

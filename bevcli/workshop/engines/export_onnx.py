@@ -30,8 +30,8 @@ from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
 from bevcli.printing import counted
+from bevcli.workshop.engines import OnnxOptions
 from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
-from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import check_output, whole_file
 
 EXPORTERS = ("onnx", "onnxscript")  # packages that write the file
