@@ -17,7 +17,7 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.batch.options import BatchOptions, ReproduceOptions, Workers
+from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model
@@ -57,7 +57,6 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.sequences.nuscenes.format import NuScenesOptions
     from bevcli.workshop.batch.job import Job, all_own_options, find_drives, read_list, with_absolute_paths
     from bevcli.workshop.batch.storage import is_url
 

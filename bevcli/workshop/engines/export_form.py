@@ -313,13 +313,15 @@ class WindowForm(ExportForm):
             torch.zeros_like(current.has_image),
             current.image_size,
         )
-        earlier = [one or absent for one in frames_at(past, indices, prepared)]
+        earlier = [frame or absent for frame in frames_at(past, indices, prepared)]
         feed = camera_feed(current) | {
-            "image_from_bev": torch.stack([*(one.image_from_bev for one in earlier), current.image_from_bev], dim=1),
-            "has_image": torch.stack([*(one.has_image for one in earlier), current.has_image], dim=1),
+            "image_from_bev": torch.stack(
+                [*(frame.image_from_bev for frame in earlier), current.image_from_bev], dim=1
+            ),
+            "has_image": torch.stack([*(frame.has_image for frame in earlier), current.has_image], dim=1),
         }
         if earlier:
-            feed["previous_features"] = torch.stack([one.image_features.tokens for one in earlier])
+            feed["previous_features"] = torch.stack([frame.image_features.tokens for frame in earlier])
         return feed
 
     def memory(

@@ -186,36 +186,25 @@ def check_exported(
 
     Raises WeightsError where the file cannot be loaded, InputError where a frame cannot be read.
     """
+    cpu = torch.device("cpu")
     network: TemporalModel
     if isinstance(reference, Path):
         network = load_exported(reference, engine)
     else:
-        network = prepare_for_inference(reference.network, torch.device("cpu"))
+        network = prepare_for_inference(reference.network, cpu)
     exported = load_exported(file, engine)
     preprocess = Preprocessor(exported.config)  # of the exported file, whose images have one size
-    frames = (preprocess(sequence.load(index)) for index in range(len(sequence.stamps)))
-    for prepared, ours, theirs in paired_steps(network, exported, frames):
-        yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
-
-
-def paired_steps(
-    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
-) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
-    """Step two versions of a model on the CPU over the same frames, each with its own history.
-
-    Yields each frame that has an image, and the outputs of both.
-    """
-    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
+    runners = [Runner(model, cpu) for model in (network, exported)]
     states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
     outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
     with contextlib.ExitStack() as hooks:
         for runner in runners:
             hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
             hooks.enter_context(hook)
-        for prepared in frames:
+        for prepared in map(preprocess, map(sequence.load, range(len(sequence.stamps)))):
             if prepared.frame.images:
                 states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
-                yield prepared, outputs[runners[0]], outputs[runners[1]]
+                yield compare_outputs(prepared.frame.stamp.index, *(outputs[runner] for runner in runners))
 
 
 def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:

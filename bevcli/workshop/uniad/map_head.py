@@ -377,8 +377,8 @@ def merge_map(outputs: MapOutputs, config: MapHeadConfig, grid: BevGrid) -> Merg
     A cell has a stuff class where its mask is larger than `config.min_mask`. Things are written by falling score, with
     the rules of the released code: see `_merge_things`.
     """
-    found = (outputs.thing_masks, outputs.stuff_masks, outputs.scores)
-    masks, stuff, scores = (each[0].detach().float() for each in found)
+    columns = (outputs.thing_masks, outputs.stuff_masks, outputs.scores)
+    masks, stuff, scores = (column[0].detach().float() for column in columns)
     labels, shape = outputs.labels[0], (grid.rows, grid.columns)
     scores, order = thing_scores(masks, scores, config.min_mask).sort(descending=True)
     order = order[scores >= config.min_score]

@@ -278,8 +278,8 @@ class UniAD(BEVFormer):
             tracks, motion = memory.tracks.to(device), _motion(prepared, memory, device)
         outputs: UniADOutputs = self(inputs, history, tracks, motion)
         rig, stamp = frame.rig, frame.stamp
-        known = TrackMemory(outputs.bev, outputs.tracks, frame.world_from_ego, rig.ego_from_bev, stamp.timestamp_ns)
-        return outputs, known
+        after = TrackMemory(outputs.bev, outputs.tracks, frame.world_from_ego, rig.ego_from_bev, stamp.timestamp_ns)
+        return outputs, after
 
     def restarted(self, memory: TrackMemory) -> TrackMemory:
         """See `TemporalModel`: the next identity, and the pose for EgoMotionConfig.first_frame "original"."""

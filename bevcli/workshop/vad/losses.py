@@ -78,9 +78,9 @@ def frame_truth(frame: Frame, sequence: Sequence, index: int, config: VADConfig)
     boxes = with_true_futures(boxes, frame.stamp, later, times)
     driven = np.full((len(times), 2), np.nan)
     for step, seconds in enumerate(times):
-        there = later.after(frame.stamp, seconds)
-        if there is not None and there.world_from_ego is not None:
-            driven[step] = apply(bev_from_world, (there.world_from_ego.matrix @ frame.rig.ego_from_bev)[:3, 3])[:2]
+        future = later.after(frame.stamp, seconds)
+        if future is not None and future.world_from_ego is not None:
+            driven[step] = apply(bev_from_world, (future.world_from_ego.matrix @ frame.rig.ego_from_bev)[:3, 3])[:2]
     boxes = boxes_inside(boxes.transformed(bev_from_world), config)
     known = driven[np.isfinite(driven).all(-1)]
     return FrameTruth(boxes, lines, driven, followed(known, config.commands) if len(known) else "")
@@ -194,7 +194,7 @@ def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> tuple[Tens
         return lines[scores[:, classes.index(name)] >= SURE] if name in classes else lines[:0]
 
     best, labels = outputs.class_logits[-1, element].sigmoid().max(-1)  # (Q,)
-    is_vehicle = torch.tensor([one.vehicle for one in config.object_classes.values()], device=start.device)
+    is_vehicle = torch.tensor([kind.vehicle for kind in config.object_classes.values()], device=start.device)
     seen = (best >= SURE) & is_vehicle[labels]
     modes = outputs.motion.mode_logits[element, seen].argmax(-1)
     offsets = outputs.motion.offsets[element, seen, modes]  # (V, T, 2)
@@ -341,7 +341,7 @@ def _layer_loss(
     at, wanted = torch.cat(matched), torch.cat(true)  # (K, P, 2)
     classes = weights.line_class * focal_loss(logits, class_targets).sum()
     distances = weights.line_points * F.l1_loss(at, wanted, reduction="sum")
-    segments, true_segments = (each.diff(dim=1) * extent_m for each in (at, wanted))
+    segments, true_segments = (points.diff(dim=1) * extent_m for points in (at, wanted))
     turned = weights.line_direction * (1 - F.cosine_similarity(segments, true_segments, dim=-1)).sum()
     return torch.stack([classes, distances, turned]) / max(len(at), 1)
 

@@ -270,7 +270,7 @@ def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
 def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
     """The line_decoder.max_lines lines with the best scores, by falling score, bev frame; see `best_classes`."""
     decoder = config.line_decoder
-    scores, queries, labels = (each[0] for each in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
+    scores, queries, labels = (column[0] for column in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
     points = line_places(outputs.lines.points[-1, 0, queries], config)  # (K, P, 2)
     return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
 
