@@ -22,7 +22,7 @@ OWN: dict[Group, dict[str, str]] = {
         "constant_parts UniAD": "bevcli.workshop.uniad.uniad:fix_nothing",
         "constant_parts VAD": "bevcli.workshop.vad.vad:fix_first_attentions",
         "export_form BEVFormer": "bevcli.workshop.engines.export_form:RecurrentForm",
-        "export_form BEVFormerV2": "bevcli.workshop.engines.export_form:window_form",
+        "export_form BEVFormerV2": "bevcli.workshop.engines.export_form:WindowForm",
         "export_form UniAD": "bevcli.workshop.uniad.uniad:refuse_export",
         "exported_outputs VAD": "bevcli.workshop.vad.vad:exported_outputs",
         "training_heads VAD": "bevcli.workshop.vad.losses:HEADS",

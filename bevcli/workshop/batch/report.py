@@ -141,19 +141,19 @@ def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -
     scored = [record for record in records if record.get("scores")]
     if not scored:
         return None
+
+    def read(record: Record) -> DriveMatches:
+        with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+            return load_state(path, DriveMatches)
+
     with ThreadPoolExecutor(READING_THREADS) as pool:
-        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+        matches = list(pool.map(read, scored))
     range_m = model.bev_grid.nearest_side_m
     config = DetectionConfig.of(model.object_classes).cut_at(range_m)
     notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
     if not are_nuscenes(model.object_classes):
         notes.append(OWN_CLASSES)
     return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
-
-
-def _read_matches(out: Storage, record: Record) -> DriveMatches:
-    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
-        return load_state(path, DriveMatches)
 
 
 def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> FrameScores:

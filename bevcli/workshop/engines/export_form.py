@@ -266,9 +266,15 @@ class WindowForm(ExportForm):
 
     step = WindowStep
 
-    def __init__(self, config: ModelConfig, cameras: int, frames: tuple[int, ...]) -> None:
+    def __init__(self, config: BEVFormerV2Config, cameras: int) -> None:
+        """Raises BevcliError for a model that looks at later frames."""
+        if config.later_frames:
+            raise BevcliError(
+                f"{config.name}: a model that looks at later frames cannot be exported: frames is "
+                f"{list(config.frames)} (expected a window that ends with 0, the current frame)"
+            )
         super().__init__(config, cameras)
-        self.frames = frames
+        self.frames = config.frames
 
     @property
     def inputs(self) -> tuple[Port, ...]:
@@ -344,13 +350,3 @@ class WindowForm(ExportForm):
 
 def _listed(frames: tuple[int, ...]) -> str:
     return ", ".join(map(str, frames))
-
-
-def window_form(config: BEVFormerV2Config, cameras: int) -> WindowForm:
-    """The form of a model. Raises BevcliError for one that looks at later frames."""
-    if config.later_frames:
-        raise BevcliError(
-            f"{config.name}: a model that looks at later frames cannot be exported: frames is "
-            f"{list(config.frames)} (expected a window that ends with 0, the current frame)"
-        )
-    return WindowForm(config, cameras, config.frames)

@@ -271,14 +271,9 @@ def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
     """The line_decoder.max_lines lines with the best scores, by falling score, bev frame; see `best_classes`."""
     decoder = config.line_decoder
     scores, queries, labels = (column[0] for column in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
-    points = line_places(outputs.lines.points[-1, 0, queries], config)  # (K, P, 2)
-    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
-
-
-def line_places(points: Tensor, config: VADConfig) -> Array:
-    """Points of lines (..., 2), 0 to 1 over the range -> metres, bev frame."""
     (x0, x1), (y0, y1) = config.bev_grid.x_range_m, config.bev_grid.y_range_m
-    return _array(points) * (x1 - x0, y1 - y0) + (x0, y0)
+    points = _array(outputs.lines.points[-1, 0, queries]) * (x1 - x0, y1 - y0) + (x0, y0)  # (K, P, 2)
+    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
 
 
 def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
