@@ -308,7 +308,7 @@ class CachedFile:
     @property
     def path(self) -> Path:
         """The exported file."""
-        return cache_folder() / f"{self.key}.onnx"
+        return user_cache() / "engines" / f"{self.key}.onnx"
 
     @property
     def stamp(self) -> tuple[object, ...]:
@@ -360,13 +360,7 @@ def _load(file: CachedFile, open_file: Open, stamp: object) -> tuple[ExportedMod
     return file.load(open_file) if stamp else None
 
 
-def cache_folder() -> Path:
-    """The folder of exported files."""
-    return user_cache() / "engines"
-
-
 def _remove_unused(folder: Path) -> None:
-    """Remove files that were not used for a long time."""
     for path in folder.glob("*.onnx") if folder.is_dir() else ():
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > UNUSED_S:
