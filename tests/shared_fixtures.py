@@ -23,10 +23,8 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.viewer import recording_file
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig
-from bevcli.workshop.vad.motion_head import MotionConfig
-from bevcli.workshop.vad.vad import VAD
+from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
+from bevcli.workshop.vad.vad import VAD, VADConfig
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -47,11 +47,11 @@ WINGS: dict[str, set[str]] = {
     "engines": set(),
     "formats": set(),
     "robustness": {"calibration", "synth"},
-    "synth": {"formats", "vad"},
+    "synth": {"formats"},
     "scores": set(),
     "training": {"synth"},
     "uniad": set(),
-    "vad": {"engines", "training"},
+    "vad": {"formats", "training"},
 }
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

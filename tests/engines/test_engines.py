@@ -33,9 +33,9 @@ from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
+from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs, step_of_file
@@ -305,7 +305,7 @@ def watch(event, arguments):
         print("CONNECTION", event, arguments, file=sys.stderr)
 sys.addaudithook(watch)
 from pathlib import Path
-from bevcli.workshop.engines.engine import load_exported
+from bevcli.workshop.engines.exported import load_exported
 load_exported(Path({str(small_file)!r}), "openvino")
 """
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)

@@ -24,10 +24,9 @@ from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries, load
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.engines.differences import check_exported
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx, read_metadata
 from bevcli.workshop.engines.export_step import replace_parts
+from bevcli.workshop.engines.exported import check_exported, load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original

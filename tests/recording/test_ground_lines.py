@@ -17,7 +17,7 @@ from bevcli.recording.frame_log import future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video import CameraImages, draw_frame, tiles
-from bevcli.workshop.vad.map_lines import MapLines, line_colors
+from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
 
 TIMES = np.array([0.5, 1.0])

@@ -117,6 +117,44 @@ class RecurrentStep(ExportedStep):
         return self.outputs(bev, hits.most_cameras)
 
 
+class WindowStep(ExportedStep):
+    """One step of a BEVFormerV2 whose window ends with the current frame: `BEVFormerV2.forward`.
+
+    The image features of the earlier frames enter, and those of the current frame come out. All frames are encoded,
+    also those that do not exist, because a graph has no optional parts; a frame without any image then takes the map
+    of the next one, as in `fill_window`.
+    """
+
+    def forward(
+        self,
+        images: Tensor,
+        image_from_bev: Tensor,
+        camera_index: Tensor,
+        has_image: Tensor,
+        previous_features: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """One step; `WindowForm` documents every input and output."""
+        network = self.network
+        image_features = self.image_features(images, camera_index)
+        tokens = [*([] if previous_features is None else previous_features), image_features.tokens]
+        hits = [self.hits(image_from_bev[:, index], has_image[:, index]) for index in range(len(tokens))]
+        maps = [
+            network.encoder(
+                bev_query=network.bev_queries.embedding[None],
+                position=network.bev_queries.position(),
+                image_features=FeatureMaps(frame_tokens, image_features.level_shapes),
+                hits=frame_hits,
+            )
+            for frame_tokens, frame_hits in zip(tokens, hits, strict=True)
+        ]
+        for index in reversed(range(len(maps) - 1)):
+            maps[index] = torch.where(has_image[:, index].any(), maps[index], maps[index + 1])
+        bev = maps[0] if network.fusion is None else network.fusion(maps)
+        most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
+        outputs = self.outputs(bev, most_cameras)
+        return outputs if previous_features is None else (*outputs, image_features.tokens)
+
+
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
     """`ModelOutputs.boxes` for a batch of one, in the graph.
 

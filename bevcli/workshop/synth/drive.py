@@ -20,6 +20,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.options import gather
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
@@ -32,7 +33,6 @@ from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, r
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Simulation
 from bevcli.workshop.synth.traffic import ActorState
-from bevcli.workshop.vad.map_lines import MapLines
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance

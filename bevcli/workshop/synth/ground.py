@@ -17,11 +17,10 @@ from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, MapLines, lines_in_area
 from bevcli.workshop.synth.city import CORNER_M, CROSSING_M, STOP_LINE_M, CityPlan, Street, along, rounded_rectangle
 from bevcli.workshop.synth.looks import tiling_noise
 from bevcli.workshop.synth.mesh import Color, linear
-from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
-from bevcli.workshop.vad.true_lines import lines_in_area
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)

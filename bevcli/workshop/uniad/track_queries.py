@@ -65,13 +65,13 @@ class Memories:
     is_empty: Tensor
     wait: Tensor
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> Memories:
+    def changed(self, change: Callable[[Tensor], Tensor]) -> Memories:
         """The memories after a change of every tensor."""
         return Memories(change(self.embeddings), change(self.is_empty), change(self.wait))
 
     def __getitem__(self, selection: Tensor) -> Memories:
         """The memories of a mask (K,) bool."""
-        return self.each(lambda column: column[selection])
+        return self.changed(lambda column: column[selection])
 
     @staticmethod
     def empty(like: Tensor, length: int) -> Memories:
@@ -124,7 +124,9 @@ class TrackQueries:
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> TrackQueries:
         queries = change(self.position), change(self.content), change(self.box_codes)
-        return TrackQueries(*queries, change(self.ids), change(self.misses), self.memories.each(change), self.next_id)
+        return TrackQueries(
+            *queries, change(self.ids), change(self.misses), self.memories.changed(change), self.next_id
+        )
 
 
 @dataclass(frozen=True)
