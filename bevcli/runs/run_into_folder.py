@@ -78,20 +78,14 @@ def run_into_folder(
         writer = RunWriter(folder.state_path, facts, files, summary)
 
         def write(step: Step) -> bool:
-            frame, prediction, after = step
-            writer.write(frame, prediction, after)
-            after_frame(frame, prediction)
+            writer.write(*step)
+            after_frame(*step[:2])
             return not should_stop()
 
         try:
             with files, writer, WriteBehind(write) as background:
-                runner = model.runner(
-                    track=options.track,
-                    temporal=options.temporal,
-                    ask_attention=options.recording.shows_internals,
-                    probes=tuple(options.recording.probes),
-                    commands=commands,
-                )
+                asked = {"ask_attention": options.recording.shows_internals, "probes": tuple(options.recording.probes)}
+                runner = model.runner(track=options.track, temporal=options.temporal, commands=commands, **asked)
                 after, indices = state.runner, range(done, len(sequence.stamps))
                 for prepared, upcoming in runner.frames(sequence, indices, runner.preprocessor(options.cameras)):
                     after, prediction = runner.step(after, prepared, upcoming)

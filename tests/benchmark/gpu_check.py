@@ -265,7 +265,7 @@ def measure_model(name: str, device: torch.device, turn: Path | None = None) -> 
     later = [preprocess(drive.load(config.past_frames + place)) for place in range(TIMED_STEPS)]
     on_cpu = plain_results(model, torch.device("cpu"), frames) if name in COMPARED_ON_CPU else None
     with taking_turns(turn):
-        timed = list(map(image_uploader(device), later))
+        timed = list(map(image_uploader(device), later)) if device.type == "cuda" else later
         plain = plain_results(model, device, frames)
         if on_cpu is not None:
             yield {"model": name, "precision": "plain, CPU"} | differences(plain, on_cpu)
