@@ -15,13 +15,12 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from bevcli.errors import ConfigError
-from bevcli.geometry.object_classes import without_meshes
+from bevcli.geometry.object_classes import ClassSettings
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.published import read_sources
-from bevcli.registry import entries, known_models, load
+from bevcli.registry import bundled_weights, entries, known_models, load
 
 T = TypeVar("T")
 
@@ -82,8 +81,9 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
 
     tracking: the dataclass of the table TRACKING; None for no such table.
     """
-    portable = replace(config, class_settings=without_meshes(config.class_settings))
-    table = {ARCHITECTURE: config.architecture, **_plain(portable)}
+    portable = {name: replace(own, mesh=None) for name, own in config.class_settings.items()}
+    stated = {name: own for name, own in portable.items() if own != ClassSettings()}
+    table = {ARCHITECTURE: config.architecture, **_plain(replace(config, class_settings=stated))}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
 
 
@@ -101,7 +101,11 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
-    known, published = known_models(), {} if name.endswith(".toml") else read_sources()
+    known, published = known_models(), {}
+    if not name.endswith(".toml") and bundled_weights(name) is None:
+        from bevcli.published import read_sources
+
+        published = read_sources()
     of_weights = published[name].model if name in published else ""
     file = model = of_weights or name
     if model.endswith(".toml"):

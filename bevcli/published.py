@@ -6,7 +6,7 @@ folder, with the hashes that were computed at their first download.
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
@@ -24,7 +24,6 @@ HASHES = "hashes.json"
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
-DownloadReport = Callable[[int, int | None, str], None]  # bytes done, of how many or None, name and URL
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -3,7 +3,6 @@
 import copy
 import hashlib
 import re
-import shlex
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -14,8 +13,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
-from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
+from bevcli.checkpoints import load_weights, read_checkpoint
+from bevcli.config import TRACKING, as_table, config_of_table, read_model_file, settings_of_table
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
@@ -28,8 +27,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.published import DownloadReport, all_weights, named_weights, weights_folder
-from bevcli.registry import entries, load
+from bevcli.registry import bundled_weights, entries, known_models, load
+from bevcli.weights import DownloadReport
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -232,9 +231,9 @@ def load_model(
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
     tracker = tracker_of_table(contents, config, file)
-    path = chosen.weights
+    path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
-        path = _weights_of(name, chosen, report, ", or pass `untrained=True` to try the program with random weights")
+        path = bundled or _published(name, chosen, report)
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -245,7 +244,7 @@ def load_model(
         device,
         precision,
         path,
-        bundled=path is not None and chosen.weights is None and path == bundled_weights(name),
+        bundled=bundled is not None,
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
@@ -255,44 +254,11 @@ def load_model(
     )
 
 
-def weights_file(path_or_name: Path) -> Path:
-    """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
-    name = str(path_or_name)
-    if path_or_name.suffix or path_or_name.is_file():
-        return path_or_name
-    if name not in known_models():
-        named_weights(name)  # raises WeightsError that lists the names
-    return _weights_of(name, ModelOptions(), lambda done, total, what: None)
+def _published(name: str, options: ModelOptions, report: DownloadReport) -> Path:
+    from bevcli.weights.fetch import published_file
 
-
-def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherwise: str = "") -> Path:
-    """The weights of a name: those of the package, downloaded ones, or with `fetch` ones that are downloaded now.
-
-    otherwise: ends the message of the WeightsError where there are none.
-    """
-    bundled = bundled_weights(name)
-    if bundled is not None:
-        return bundled
-    named = all_weights(options.weights_dir).get(name)
-    if named is not None and named.here is not None:
-        return named.here
-    if named is None:
-        how = "pass `weights=FILE` (the official .pth or a .safetensors)"
-    elif named.file is None:
-        how = f"they {named.by_hand}"
-    elif options.fetch:
-        from bevcli.weights.fetch import fetch_weights
-
-        return fetch_weights(named, report).path
-    else:
-        how = f"run {_fetch_command(name, options)}, which downloads them"
-    raise WeightsError(f"model {name} has no weights: {how}{otherwise}")
-
-
-def _fetch_command(name: str, options: ModelOptions) -> str:
-    if options.weights_dir in (None, weights_folder().absolute()):
-        return f"`bevcli weights fetch {name}`"
-    return f"`bevcli weights fetch {name} --weights-dir {shlex.quote(str(options.weights_dir))}`"
+    untrained = ", or pass `untrained=True` to try the program with random weights"
+    return published_file(name, options.weights_dir, report if options.fetch else None, untrained)
 
 
 def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -> TrackerConfig:

@@ -173,12 +173,12 @@ class FrameLog:
         if frame.ground_truth is not None:
             truth = frame.ground_truth.transformed(moved).transformed(bev_from_world)
             truth = log_boxes.detectable(truth, prediction.grid)
-            other = log_boxes.other_classes(truth, classes)
-            found = np.ones(len(truth), dtype=bool)
+            matched = np.ones(len(truth), dtype=bool)
             if not self._recorded.model.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | other
-            in_world, colors = truth.transformed(world_from_bev), log_boxes.ground_truth_colors(found, other)
+                matched = marks.found
+            in_world = truth.transformed(world_from_bev)
+            found, colors = log_boxes.found_and_colored(truth, matched, classes)
             log_boxes.log_ground_truth(stream, in_world, truth.corners(), found, colors)
             drawn_truth = in_world.corners(), colors
         in_world, colors = shown.transformed(world_from_bev), log_boxes.box_colors(shown, classes)

@@ -162,18 +162,18 @@ def log_boxes_bev(
         log(stream, entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
-def other_classes(truth: Boxes3D, classes: Iterable[str]) -> np.ndarray:
-    """(M,) bool, ground-truth boxes of classes that the model does not have: they are never missed."""
-    return ~np.isin(truth.classes, list(classes))
+def found_and_colored(
+    truth: Boxes3D, matched: NDArray[np.bool_], classes: Iterable[str]
+) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
+    """(M,) bool, the ground-truth boxes that count as found, and their colours (M, 3).
 
-
-def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(M, 3) uint8 colours of ground-truth boxes: pale where found, red where missed, grey for other classes.
-
-    found: (M,) bool. other: (M,) bool, classes that are not among the model's.
+    Those are pale where a box is found, red where it was missed, and grey for a class that the model does not have,
+    which is never missed. matched: (M,) bool. classes: of the model.
     """
-    colors = np.where(found[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
-    return np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
+    other = ~np.isin(truth.classes, list(classes))
+    colors = np.where(matched[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
+    colors = np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
+    return matched | other, colors
 
 
 def log_ground_truth(
