@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -233,7 +234,8 @@ def load_model(
     tracker = tracker_of_table(contents, config, file)
     path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
-        path = bundled or _published(name, chosen, report)
+        untrained = ", or pass `untrained=True` to try the program with random weights"
+        path = bundled or _published(name, chosen, report, untrained)
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -254,11 +256,44 @@ def load_model(
     )
 
 
-def _published(name: str, options: ModelOptions, report: DownloadReport) -> Path:
-    from bevcli.weights.fetch import published_file
+def weights_file(path_or_name: Path) -> Path:
+    """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
+    name = str(path_or_name)
+    if path_or_name.suffix or path_or_name.is_file():
+        return path_or_name
+    if name not in known_models():
+        from bevcli.published import named_weights
 
-    untrained = ", or pass `untrained=True` to try the program with random weights"
-    return published_file(name, options.weights_dir, report if options.fetch else None, untrained)
+        named_weights(name)  # raises WeightsError that lists the names
+    return bundled_weights(name) or _published(name, ModelOptions())
+
+
+def _published(
+    name: str, options: ModelOptions, report: DownloadReport = lambda done, total, what: None, otherwise: str = ""
+) -> Path:
+    """The published weights of a name: downloaded ones, or with `fetch` ones that are downloaded now.
+
+    otherwise: ends the message of the WeightsError where there are none.
+    """
+    from bevcli.published import all_weights, weights_folder
+
+    named = all_weights(options.weights_dir).get(name)
+    if named is not None and named.here is not None:
+        return named.here
+    if named is None:
+        how = "pass `weights=FILE` (the official .pth or a .safetensors)"
+    elif named.file is None:
+        how = f"they {named.by_hand}"
+    elif options.fetch:
+        from bevcli.weights.fetch import fetch_weights
+
+        return fetch_weights(named, report).path
+    elif options.weights_dir in (None, weights_folder().absolute()):
+        how = f"run `bevcli weights fetch {name}`, which downloads them"
+    else:
+        folder = shlex.quote(str(options.weights_dir))
+        how = f"run `bevcli weights fetch {name} --weights-dir {folder}`, which downloads them"
+    raise WeightsError(f"model {name} has no weights: {how}{otherwise}")
 
 
 def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -> TrackerConfig:

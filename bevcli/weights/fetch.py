@@ -9,7 +9,6 @@ import contextlib
 import hashlib
 import os
 import re
-import shlex
 import shutil
 import time
 from collections.abc import Callable
@@ -25,8 +24,7 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
-from bevcli.published import HASHES, Known, NamedWeights, all_weights, named_weights, weights_folder
-from bevcli.registry import bundled_weights, known_models
+from bevcli.published import HASHES, Known, NamedWeights
 from bevcli.weights import DownloadReport
 from bevcli.writing import lock, output_errors
 
@@ -59,40 +57,6 @@ class FetchedWeights:
     path: Path
     known: Known
     checked: str
-
-
-def weights_file(path_or_name: Path) -> Path:
-    """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
-    name = str(path_or_name)
-    if path_or_name.suffix or path_or_name.is_file():
-        return path_or_name
-    if name not in known_models():
-        named_weights(name)  # raises WeightsError that lists the names
-    return bundled_weights(name) or published_file(name)
-
-
-def published_file(
-    name: str, folder: Path | None = None, report: DownloadReport | None = None, otherwise: str = ""
-) -> Path:
-    """The weights of a name that are on this machine, or with a `report` are downloaded now.
-
-    folder: of downloaded weights. otherwise: ends the message of the WeightsError where there are none.
-    """
-    named = all_weights(folder).get(name)
-    if named is not None and named.here is not None:
-        return named.here
-    if named is None:
-        how = "pass `weights=FILE` (the official .pth or a .safetensors)"
-    elif named.file is None:
-        how = f"they {named.by_hand}"
-    elif report is not None:
-        return fetch_weights(named, report).path
-    else:
-        elsewhere = (
-            "" if folder in (None, weights_folder().absolute()) else f" --weights-dir {shlex.quote(str(folder))}"
-        )
-        how = f"run `bevcli weights fetch {name}{elsewhere}`, which downloads them"
-    raise WeightsError(f"model {name} has no weights: {how}{otherwise}")
 
 
 def fetch_weights(

@@ -10,11 +10,8 @@ In the order of the work:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from bevcli.cli.bridge import Extension
 from bevcli.options import option, options
-from bevcli.printing import say
 
 
 @options("Calibration")
@@ -38,34 +35,6 @@ class CalibrateOptions:
         minimum=0.0001, maximum=0.2,
     )  # fmt: skip
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
-
-
-@options("Input")
-class CalibrateFirstOptions:
-    """Whether a drive is calibrated before it is used."""
-
-    calibrate: bool = option(
-        default=False,
-        help="Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.",
-    )
-
-
-def _corrected(options: CalibrateFirstOptions, drive: Any) -> Any:
-    """The drive with the rig that it shows, where this is asked for; what is corrected is printed."""
-    if not options.calibrate:
-        return drive
-    from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration import calibrate as calibration
-
-    with Progress(calibration.STEPS, "steps of the calibration") as progress:
-        result = calibration.calibrate(drive, after_step=progress.advance)
-    for camera in result.cameras:
-        reason = calibration.change_text(camera) if camera.verdict is calibration.Verdict.CORRECTED else camera.reason
-        say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return calibration.CorrectedDrive(drive, result)
-
-
-CALIBRATE_FIRST = Extension(CalibrateFirstOptions, _corrected)
 
 
 @options()

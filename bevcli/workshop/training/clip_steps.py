@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
+from bevcli.inference.load import weights_file
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.config import ModelConfig
@@ -27,7 +28,6 @@ from bevcli.model.network import Network, build_network
 from bevcli.model.resnet import Backbone
 from bevcli.model.step import ModelOutputs
 from bevcli.registry import for_model
-from bevcli.weights.fetch import weights_file
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.samples import Batch
 

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from bevcli.config import TRAINING, load_config, load_table, settings_of_table
 from bevcli.errors import ConfigError, InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
+from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
-from bevcli.weights.fetch import weights_file
 from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
