@@ -101,7 +101,7 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
-    known, published = known_models(), {}
+    models, published = known_models(), {}
     if not name.endswith(".toml") and bundled_weights(name) is None:
         from bevcli.published import read_sources
 
@@ -110,11 +110,11 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     file = model = of_weights or name
     if model.endswith(".toml"):
         if not Path(model).is_file():
-            raise ConfigError(f"{model}: file not found; known models are {', '.join(known)}")
+            raise ConfigError(f"{model}: file not found; known models are {', '.join(models)}")
         text = read_text(Path(model), TOML_BYTES, error=ConfigError)
     else:
-        if model not in known:
-            names = ", ".join(dict.fromkeys([*known, *published]))
+        if model not in models:
+            names = ", ".join(dict.fromkeys([*models, *published]))
             raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml')
         file = f"{model}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
@@ -142,14 +142,14 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
 def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
-    kinds: dict[str, Any] = {each.kind: each for each in typing.get_args(kind) if hasattr(each, "kind")}
+    kinds: dict[str, Any] = {part.kind: part for part in typing.get_args(kind) if hasattr(part, "kind")}
     if kinds and isinstance(value, dict):
         chosen = value.get("kind", next(iter(kinds)))
         if chosen not in kinds:
             raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {chosen!r:.60}')
         return _dataclass(value, kinds[chosen], file, f"{key}.")
     if typing.get_origin(kind) is Mapping and isinstance(value, dict):
-        return {name: _value(each, typing.get_args(kind)[1], file, f"{key}.{name}") for name, each in value.items()}
+        return {name: _value(part, typing.get_args(kind)[1], file, f"{key}.{name}") for name, part in value.items()}
     try:
         if _is_finite(value):
             return msgspec.convert(value, kind)
@@ -180,6 +180,6 @@ def _describe(kind: Any) -> str:
     return names.get(kind, "a table")
 
 
-def _nearest(key: str, known: list[str]) -> str:
-    match = difflib.get_close_matches(key, known, n=1)
-    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(known)}"
+def _nearest(key: str, keys: list[str]) -> str:
+    match = difflib.get_close_matches(key, keys, n=1)
+    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(keys)}"

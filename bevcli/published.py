@@ -186,10 +186,10 @@ def all_weights(folder: Path | None = None) -> dict[str, NamedWeights]:
 
 def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     """A name of the table of sources. Raises WeightsError for another one."""
-    known = all_weights(folder)
-    if name not in known:
-        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(known)})')
-    return known[name]
+    weights = all_weights(folder)
+    if name not in weights:
+        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(weights)})')
+    return weights[name]
 
 
 def _read_hashes(folder: Path) -> dict[str, Known]:

@@ -250,12 +250,12 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
 
     here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
     """
-    place = origin.latitude_longitude(here)
+    position = origin.latitude_longitude(here)
     stream.log(
-        entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
+        entities.MAP_EGO, rr.GeoPoints(lat_lon=[position], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
     )
     if before is not None:
-        way = [origin.latitude_longitude(before), place]
+        way = [origin.latitude_longitude(before), position]
         line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=entities.EGO_COLOR)
         stream.log(entities.MAP_ROUTE, line)
 

@@ -3,8 +3,6 @@
 `CheckedDrive` runs the cheap ones before a run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -122,7 +120,7 @@ class _Drive:
     is_plausible: bool  # the vehicle is level, not too fast, and drives forward in most steps
 
     @classmethod
-    def of(cls, ego_motion: EgoMotion) -> _Drive:
+    def of(cls, ego_motion: EgoMotion) -> "_Drive":
         """The poses of ego-motion."""
         rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
         steps, seconds = np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9

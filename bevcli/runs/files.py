@@ -1,7 +1,5 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Mapping
@@ -83,7 +81,7 @@ class RunFiles:
         if resume is not None:
             self._check_files(resume)
 
-    def __enter__(self) -> RunFiles:
+    def __enter__(self) -> "RunFiles":
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
@@ -193,7 +191,7 @@ class RunFiles:
         self._files[name] = self._stack.enter_context(file)
         return file
 
-    def _open_submission(self) -> SubmissionWriter:
+    def _open_submission(self) -> "SubmissionWriter":
         from bevcli.evaluation.submission import SubmissionWriter  # nuScenes drives only
 
         return self._open(SUBMISSION, SubmissionWriter)

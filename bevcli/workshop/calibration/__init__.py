@@ -7,8 +7,6 @@ In the order of the work:
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bevcli.options import option, options

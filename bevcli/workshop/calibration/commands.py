@@ -3,8 +3,6 @@
 And its short form, the check of `bevcli project-debug`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,7 +48,7 @@ def calibrate(
     say("Written: " + ", ".join(map(str, written)), err=as_json)
 
 
-def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], Sequence]) -> tuple[Finding, ...]:
+def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Sequence"]) -> "tuple[Finding, ...]":
     """Findings of a short calibration of the drive, where it has ego-motion and is no calibration alone."""
     if not options.motion:
         return ()
