@@ -217,7 +217,7 @@ class Recording:
             vehicle = None if path is None else meshes.load_vehicle(path)
             of_classes = meshes.read_class_meshes(config.object_classes)
         self._layout = recording_blueprint(recorded)
-        self._file = RrdFile(self.path, self._size)
+        self.file = RrdFile(self.path, self._size)
         self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
@@ -230,7 +230,7 @@ class Recording:
     def _connect(self, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            with self._file.sink() as sink:
+            with self.file.sink() as sink:
                 self._stream.set_sinks(sink, default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
@@ -246,25 +246,21 @@ class Recording:
                 self._layout.free()
             self._flush()
         finally:
-            self._file.leave_out_index()
+            self.file.leave_out_index()
             # rerun itself waits without a limit.
             closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
             closing.start()
             closing.join(FLUSH_TIMEOUT_S)
             if closing.is_alive():
                 raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
-            self._file.close()
+            self.file.close()
             if self._live is not None:
                 self._live.close()
 
     def state(self) -> RecordingState | None:
         """The state from which a later Recording goes on; None as long as it cannot be resumed."""
         frames = self._frame_log.state()
-        return None if frames is None else RecordingState(self._recording_id, self._file.synced, frames)
-
-    def is_deleted(self) -> bool:
-        """True if somebody has deleted the file that is being written."""
-        return self._file.is_deleted()
+        return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
@@ -284,6 +280,6 @@ class Recording:
     def _flush(self) -> None:
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
-            self._file.sync()
+            self.file.sync()
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
