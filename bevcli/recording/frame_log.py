@@ -1,8 +1,10 @@
 """The rows of each frame: poses, images, boxes, curves and events; then features, maps, probes, lines on the ground."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,12 +12,13 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Prediction, Probe
+from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, Probe, result_of
 from bevcli.geometry.bev_grid import BevGrid, rectangle
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_boxes, log_cameras, log_static
-from bevcli.recording.components import any_values, components, log, rgb_format, ui_points
+from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
 from bevcli.recording.log_cameras import PosedCamera
 
 Features = NDArray[np.float32]
@@ -28,6 +31,8 @@ PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
 PROBE_COLOR: Color = (255, 80, 220)
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
+FUTURES_OPACITY, FUTURES_WIDTH = 230, 1.0  # of 255; points of the user interface
+ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
 
 
 @dataclass
@@ -45,7 +50,7 @@ class FrameLogState:
     origin: Array | None = None
     scene: str = ""
     world_from_ego: Pose | None = None
-    colors: "BevColors | None" = None
+    colors: BevColors | None = None
     tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
 
 
@@ -102,9 +107,7 @@ class FrameLog:
             self._images.log(name, frame.images.get(name))
         self._log_boxes(frame, prediction, moved, cameras)
         if self._recorded.model.config.results:
-            from bevcli.recording.log_lines import log_results  # few models have lines
-
-            log_results(stream, self._recorded, prediction, moved, cameras)
+            self._log_results(prediction, moved, cameras)
         if is_first:
             stages, classes, bright = list(prediction.stage_seconds), self._recorded.classes, entities.STAGE_COLORS
             colors = [bright[i % len(bright)] for i in range(len(stages))]
@@ -170,12 +173,12 @@ class FrameLog:
         if frame.ground_truth is not None:
             truth = frame.ground_truth.transformed(moved).transformed(bev_from_world)
             truth = log_boxes.detectable(truth, prediction.grid)
-            matched = np.ones(len(truth), dtype=bool)
+            other = log_boxes.other_classes(truth, classes)
+            found = np.ones(len(truth), dtype=bool)
             if not self._recorded.model.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                matched = marks.found
-            in_world = truth.transformed(world_from_bev)
-            found, colors = log_boxes.found_and_colored(truth, matched, classes)
+                found = marks.found | other
+            in_world, colors = truth.transformed(world_from_bev), log_boxes.ground_truth_colors(found, other)
             log_boxes.log_ground_truth(stream, in_world, truth.corners(), found, colors)
             drawn_truth = in_world.corners(), colors
         in_world, colors = shown.transformed(world_from_bev), log_boxes.box_colors(shown, classes)
@@ -194,6 +197,19 @@ class FrameLog:
         log_cameras.log_boxes_in_images(stream, cameras, corners, colors, texts, drawn_truth)
         counts = np.array([(shown.classes == name).sum() for name in classes])
         log(stream, entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
+
+    def _log_results(self, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+        """Writes the results and futures of a model that has further results."""
+        score, moved_from_ego = self._options.score, moved @ prediction.world_from_ego.matrix
+        world_from_bev = moved_from_ego @ prediction.ego_from_bev
+        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(moved_from_ego))
+        for kind, names in self._recorded.model.config.results.items():
+            result = result_of(kind, prediction.results)
+            lines = GroundLines() if result is None else result.drawn(ground, names, score)
+            log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+        shown = prediction.boxes.scored(score).transformed(world_from_bev)
+        futures = future_lines(shown, self._recorded.classes)
+        log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
     def _log_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
@@ -385,3 +401,53 @@ def log_probes(stream: rr.RecordingStream, probes: Sequence[Probe], ego_from_bev
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
     strips = apply(ego_from_bev, ends).astype(np.float32)
     stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=PROBE_COLOR, radii=0.05))
+
+
+def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
+    """The futures of boxes in the recording's world: colours by class, opaque by score of the mode, faded in time."""
+    if boxes.futures is None or not len(boxes):
+        return GroundLines()
+    feet = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2
+    places = np.concatenate([np.broadcast_to(boxes.centers[:, None, None, :2], (*boxes.futures.shape[:2], 1, 2)),
+                             boxes.futures[..., 1:]], axis=2)  # (N, M, T + 1, 2)  # fmt: skip
+    heights = np.broadcast_to(feet[:, None, None, None], (*places.shape[:3], 1))
+    steps = np.concatenate([places, heights], axis=-1)
+    modes = np.ones(boxes.futures.shape[:2]) if boxes.future_scores is None else boxes.future_scores
+    share = modes / np.maximum(modes.max(1, keepdims=True), 1e-9)  # (N, M)
+    fading = np.linspace(1, 0.25, boxes.futures.shape[2])
+    strips, colors, of_class = [], [], log_boxes.box_colors(boxes, classes)
+    for box, mode, step in np.ndindex(*boxes.futures.shape[:3]):
+        piece = steps[box, mode, step : step + 2]
+        if np.isfinite(piece).all():
+            strips.append(piece)
+            colors.append((*map(int, of_class[box][:3]), round(FUTURES_OPACITY * fading[step] * share[box, mode])))
+    return GroundLines(strips, colors, FUTURES_WIDTH)
+
+
+def log_ground_lines(
+    stream: rr.RecordingStream, kind: str, lines: GroundLines, world_from_bev: Array, cameras: Sequence[PosedCamera]
+) -> None:
+    """Writes lines in the recording's world; without any, those of the frame before are cleared.
+
+    kind: last part of their entities.
+    """
+    colors = np.array(lines.colors, np.uint8) if len(lines.colors) else None
+    radii = ui_points(lines.width)
+    points, lengths = np.concatenate([np.zeros((0, 3)), *lines.strips]), list(map(len, lines.strips))
+    in_space = line_strips(points + ABOVE_GROUND, lengths)
+    solid = components(rr.LineStrips3D, strips=in_space, colors=colors, radii=radii)
+    log(stream, f"{entities.WORLD}/{kind}", solid)
+    flat = line_strips(apply(inverse(world_from_bev), points)[:, :2] * (1, -1), lengths)
+    from_above = components(rr.LineStrips2D, strips=flat, colors=colors, radii=radii, draw_order=24)
+    log(stream, f"{entities.BEV}/{kind}", from_above)
+    pieces = [np.stack([strip[:-1], strip[1:]], axis=1) for strip in lines.strips]
+    ends = np.concatenate([np.zeros((0, 2, 3)), *pieces])
+    owners = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    of_cameras = np.concatenate([apply(posed.camera_from_world, ends) for posed in cameras])
+    counts = np.full(len(cameras), len(ends))
+    parts = log_cameras.cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, cameras)
+    own_colors = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4)
+    for posed, visible in zip(cameras, parts, strict=True):
+        own = own_colors[visible.owners]
+        strips = components(rr.LineStrips2D, strips=visible.segments, colors=own, radii=radii, draw_order=15)
+        log(stream, entities.overlay(posed.camera.name, kind), strips)

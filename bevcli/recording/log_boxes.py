@@ -162,18 +162,18 @@ def log_boxes_bev(
         log(stream, entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
 
-def found_and_colored(
-    truth: Boxes3D, matched: NDArray[np.bool_], classes: Iterable[str]
-) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """(M,) bool, the ground-truth boxes that count as found, and their colours (M, 3).
+def other_classes(truth: Boxes3D, classes: Iterable[str]) -> np.ndarray:
+    """(M,) bool, ground-truth boxes of classes that the model does not have: they are never missed."""
+    return ~np.isin(truth.classes, list(classes))
 
-    Those are pale where a box is found, red where it was missed, and grey for a class that the model does not have,
-    which is never missed. matched: (M,) bool. classes: of the model.
+
+def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(M, 3) uint8 colours of ground-truth boxes: pale where found, red where missed, grey for other classes.
+
+    found: (M,) bool. other: (M,) bool, classes that are not among the model's.
     """
-    other = ~np.isin(truth.classes, list(classes))
-    colors = np.where(matched[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
-    colors = np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
-    return matched | other, colors
+    colors = np.where(found[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
+    return np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
 def log_ground_truth(
@@ -250,12 +250,12 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
 
     here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
     """
-    position = origin.latitude_longitude(here)
+    place = origin.latitude_longitude(here)
     stream.log(
-        entities.MAP_EGO, rr.GeoPoints(lat_lon=[position], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
+        entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
     )
     if before is not None:
-        way = [origin.latitude_longitude(before), position]
+        way = [origin.latitude_longitude(before), place]
         line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=entities.EGO_COLOR)
         stream.log(entities.MAP_ROUTE, line)
 

@@ -1,5 +1,7 @@
 """The rows that are written once: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

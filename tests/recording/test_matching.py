@@ -10,7 +10,7 @@ from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording.entities import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
-from bevcli.recording.log_boxes import detectable, found_and_colored, true_positives
+from bevcli.recording.log_boxes import detectable, ground_truth_colors, other_classes, true_positives
 
 
 def boxes(places, classes, scores=None) -> Boxes3D:
@@ -86,8 +86,8 @@ def test_the_display_agrees_with_the_evaluation(seed):
 
 def test_ground_truth_of_other_classes_is_grey_and_never_missed():
     truth = boxes([(0, 0), (5, 0), (9, 0)], ["car", "Tricycle", "bus"])
-    matched = np.array([True, False, False])
-    found, colors = found_and_colored(truth, matched, ("car", "bus"))
-    assert found.tolist() == [True, True, False]
-    assert found_and_colored(truth, matched, ("car", "bus", "Tricycle"))[0].tolist() == [True, False, False]
+    other = other_classes(truth, ("car", "bus"))
+    assert other.tolist() == [False, True, False]
+    assert not other_classes(truth, ("car", "bus", "Tricycle")).any()
+    colors = ground_truth_colors(np.array([True, True, False]), other)
     assert colors.tolist() == [list(GROUND_TRUTH_COLOR), list(OTHER_COLOR), list(MISSED_COLOR)]
