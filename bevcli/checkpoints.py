@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from importlib import resources
 from pathlib import Path
 
 import safetensors
@@ -153,6 +154,12 @@ def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tu
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
         reason = " ".join(str(failure).split())
         raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None
+
+
+def bundled_weights(model: str) -> Path | None:
+    """The weights file that comes with the package for a known model; None where there is none."""
+    file = Path(str(resources.files("bevcli").joinpath("weights", f"{model}.safetensors")))
+    return file if model in known_models() and file.is_file() else None
 
 
 def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict[str, list[str]]:

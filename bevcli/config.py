@@ -20,7 +20,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.registry import bundled_weights, entries, known_models, load
+from bevcli.registry import entries, known_models, load
 
 T = TypeVar("T")
 
@@ -102,7 +102,8 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
     models, published = known_models(), {}
-    if not name.endswith(".toml") and bundled_weights(name) is None:
+    has_own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file()
+    if not name.endswith(".toml") and not has_own_weights:  # a name of the package is not in the table
         from bevcli.published import read_sources
 
         published = read_sources()

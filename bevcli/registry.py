@@ -77,9 +77,3 @@ def known_models() -> tuple[str, ...]:
     """The names of the models whose TOML files come with the package."""
     files = resources.files("bevcli").joinpath("configs").iterdir()
     return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
-
-
-def bundled_weights(model: str) -> Path | None:
-    """The weights file that comes with the package for a known model; None where there is none."""
-    file = Path(str(resources.files("bevcli").joinpath("weights", f"{model}.safetensors")))
-    return file if model in known_models() and file.is_file() else None

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from bevcli.checkpoints import load_weights, read_checkpoint
-from bevcli.config import TRACKING, as_table, config_of_table, read_model_file, settings_of_table
+from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
+from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
@@ -28,7 +28,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.registry import bundled_weights, entries, known_models, load
+from bevcli.registry import entries, load
 from bevcli.weights import DownloadReport
 
 DEFAULT_MODEL = "demo"

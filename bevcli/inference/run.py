@@ -219,10 +219,10 @@ def _check_image(pixels: NDArray[np.uint8], camera: Camera) -> None:
     """Raise InputError where pixels are not an image of a camera."""
     shape, kind = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
     if shape != (camera.height, camera.width, 3) or kind != np.uint8:
-        given = kind if shape is None else f"{kind} of shape {shape}"
+        found = kind if shape is None else f"{kind} of shape {shape}"
         raise InputError(
             f"`images`: camera {camera.name}: expected uint8 of shape ({camera.height}, {camera.width}, 3), as in the "
-            f"rig (found {given})"
+            f"rig (found {found})"
         )
 
 

@@ -1,5 +1,7 @@
 """Recording: writes frames and predictions into an .rrd file, frame by frame."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 import select
@@ -207,7 +209,7 @@ class Recording:
         frames = None if resume is None else resume.frames
         self._frame_log = FrameLog(self._stream, self._recorded, frames)
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> Recording:
         recorded, config = self._recorded, self._recorded.model.config
         vehicle, of_classes = None, {}
         path = recorded.options.vehicle_mesh

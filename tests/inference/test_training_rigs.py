@@ -11,6 +11,7 @@ import safetensors
 import torch
 from memory_drive import MemorySequence, make_camera, make_rig
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev, level_rig
 from bevcli.geometry.transforms import Array, rigid
@@ -19,7 +20,6 @@ from bevcli.inference.runner import Runner
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes, weights_facts
 from bevcli.model.config import BevFrameConfig
 from bevcli.model.temporal_model import build_model
-from bevcli.registry import bundled_weights
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 

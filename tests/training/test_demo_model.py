@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
 from bevcli.frame import Sequence
 from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.registry import bundled_weights
 from bevcli.sequences.open import select_range
 from bevcli.workshop.synth.drives import FolderDrives
 from bevcli.workshop.training.job import TrainingConfig

@@ -12,13 +12,13 @@ import safetensors.torch
 import torch
 from memory_drive import make_rig
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
 from bevcli.inference.load import weights_file
 from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.registry import bundled_weights
 from bevcli.workshop.training.trainer import save_weights
 from bevcli.workshop.training.warm_start import WarmStart, warm_start
 

@@ -16,12 +16,12 @@ import torch
 from command_line import MINI_TOML, command
 from file_server import serving
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
 from bevcli.published import all_weights, named_weights, own_table, read_sources
-from bevcli.registry import bundled_weights
 from bevcli.weights import fetch
 from bevcli.weights.fetch import fetch_weights
 
