@@ -48,7 +48,7 @@ def rows_of_largest_images(
     rows = rows_by_yaw(yaws)
     one_row = (sum(rows, ()),)
     wide, narrow = (
-        min(width / max(map(len, each)), (height / len(each) - title_height) * aspect) for each in (one_row, rows)
+        min(width / max(map(len, layout)), (height / len(layout) - title_height) * aspect) for layout in (one_row, rows)
     )
     return one_row if wide >= narrow else rows
 

@@ -10,7 +10,6 @@ Colours are RGB, 0 to 255. rerun takes half a second to import, and is imported 
 
 import colorsys
 from collections.abc import Iterable, Mapping
-from functools import cache
 from itertools import cycle
 
 import cv2
@@ -154,12 +153,6 @@ def map_colors(
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
     """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
     indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
-    return _table(name).take(indices, axis=0)
-
-
-@cache
-def _table(name: str) -> NDArray[np.uint8]:
-    """(256, 3) RGB, the colours of one of OpenCV's colour maps."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
-    colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
-    return np.ascontiguousarray(colors, dtype=np.uint8)
+    colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]  # (256, 3) RGB
+    return np.asarray(colors.take(indices, axis=0), dtype=np.uint8)

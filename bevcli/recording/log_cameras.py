@@ -66,24 +66,18 @@ def lines_in_images(corners: Array, cameras: Sequence[PosedCamera]) -> list[Imag
 
     corners: (N, 8, 3) of the boxes in the recording's world.
     """
-    of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])
-    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1) & ~_are_beside(of_cameras, cameras))
+    of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])  # (C, N, 8, 3)
+    # A side of an undistorted image is a plane through the camera: boxes beyond it, by a pixel at least, are left out.
+    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
+    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
+    pixels, depth = of_cameras @ intrinsics[:, None], of_cameras[..., 2:]  # pixels times depth, (C, N, 8, 2)
+    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
+    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
+    outside = beside.any(-1) & is_straight[:, None]
+    camera, before = np.nonzero((depth[..., 0] >= NEAR_CLIP_M).any(-1) & ~outside)
     edges = of_cameras[camera, before][:, _EDGES]  # (K, 14, 2, 3)
     counts = np.bincount(camera, minlength=len(cameras)) * len(_EDGES)
     return cut_to_images(edges.reshape(-1, 2, 3), np.repeat(before, len(_EDGES)), counts, cameras)
-
-
-def _are_beside(corners: Array, cameras: Sequence[PosedCamera]) -> NDArray[np.bool_]:
-    """(C, N) bool: boxes that project to one side of the image as a whole, by a pixel at least; never with distortion.
-
-    corners: (C, N, 8, 3) in the frame of each camera. A side of the image is a plane through the camera.
-    """
-    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
-    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
-    pixels, depth = corners @ intrinsics[:, None], corners[..., 2:]  # pixels times depth, (C, N, 8, 2)
-    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
-    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
-    return beside.any(-1) & is_straight[:, None]
 
 
 def cut_to_images(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -235,7 +235,7 @@ def _prism(outline: Array, height: float) -> Array:
 
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
-    """Writes the page "About", and the facts of the run that readers of the file need."""
+    """Writes the page "About", the legend in columns, and the facts of the run that readers of the file need."""
     cameras, untrained = recorded.drive.rig.names, recorded.model.untrained
     title = f"{recorded.drive.name} · {recorded.model.config.name}"
     maps, lines = recorded.map_classes, line_entries(recorded.model.config)
@@ -260,6 +260,14 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     )
     page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
     stream.log(entities.RUN, page, facts, static=True)
+    entries = legend_entries(recorded)
+    rows = -(-len(entries) // LEGEND_COLUMNS)
+    spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
+    texts, colors_of_entries = zip(*entries, strict=True)
+    circles = rr.Points2D(spots + (0.7, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
+    stream.log(f"{entities.LEGEND}/colors", circles, static=True)
+    labels = labels_2d(spots + (5.0, -0.25), list(texts), colors=TEXT_COLOR)  # a label is drawn below its point
+    log(stream, f"{entities.LEGEND}/texts", labels, static=True)
 
 
 def log_pillars(
@@ -318,14 +326,3 @@ def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds."""
     of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
     return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
-
-
-def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
-    """Writes the legend: a filled circle and a text for each entry, in columns."""
-    rows = -(-len(entries) // LEGEND_COLUMNS)
-    places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
-    texts, colors = [text for text, _ in entries], [color for _, color in entries]
-    circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))
-    stream.log(f"{entities.LEGEND}/colors", circles, static=True)
-    labels = labels_2d(places + (5.0, -0.25), texts, colors=TEXT_COLOR)  # a label is drawn below its point
-    log(stream, f"{entities.LEGEND}/texts", labels, static=True)

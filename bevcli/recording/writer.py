@@ -8,6 +8,7 @@ import select
 import threading
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -41,8 +42,8 @@ class RrdFile(GrowingFile):
     index.
 
         file = RrdFile(path)
-        stream.set_sinks(file.sink())
-        file.opened()
+        with file.sink() as sink:
+            stream.set_sinks(sink)
 
     Attributes:
         synced: bytes in the file at the last `sync`; all frames up to then are readable.
@@ -58,8 +59,9 @@ class RrdFile(GrowingFile):
         self._busy = threading.Lock()
         self._block = memoryview(bytearray(BLOCK))  # allocated here, where a lack of memory can be told
 
-    def sink(self) -> rr.FileSink:
-        """The sink that rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
+    @contextlib.contextmanager
+    def sink(self) -> Iterator[rr.FileSink]:
+        """`with` the sink that rerun is to open in the block and writes to from then on; it ends when rerun closes it.
 
         Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
         """
@@ -71,11 +73,10 @@ class RrdFile(GrowingFile):
             self._pipe = pipe
         self._thread = threading.Thread(target=self._move_all, args=(pipe,), name="rrd-file", daemon=True)
         self._thread.start()
-        return rr.FileSink(f"/dev/fd/{self._pipe_in}")
-
-    def opened(self) -> None:
-        """Says that rerun has opened the sink: the file ends when rerun closes it."""
-        os.close(self._pipe_in)
+        try:
+            yield rr.FileSink(f"/dev/fd/{self._pipe_in}")
+        finally:
+            os.close(self._pipe_in)
 
     def sync(self) -> None:
         """Waits until all that rerun has flushed is in the file.
@@ -218,7 +219,7 @@ class Recording:
             vehicle = None if path is None else meshes.load_vehicle(path)
             of_classes = meshes.read_class_meshes(config.object_classes)
         self._layout = recording_blueprint(recorded)
-        self._file = RrdFile(self.path, self._size)
+        self.file = RrdFile(self.path, self._size)
         self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
@@ -226,17 +227,16 @@ class Recording:
         for name, mesh in of_classes.items():
             log_static.log_mesh(self._stream, entities.class_mesh(name), mesh)
         log_static.log_about(self._stream, recorded)
-        log_static.log_legend(self._stream, log_static.legend_entries(recorded))
         return self
 
     def _connect(self, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            self._stream.set_sinks(self._file.sink(), default_blueprint=layout)
+            with self.file.sink() as sink:
+                self._stream.set_sinks(sink, default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
         finally:
-            self._file.opened()
             if layout is not None:
                 layout.free()
 
@@ -248,25 +248,21 @@ class Recording:
                 self._layout.free()
             self._flush()
         finally:
-            self._file.leave_out_index()
+            self.file.leave_out_index()
             # rerun itself waits without a limit.
             closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
             closing.start()
             closing.join(FLUSH_TIMEOUT_S)
             if closing.is_alive():
                 raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
-            self._file.close()
+            self.file.close()
             if self._live is not None:
                 self._live.close()
 
     def state(self) -> RecordingState | None:
         """The state from which a later Recording goes on; None as long as it cannot be resumed."""
         frames = self._frame_log.state()
-        return None if frames is None else RecordingState(self._recording_id, self._file.synced, frames)
-
-    def is_deleted(self) -> bool:
-        """True if somebody has deleted the file that is being written."""
-        return self._file.is_deleted()
+        return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
@@ -286,6 +282,6 @@ class Recording:
     def _flush(self) -> None:
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
-            self._file.sync()
+            self.file.sync()
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error

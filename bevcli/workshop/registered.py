@@ -81,6 +81,6 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.extensions": {
         "project-debug.motion": "bevcli.workshop.calibration.commands:CHECK_MOTION",
-        "run.calibrate": "bevcli.workshop.calibration.commands:CALIBRATE_FIRST",
+        "run.calibrate": "bevcli.workshop.calibration.run_option:CALIBRATE_FIRST",
     },
 }
