@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import show as show
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
+    from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
 
 # The public names by the modules that define them.
@@ -62,6 +63,7 @@ _NAMES = {
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
+    "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.viewer.recording_file": "show",
 }

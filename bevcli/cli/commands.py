@@ -3,10 +3,11 @@
 import json
 import shutil
 import textwrap
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -156,7 +157,12 @@ def project_debug(
 
 
 def evaluate(
-    predictions: Annotated[Path, argument("predictions.json, the folder of a run, or a results_nusc.json.")],
+    predictions: Annotated[
+        list[Path],
+        argument(
+            "predictions.json, the folder of a run, or a results_nusc.json. Two are compared.", metavar="PREDICTIONS"
+        ),
+    ],
     ground_truth: Annotated[
         Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
@@ -170,11 +176,19 @@ def evaluate(
 
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
     runs a model on several drives and scores them together.
-    """
-    from bevcli.evaluation.evaluate import evaluate
 
-    scores = evaluate(
-        predictions,
+    With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
+    frames.
+    """
+    from bevcli.errors import InputError
+    from bevcli.evaluation.evaluate import evaluate
+    from bevcli.registry import load
+
+    if len(predictions) > 2:
+        raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
+    score: Callable[..., Any] = evaluate if len(predictions) == 1 else load("bevcli.comparisons", "boxes")
+    scores = score(
+        *predictions,
         ground_truth,
         options.max_range,
         options.count_missing,

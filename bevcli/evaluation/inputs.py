@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.detection import DetectionScores
 from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import FrameStamp, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
@@ -43,6 +44,12 @@ class ScoredInput:
     open_drive: Callable[[], Drive] | None = None
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
     impossible_boxes: int = 0
+
+    @property
+    def range_m(self) -> float | None:
+        """Distance to the end of the BEV grid of the model that made the predictions, metres; None if not stated."""
+        stated = self.boxes.extras.get("range_m")
+        return float(stated) if isinstance(stated, (int, float)) and stated > 0 else None
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
@@ -319,6 +326,8 @@ class Compared:
         classes: of the predictions, by name.
         max_range_m: distance from the ego vehicle beyond which nothing is scored; None for the range of each class.
         predictions, truth: with all their frames, and where they come from; None of frames in memory.
+        detection: the scores of the boxes; None where they are not computed.
+        selection: what was read of the ground truth: "scene", "version" and "split", where given.
     """
 
     pairs: FramePairs
@@ -326,3 +335,5 @@ class Compared:
     max_range_m: float | None
     predictions: ScoredInput | None = None
     truth: ScoredInput | None = None
+    detection: DetectionScores | None = None
+    selection: Mapping[str, str] = field(default_factory=dict)
