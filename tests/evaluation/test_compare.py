@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
 from dataclasses import replace
@@ -278,18 +279,6 @@ def test_a_frame_of_a_nuscenes_root_is_seen_in_its_scene(tmp_path: Path) -> None
     assert of_scene == view
 
 
-def test_the_curves_of_both_are_drawn(tmp_path: Path, drive: Path, found: Path) -> None:
-    right = write_frames(tmp_path / "right.json", [cars([5.0], [0.9])] * 4)
-    evaluated(found, right, drive, "--plot", tmp_path / "plots")
-    [file] = (tmp_path / "plots").iterdir()
-    image = cv2.imread(str(file))
-    assert file.name == "precision_recall_of_both.png"
-    assert image is not None
-    blue, red = image[..., 0].astype(int), image[..., 2].astype(int)
-    assert (blue - red > 60).sum() > 500  # the curves of A
-    assert (red - blue > 60).sum() > 500
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -315,3 +304,24 @@ def test_models_without_a_common_frame_are_refused(tmp_path: Path, files: tuple[
 def test_three_files_of_predictions_are_refused(files: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match=r"found 3 files of predictions .expected 1, or 2 to compare"):
         CliRunner().invoke(app, ["eval", *map(str, (*files[:2], *files[1:]))], catch_exceptions=False)
+
+
+def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, monkeypatch: Any) -> None:
+    page = (STREET.parents[1] / "docs" / "compare.md").read_text().partition("## Compare two models")[2]
+    drive.rename(tmp_path / "my_drive")
+    found.rename(tmp_path / "a.json")
+    write_frames(tmp_path / "b.json", [cars([5.0], [0.9])] * 4)
+    monkeypatch.chdir(tmp_path)
+    both, one = re.findall("^bevcli eval .*$", page, flags=re.MULTILINE)
+    shown = CliRunner().invoke(app, shlex.split(both, comments=True)[1:], catch_exceptions=False)
+    [view] = re.findall("^Look at it: .*--frame ", page, flags=re.MULTILINE)
+    for text in (view, "better\n", "A missed  A invented  B missed  B invented\n"):
+        assert text in page
+        assert text in shown.stdout
+    image = cv2.imread("plots/precision_recall_of_both.png")
+    assert image is not None
+    blue, red = image[..., 0].astype(int), image[..., 2].astype(int)
+    assert (blue - red > 60).sum() > 500  # the curves of A
+    assert (red - blue > 60).sum() > 500
+    shown = CliRunner().invoke(app, shlex.split(one, comments=True)[1:], catch_exceptions=False)
+    assert "worst frames" in shown.stdout
