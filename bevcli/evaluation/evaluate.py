@@ -292,11 +292,8 @@ def _model_range_m(
     predictions: inputs.ScoredInput, pairs: inputs.FramePairs, classes: Mapping[str, ObjectClass]
 ) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
-    stated = predictions.boxes.extras.get("range_m")
-    farthest = max(kind.range_m for kind in classes.values())
-    if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
-        return None
-    return float(stated)
+    stated, farthest = predictions.range_m, max(kind.range_m for kind in classes.values())
+    return stated if pairs.ego_pose_known and stated is not None and stated < farthest else None
 
 
 def _class_notes(
