@@ -308,9 +308,10 @@ def test_three_files_of_predictions_are_refused(files: tuple[Path, Path, Path]) 
 
 def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, monkeypatch: Any) -> None:
     page = (STREET.parents[1] / "docs" / "compare.md").read_text().partition("## Compare two models")[2]
-    drive.rename(tmp_path / "my_drive")
-    found.rename(tmp_path / "a.json")
-    write_frames(tmp_path / "b.json", [cars([5.0], [0.9])] * 4)
+    (tmp_path / "samples").mkdir()
+    drive.rename(tmp_path / "samples" / "street")
+    found.rename(tmp_path / "mine.json")
+    write_frames(tmp_path / "other.json", [cars([5.0], [0.9])] * 4)
     monkeypatch.chdir(tmp_path)
     both, one = re.findall("^bevcli eval .*$", page, flags=re.MULTILINE)
     shown = CliRunner().invoke(app, shlex.split(both, comments=True)[1:], catch_exceptions=False)
