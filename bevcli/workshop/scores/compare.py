@@ -139,16 +139,16 @@ def compare(
 ) -> Comparison:
     """Compare the boxes of two models on the same frames.
 
-    The differences are those of B minus A. Each has an interval: the score is computed for many resamples of the
-    frames, drawn with replacement, the same for both models. It holds 95 % of the differences.
+    A difference is the score of B minus that of A. Its interval holds the central 95 % of the differences of many
+    resamples of the frames, which are drawn with replacement and are the same for both models.
 
     Args:
         a, b: predictions as `bevcli.evaluate` takes them.
-        ground_truth: see there.
-        max_range: see there. Default: where the BEV grid of the first model ends, and never beyond that of the other.
+        ground_truth: see `bevcli.evaluate`.
+        max_range: see there. By default the range of both ends with the smaller BEV grid.
         count_missing: see there. Frames that only one model has are left out without it.
         resamples: number of resamples.
-        scene, version, split, class_map: see there.
+        scene, version, split, class_map: see `bevcli.evaluate`.
         results: worst=3: length of the lists of frames.
 
     Returns:
