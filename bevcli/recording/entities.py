@@ -33,6 +33,7 @@ BOXES = "world/boxes"
 VELOCITY = "world/boxes/velocity"
 FALSE_BOXES = "world/boxes/false"
 DUPLICATES = "world/boxes/duplicate"
+MODELS = "models"  # a kind of boxes: two models that are compared, by name
 TRACKS = "world/tracks"
 GROUND_TRUTH = "world/ground_truth"
 MISSED = "world/ground_truth/missed"
@@ -73,6 +74,7 @@ OTHER_COLOR: Color = (128, 132, 140)  # ground truth of a class that is not amon
 MISSED_COLOR: Color = (255, 45, 85)
 FALSE_COLOR: Color = (255, 45, 85)
 EGO_COLOR: Color = (90, 200, 250)
+LAYER_COLORS: tuple[Color, Color] = ((255, 158, 44), (178, 130, 255))  # two models: orange and violet
 STAGE_COLORS: tuple[Color, ...] = (
     (96, 165, 255), (255, 158, 44), (70, 222, 190), (240, 108, 190), (245, 222, 90), (178, 130, 255), (186, 222, 92),
 )  # fmt: skip
@@ -110,6 +112,13 @@ def track(class_name: str, identity: str) -> str:
     import rerun as rr
 
     return f"{TRACKS}/{rr.escape_entity_path_part(f'{class_name}_{identity}')}"
+
+
+def layer(root: str, name: str) -> str:
+    """The entity of the boxes of one of two models, such as "bev/models/a". root: WORLD, BEV or that of a camera."""
+    import rerun as rr
+
+    return f"{root}/{MODELS}/{rr.escape_entity_path_part(name)}"
 
 
 def class_mesh(class_name: str) -> str:

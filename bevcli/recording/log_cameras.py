@@ -49,6 +49,27 @@ class PosedCamera:
 
 
 @dataclass(frozen=True)
+class ImageLayer:
+    """Boxes that are drawn into the images.
+
+    Attributes:
+        kind: of their overlay, see `bevcli.recording.entities.overlay`.
+        corners: (N, 8, 3) in the recording's world.
+        colors: (N, 3) uint8.
+        texts: N labels; None for none.
+        width: of the lines, in points of the user interface.
+        order: boxes with a higher one are drawn above others.
+    """
+
+    kind: str
+    corners: Array
+    colors: NDArray[np.uint8]
+    texts: list[str] | None = None
+    width: float = 1.0
+    order: int = 30
+
+
+@dataclass(frozen=True)
 class ImageLines:
     """Lines in an image.
 
@@ -257,33 +278,27 @@ class CameraImages:
 
 
 def log_boxes_in_images(
-    stream: rr.RecordingStream,
-    cameras: Sequence[PosedCamera],
-    corners: Array,
-    colors: NDArray[np.uint8],
-    texts: list[str],
-    truth: tuple[Array, NDArray[np.uint8]] | None,
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], layers: Sequence[ImageLayer]
 ) -> None:
-    """Draws predicted boxes with labels, and ground-truth boxes, into the images.
-
-    corners: (N, 8, 3) in the recording's world. colors: (N, 3). texts: N labels. truth: corners (M, 8, 3) and colours
-    (M, 3) of ground-truth boxes; None without ground truth.
-    """
-    true_corners, true_colors = (corners[:0], colors[:0]) if truth is None else truth
-    all_corners, all_colors = np.concatenate([corners, true_corners]), np.concatenate([colors, true_colors])
-    for posed, lines in zip(cameras, lines_in_images(all_corners, cameras), strict=True):
-        camera, count = posed.camera, int(np.searchsorted(lines.owners, len(corners)))
-        parts = [("boxes", slice(0, count), 1.0, 30)]
-        if truth is not None:
-            parts.append(("ground_truth", slice(count, None), 0.6, 20))
-        for kind, part, width, order in parts:
-            segments, own, radii = lines.segments[part], all_colors[lines.owners[part]], ui_points(width)
-            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=order)
-            log(stream, entities.overlay(camera.name, kind), strips)
-        predicted = ImageLines(lines.segments[:count], lines.owners[:count])
+    """Draws boxes, and the labels of those that have some, into the images. Layers with labels come first."""
+    corners, colors = (np.concatenate([getattr(each, part) for each in layers]) for part in ("corners", "colors"))
+    texts = [text for each in layers for text in each.texts or ()]
+    starts = np.cumsum([0, *(len(each.corners) for each in layers)])
+    for posed, lines in zip(cameras, lines_in_images(corners, cameras), strict=True):
+        camera, ends = posed.camera, np.searchsorted(lines.owners, starts).tolist()
+        labelled = int(np.searchsorted(lines.owners, len(texts)))
+        predicted = ImageLines(lines.segments[:labelled], lines.owners[:labelled])
         positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
-        labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-        log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
+        for i, each in enumerate(layers):
+            part, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, each.kind)
+            segments, own, radii = lines.segments[part], colors[lines.owners[part]], ui_points(each.width)
+            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=each.order)
+            log(stream, entity, strips)
+            if each.texts is not None:
+                chosen = (owners >= starts[i]) & (owners < starts[i + 1])
+                names, own = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
+                labels = labels_2d(positions[chosen], names, colors=own, draw_order=each.order + 1)
+                log(stream, f"{entity}/labels", labels)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:

@@ -19,8 +19,8 @@ from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, Prediction
 from bevcli.recording import entities, log_static
 from bevcli.recording.blueprint import Layout, recording_blueprint
-from bevcli.recording.frame_log import FrameLog, FrameLogState
-from bevcli.recording.log_static import Recorded, RecordedDrive, RecordedModel
+from bevcli.recording.frame_log import FileBoxes, FrameLog, FrameLogState
+from bevcli.recording.log_static import Recorded, RecordedBoxes, RecordedDrive, RecordedModel
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.incremental_json import GrowingFile
 
@@ -179,7 +179,7 @@ class Recording:
     Args:
         path: the .rrd file to write; an existing one is replaced.
         sequence: the drive, or a `Session`; the rig and the name are taken from it.
-        model: the class names, the name and whether it is trained are taken from it.
+        model: the class names, the name and whether it is trained are taken from it; `RecordedBoxes` without a model.
         options: how much is written; the defaults of RecordingOptions if None.
         live: a viewer that follows the recording; None for no viewer.
         resume: `state()` of the recording that was interrupted; the file is cut to its size and goes on from there.
@@ -191,7 +191,7 @@ class Recording:
         self,
         path: str | Path,
         sequence: RecordedDrive,
-        model: RecordedModel,
+        model: RecordedModel | RecordedBoxes,
         options: RecordingOptions | None = None,
         live: LiveSink | None = None,
         resume: RecordingState | None = None,
@@ -210,20 +210,20 @@ class Recording:
         self._frame_log = FrameLog(self._stream, self._recorded, frames)
 
     def __enter__(self) -> Recording:
-        recorded, config = self._recorded, self._recorded.model.config
+        recorded, object_classes = self._recorded, self._recorded.object_classes
         vehicle, of_classes = None, {}
         path = recorded.options.vehicle_mesh
-        if path is not None or any(settings.mesh for settings in config.object_classes.values()):
+        if path is not None or any(settings.mesh for settings in object_classes.values()):
             from bevcli.recording import meshes
 
             vehicle = None if path is None else meshes.load_vehicle(path)
-            of_classes = meshes.read_class_meshes(config.object_classes)
+            of_classes = meshes.read_class_meshes(object_classes)
         self._layout = recording_blueprint(recorded)
         self.file = RrdFile(self.path, self._size)
         self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
-        log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, config.bev_grid)
+        log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, recorded.grid)
         for name, mesh in of_classes.items():
             log_static.log_mesh(self._stream, entities.class_mesh(name), mesh)
         log_static.log_about(self._stream, recorded)
@@ -264,9 +264,12 @@ class Recording:
         frames = self._frame_log.state()
         return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
 
-    def log(self, frame: Frame, prediction: Prediction) -> None:
-        """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
-        self._frame_log.log(frame, prediction)
+    def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+        """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals.
+
+        found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the frame.
+        """
+        self._frame_log.log(frame, found)
         self._flush()
         self._frames += 1
         if self._frames % INDEXED_FRAMES == 0:
