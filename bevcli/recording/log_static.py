@@ -330,10 +330,10 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
         how = TWO_MODELS if files.names else LABELS_ALONE
     page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{how}", media_type="text/markdown")
     stream.log(entities.RUN, page, facts, static=True)
-    entries = legend_entries(recorded)
-    rows = -(-len(entries) // LEGEND_COLUMNS)
-    spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
-    texts, colors_of_entries = zip(*entries, strict=True)
+    legend = legend_entries(recorded)
+    rows = -(-len(legend) // LEGEND_COLUMNS)
+    spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(legend))])
+    texts, colors_of_entries = zip(*legend, strict=True)
     circles = rr.Points2D(spots + (0.7, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
     stream.log(f"{entities.LEGEND}/colors", circles, static=True)
     labels = labels_2d(spots + (5.0, -0.25), list(texts), colors=TEXT_COLOR)  # a label is drawn below its point
