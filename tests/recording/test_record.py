@@ -11,7 +11,7 @@ from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.errors import InputError
 from bevcli.evaluation.submission import write_submission
-from bevcli.frame import Frame
+from bevcli.frame import BevMap, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording import entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
@@ -192,12 +192,26 @@ def test_labels_of_any_class_have_a_colour(tmp_path):
     assert read.integers(entities.BOXES, "Boxes3D:class_ids") == [11, 1]
 
 
+def test_a_labelled_map_lies_on_the_ground(tmp_path):
+    drive = Labelled(2)
+    frames = [drive.load(place) for place in range(2)]
+    frames[0] = replace(frames[0], ground_truth_map=BevMap(np.ones((4, 4), np.uint8), (-8, 8), (-8, 8), {"road": 1}))
+    drive.load = lambda place: frames[place]  # type: ignore[method-assign]
+    first, last = frames_of(record(drive, path=tmp_path / "r.rrd"))
+    assert first.texts(entities.RUN, "map_classes") == ["road"]
+    assert first.has(entities.BEV_SEGMENTATION, "Image:buffer")
+    assert not last.has(entities.BEV_SEGMENTATION, "Image:buffer")
+
+
 def test_wrong_boxes_get_one_line(tmp_path):
     drive = Labelled(2)
     with pytest.raises(InputError, match=r"of 3 models \(expected at most 2\)"):
         record(drive, dict.fromkeys("abc", [Boxes3D.empty()] * 2))
     with pytest.raises(InputError, match=r"found 1 \(expected 2, one for each frame\)"):
         record(drive, [Boxes3D.empty()])
+    for boxes, found in ((boxes_of(drive, 0), "those of one frame"), ([predict(drive.load(0))] * 2, "a Prediction")):
+        with pytest.raises(InputError, match=rf"found {found} \(expected a file, or a list with the Boxes3D of each"):
+            record(drive, boxes)
     write_boxes(boxes_file(drive, range(2)), tmp_path / "a.json")
     other = json.loads((tmp_path / "a.json").read_text())
     for frame in other["frames"]:
