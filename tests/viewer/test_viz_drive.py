@@ -8,9 +8,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from command_line import command
+from recorded_drive import screenshot_or_skip
 from typer.testing import CliRunner
 
 import bevcli
@@ -142,3 +144,14 @@ def test_the_commands_of_the_page_run(folder, opened):
     with contextlib.chdir(folder):
         exec(example, {})
     assert (folder / "labels.rrd").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_both_models_and_a_tab_for_each(folder, tmp_path):
+    viz(folder, f"samples/street --boxes mine.json --boxes other.json --frames 0:1 --out {tmp_path}/two.rrd")
+    views = screenshot_or_skip(tmp_path / "two.rrd", tmp_path / "two.png")
+    assert views.count("BEV") == views.count("3D scene") == views.count("CAM_FRONT") == 3
+    assert "BEV features" not in views
+    image = cv2.imread(str(tmp_path / "two.png"))[:, : round(0.7 * 1920)].astype(int)
+    for own in entities.LAYER_COLORS:
+        assert (np.abs(image - own[::-1]).sum(-1) < 40).sum() > 200
