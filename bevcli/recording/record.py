@@ -4,8 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from bevcli.errors import InputError
-from bevcli.evaluation.inputs import ScoredInput, boxes_of_drive, open_predictions
+from bevcli.evaluation.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 from bevcli.evaluation.matching import ranges_m
 from bevcli.frame import Frame, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
@@ -18,6 +20,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, count_class
 from bevcli.sequences.open import open_sequence
 
 MOST = 2  # models: each has a colour
+FAR_M = 150.0  # boxes that are all farther away are of another drive, or in another frame of reference
 GivenBoxes = str | Path | Sequence[Boxes3D | None]
 
 
@@ -117,13 +120,18 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
 def _by_frame(drive: Drive, name: str, given: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
     """The boxes of one model for each frame of the drive. Raises InputError, which names the model."""
     try:
-        of_frames, key = boxes_of_drive(given.boxes, drive)
+        of_frames, pairs = boxes_of_drive(given.boxes, drive)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    found = sum(boxes is not None for boxes in of_frames)
+    found = len(pairs.predictions)
     rest = len(given.boxes.frames) - found
     more = f"; not in the drive: {counted(rest, 'further frames')}" if rest else ""
+    key = pairs.matched_by if pairs.matched_by in RELIABLE else f"{pairs.matched_by}, as scenes or times differ"
     report(f"{name}: has boxes of {found} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
+    sides = zip(pairs.predictions, pairs.ego_xy, strict=True)
+    away = np.concatenate([np.linalg.norm(frame.boxes.centers[:, :2] - ego, axis=1) for frame, ego in sides])
+    if len(away) and away.min() > FAR_M:
+        report(f"warning: {name}: the nearest box is {away.min():.0f} m from the vehicle: is it of this drive?")
     return of_frames
 
 

@@ -1,6 +1,7 @@
 """A drive is recorded without a model: its labels alone, and boxes of one or two files against them."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from bevcli.errors import InputError
 from bevcli.evaluation.submission import write_submission
 from bevcli.frame import BevMap, Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import rigid
 from bevcli.recording import entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
 from bevcli.recording.options import RecordingOptions
@@ -115,6 +117,17 @@ def test_frames_of_a_submission_are_matched_by_token(tmp_path):
     assert last.texts(entities.MISSED, "name") == last.texts(entities.BOXES, "name") == []
     assert last.texts(entities.GROUND_TRUTH, "name") == ["car", "bicycle"]
     assert last.texts(entities.EVENTS, "TextLog:text") == ["frame 2: results_nusc does not have this frame"]
+
+
+def test_boxes_of_another_drive_are_told(tmp_path):
+    drive, lines = Labelled(1), list[str]()
+    file = boxes_file(drive, range(1))
+    stamp = replace(drive.stamps[0], scene="b", timestamp_ns=7)
+    far = file.frames[0].boxes.transformed(rigid((0, -2000, 0)))
+    write_boxes(BoxesFile("world", (FrameBoxes(stamp, drive.pose(0), far),)), tmp_path / "a.json")
+    record(drive, tmp_path / "a.json", tmp_path / "r.rrd", report=lines.append)
+    assert lines[0] == "a: has boxes of 1 of 1 frame, matched by frame index, as scenes or times differ"
+    assert re.fullmatch(r"warning: a: the nearest box is 19\d\d m from the vehicle: is it of this drive\?", lines[1])
 
 
 def test_trails_end_where_a_file_lacks_a_frame(tmp_path):
