@@ -238,7 +238,7 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
     unit = (
         drive.stated.pose_times or (stated and (stated[1] or stated[2])) or _unit(table.path, values, positions, drive)
     )
-    if not all(abs(value * UNITS_NS[unit]) < LARGEST_INTEGER for value in (values[0], values[-1])):
+    if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
         raise InputError(f"{rows[0].path}: the times are too large for {UNIT_WORDS[unit]}: pass `pose_times`")
     times = np.array([int((value * UNITS_NS[unit]).to_integral_value()) for value in values], dtype=np.int64)
     return times, UNIT_WORDS[unit] + (" since 1970" if YEARS_NS[0] <= times[0] <= YEARS_NS[1] else "")
