@@ -10,7 +10,7 @@ import pytest
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Pose, inverse, rigid
-from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_ego_motion, read_poses
+from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_ego_motion, read_poses
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import RigOptions
 
@@ -36,7 +36,7 @@ FRAMES = TIMES[5:50:5]
 def read(path: Path, text: str, rig: CameraRig = RIG, frames=FRAMES, **stated) -> ReadPoses:
     path = path / "poses.txt"
     path.write_text(text)
-    return read_poses(path, DrivePoses(rig, np.asarray(frames), RigOptions(**stated)))
+    return read_poses(path, DrivePoses(rig, RigOptions(**stated), None if frames is None else np.asarray(frames)))
 
 
 def lines(*columns, separator=" ", header="") -> str:
@@ -205,14 +205,26 @@ def test_the_angle_of_a_vehicle_that_stands_needs_no_unit(tmp_path):
     assert read(tmp_path, standing("0.5")).motion.velocities == pytest.approx(0)
 
 
+def test_times_of_frames_that_are_not_known_are_asked_for(circle, tmp_path):
+    for name in ("tum", "yaw in degrees, milliseconds", "gps"):
+        found = read(tmp_path, FORMATS[name][0], frames=None)
+        np.testing.assert_array_equal(found.motion.timestamps_ns, TIMES)
+        assert found.notes[0].endswith(", of the vehicle")
+    for text in (kitti(camera_poses(first_world=True)), SLOW):
+        with pytest.raises(FrameTimesNeeded):
+            read(tmp_path, text, frames=None)
+
+
+# A row a second of a slow vehicle, or one a millisecond.
+SLOW = lines([f"{place}" for place in range(COUNT)], X / 1000, Y / 1000, ZERO, *LEVEL, QZ, QW)
+
+
 def test_times_with_two_readings_are_asked_for(tmp_path):
-    count = [f"{place}" for place in range(COUNT)]  # a row a second of a slow vehicle, or one a millisecond
-    text = lines(count, X / 1000, Y / 1000, ZERO, *LEVEL, QZ, QW)
     frames = [5_000_000, 10_000_000]
     with pytest.raises(InputError, match=r"may be seconds or milliseconds: pass `pose_times=s` or `pose_times=ms`"):
-        read(tmp_path, text, frames=frames)
-    assert read(tmp_path, text, frames=frames, pose_times="ms").motion.last_ns == 59_000_000
-    assert "seconds" in read(tmp_path, text, frames=[5 * 10**9, 55 * 10**9]).notes[0]  # only these cover the frames
+        read(tmp_path, SLOW, frames=frames)
+    assert read(tmp_path, SLOW, frames=frames, pose_times="ms").motion.last_ns == 59_000_000
+    assert "seconds" in read(tmp_path, SLOW, frames=[5 * 10**9, 55 * 10**9]).notes[0]  # only these cover the frames
 
 
 @pytest.mark.parametrize(
@@ -260,3 +272,22 @@ def test_a_place_on_earth_becomes_that_of_the_drive(drive, tmp_path):
     assert (opened.facts.geo_origin.latitude_deg, opened.facts.geo_origin.longitude_deg) == (48, 11.5)
     moved = opened.load(2).world_from_ego.translation - opened.load(0).world_from_ego.translation
     assert moved == pytest.approx([0, 111.2, 0], abs=0.1)  # a second, 0.001 degrees of latitude
+
+
+def test_the_heading_of_gps_is_clockwise_from_north(tmp_path):
+    there = ["48"] * COUNT, ["11"] * COUNT, np.linspace(0, 5, COUNT)
+    found = read(tmp_path, lines(S, *there, separator=",", header="t,lat,lon,heading"))
+    yaws = [np.degrees(Pose(np.zeros(3), quaternion).yaw) for quaternion in found.motion.quaternions]
+    assert yaws == pytest.approx(90 - np.linspace(0, 5, COUNT))
+    turned = read(tmp_path, lines(S, X, Y, COMPASS, separator=",", header="t,x,y,heading"), pose_angles="compass")
+    assert Pose(np.zeros(3), turned.motion.quaternions[0]).yaw == pytest.approx(YAW[0])
+
+
+def test_pitch_lifts_the_nose_with_a_heading_from_north(tmp_path):
+    climbs = ZERO + 2.0  # degrees
+    up = np.tan(np.radians(2)) * SPEED * 0.1 * np.arange(COUNT)
+    header = "t,lat,lon,alt,roll_deg,pitch_deg,heading_deg"
+    text = lines(S, LATITUDE, LONGITUDE, up, ZERO, climbs, COMPASS, separator=",", header=header)
+    velocities = read(tmp_path, text).motion.velocities[1:-1]
+    assert velocities[:, 2] == pytest.approx(0, abs=0.02)
+    assert velocities[:, 0] == pytest.approx(SPEED / np.cos(np.radians(2)), abs=0.02)

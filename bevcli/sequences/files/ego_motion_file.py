@@ -26,19 +26,23 @@ NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
 AHEAD = np.radians(45)  # largest yaw of a camera that looks ahead
 
 
+class FrameTimesNeeded(InputError):
+    """A file of poses cannot be read without the times of the frames. Raised where they were not given."""
+
+
 @dataclass(frozen=True)
 class DrivePoses:
     """The drive that a file of poses is for, and what the user states of the file.
 
     Attributes:
         rig: of the drive.
-        times_ns: (F,) of its frames.
         stated: `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found.
+        times_ns: (F,) of its frames; None while they are not known.
     """
 
     rig: CameraRig
-    times_ns: NDArray[np.int64]
     stated: RigOptions
+    times_ns: NDArray[np.int64] | None = None
 
     @property
     def cameras_ahead(self) -> list[Camera]:
@@ -48,7 +52,13 @@ class DrivePoses:
 
 @dataclass(frozen=True)
 class ReadPoses:
-    """The poses of a file, notes on how it was read, and the place of their world frame on Earth; None if unknown."""
+    """The poses of a file.
+
+    Attributes:
+        motion: None without poses.
+        notes: for the user, such as how the file was read.
+        geo_origin: the place of their world frame on Earth, where the file says it.
+    """
 
     motion: EgoMotion | None
     notes: tuple[str, ...] = ()
@@ -59,7 +69,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
     """The poses of ego_motion.csv, or of a file of a kind that is registered under `bevcli.poses`.
 
     Each entry of that group is a function of the same arguments, which returns None for a file that it does not know.
-    Raises InputError.
+    Raises InputError, and FrameTimesNeeded for a file whose times only those of the frames can explain.
     """
     for name in () if _is_own(path) else entries(GROUP):
         found: ReadPoses | None = load(GROUP, name)(path, drive)

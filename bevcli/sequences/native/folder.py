@@ -141,7 +141,7 @@ def _read_poses(
     if not is_there(file):
         return ReadPoses(None, ("ego_motion.csv is missing: boxes are in the ego frame",))
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    poses = read_poses(file, DrivePoses(rig, frame_times, own))
+    poses = read_poses(file, DrivePoses(rig, own, frame_times))
     assert poses.motion is not None
     first, last = poses.motion.first_ns, poses.motion.last_ns
     read_as = f", read as {poses.notes[0]}" if poses.notes else ""

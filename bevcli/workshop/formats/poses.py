@@ -23,7 +23,7 @@ from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin, quaternion_fr
 from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
-from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, ReadPoses
+from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
 from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
@@ -130,11 +130,13 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     if camera is not None:
         readings = [each for reading in readings for each in of_vehicle(reading, camera)]
     chosen = best_reading(path, readings, times, ask, drive)
-    covered = _covered(int(times[0]), int(times[-1]), drive)
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
     words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, chosen.words, of)
-    cover = "all" if covered == len(drive.times_ns) else f"{covered} of {len(drive.times_ns)}"
-    note = f"poses: {', '.join(word for word in words if word)}; cover {cover} frames"
+    note = f"poses: {', '.join(word for word in words if word)}"
+    if drive.times_ns is not None:
+        covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
+        count = len(drive.times_ns)
+        note += f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
     kinematics = derive_kinematics(times, chosen.translations, chosen.quaternions)
     poses = (times, chosen.translations, chosen.quaternions)
     return ReadPoses(EgoMotion(*poses, *kinematics, velocities_are_stated=False), (note,), origin)
@@ -216,12 +218,12 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
         path, count = table.path, len(rows)
         beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
         file = next((each for each in beside if is_there(each)), None)
-        if file is None and count != len(drive.times_ns):
-            raise InputError(
-                f"{path}: has {count} poses without times, and the drive has {len(drive.times_ns)} frames: put "
-                f"times.txt beside it, with {count} lines"
-            )
+        if file is None and (drive.times_ns is None or count != len(drive.times_ns)):
+            frames = "" if drive.times_ns is None else f", and the drive has {len(drive.times_ns)} frames"
+            message = f"{path}: has {count} poses without times{frames}: put times.txt beside it, with {count} lines"
+            raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
         if file is None:
+            assert drive.times_ns is not None
             return drive.times_ns, "the times of the frames"
         lines = [line for line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1) if line[1].strip()]
         if len(lines) != count:
@@ -275,20 +277,23 @@ def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePo
             unit for unit, ns in UNITS_NS.items()
             if PERIODS_S[0] <= period * ns <= PERIODS_S[1] and speed / ns <= FASTEST_M_S
         ] or units  # fmt: skip
-    covered = {unit: _covered(times[0] * UNITS_NS[unit], times[-1] * UNITS_NS[unit], drive) for unit in units}
-    units = [unit for unit in units if covered[unit] == max(covered.values())]
+    if drive.times_ns is not None:
+        ends = {unit: (times[0] * UNITS_NS[unit], times[-1] * UNITS_NS[unit]) for unit in units}
+        covered = {unit: _covered(*ends[unit], drive.times_ns) for unit in units}
+        units = [unit for unit in units if covered[unit] == max(covered.values())]
     recent = [unit for unit in units if YEARS_NS[0] <= times[0] * UNITS_NS[unit] <= YEARS_NS[1]]
     units = recent or units
     if len(units) > 1:
         words = " or ".join(UNIT_WORDS[unit] for unit in units)
         options = " or ".join(f"`pose_times={unit}`" for unit in units)
-        raise InputError(f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}")
+        message = f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}"
+        raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
     return units[0]
 
 
-def _covered(first: Decimal | int, last: Decimal | int, drive: DrivePoses) -> int:
+def _covered(first: Decimal | int, last: Decimal | int, times_ns: NDArray[np.int64]) -> int:
     """Number of frames that poses from `first` to `last`, ns, cover."""
-    return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in drive.times_ns.tolist())
+    return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
 
 
 def _camera(path: Path, kind: Kind, drive: DrivePoses) -> tuple[Camera | None, str]:

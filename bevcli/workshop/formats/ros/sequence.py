@@ -223,7 +223,7 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     used_rig = reader.rig() if rig is None else rig
     entries = _entries(bag, finder.cameras)
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    given = None if file is None else partial(read_poses, file, DrivePoses(used_rig, frame_times, own))
+    given = None if file is None else partial(read_poses, file, DrivePoses(used_rig, own, frame_times))
     motion, source, motion_notes = reader.motion(common.ego_motion, given)
     geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
     entries, gaps = _covered(entries, motion, path)
