@@ -195,7 +195,10 @@ def standing(text_yaw: str) -> str:
 
 @pytest.mark.parametrize(("unit", "turn"), [("degrees", np.radians(0.5)), ("radians", 0.5)])
 def test_angles_that_nothing_decides_are_asked_for(unit, turn, tmp_path):
-    with pytest.raises(InputError, match=r"yaw in radians .*does not move.*pass `pose_angles=degrees` or "):
+    with pytest.raises(
+        InputError,
+        match=r"may have yaw in radians .* or yaw in degrees .*does not move.*pass `pose_angles=degrees` or ",
+    ):
         read(tmp_path, standing("0"))
     found = read(tmp_path, standing("0"), pose_angles=unit)
     assert Pose(np.zeros(3), found.motion.quaternions[-1]).yaw == pytest.approx(turn)

@@ -71,11 +71,16 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
     Each entry of that group is a function of the same arguments, which returns None for a file that it does not know.
     Raises InputError, and FrameTimesNeeded for a file whose times only those of the frames can explain.
     """
-    for name in () if _is_own(path) else entries(GROUP):
+    if _is_own(path):
+        return ReadPoses(read_ego_motion(path))
+    for name in entries(GROUP):
         found: ReadPoses | None = load(GROUP, name)(path, drive)
         if found is not None:
             return found
-    return ReadPoses(read_ego_motion(path))
+    try:
+        return ReadPoses(read_ego_motion(path))
+    except InputError as error:
+        raise InputError(f"{error}; other kinds of poses are in docs/other-inputs.md#poses") from None
 
 
 def _is_own(path: Path) -> bool:

@@ -62,9 +62,9 @@ def best_reading(
     least, first = min(misfits), readings[0]
     decided = least <= LARGEST_MISFIT_DEG and (moves or not any(first.differs_from(other) for other in readings[1:]))
     if ask and len(readings) > 1 and not decided:
-        words = ", ".join(f"{each.words} ({misfit:.0f}°)" for each, misfit in zip(readings, misfits, strict=True))
-        why = "none fits how the vehicle moves" if moves else "the vehicle does not move, which would decide"
-        raise InputError(f"{path}: the angles may be {words}; {why}: pass {ask}")
+        words = " or ".join(each.words for each in readings)
+        why = f"none fits how the vehicle moves, the best is {least:.0f}° off" if moves else "the vehicle does not move"
+        raise InputError(f"{path}: may have {words}; {why}, which would decide: pass {ask}")
     if least > LARGEST_MISFIT_DEG:
         _refuse_poses_of_camera(path, first, times_ns, drive)
         return first
