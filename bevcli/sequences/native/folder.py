@@ -21,7 +21,8 @@ from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import true_results
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
-from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
+from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -40,7 +41,7 @@ class FolderSequence(ListedSequence):
         self,
         path: Path,
         common: SequenceOptions = SequenceOptions(),
-        own: RigOptions = RigOptions(),
+        own: FolderOptions = FolderOptions(),
         rig: CameraRig | None = None,
     ) -> None:
         if not path.is_dir():
@@ -48,19 +49,22 @@ class FolderSequence(ListedSequence):
         rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
             rig, facts = read_rig_and_facts(path / CALIBRATION)
-        table = path / "frames.csv"
+        table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         notes: tuple[str, ...] = ()
+        advice = "add ego-motion, or remove the frame"
         if is_there(table):
             entries = read_frames_table(table, rig.names)
+            motion, motion_notes = _read_motion(file, common.ego_motion)
         else:
             from bevcli.sequences.native.unlisted import find_frames
 
-            entries, notes = find_frames(path, rig.names)
+            motion, motion_notes = _read_motion(file, common.ego_motion)
+            entries, notes = find_frames(path, rig.names, own, motion)
+            advice = "state the time of the first image by `start_ns`, or in timing.toml"
         if not common.allow_outside:
             _check_paths(path, entries)
-        file = own.ego_motion_file or path / "ego_motion.csv"
-        advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-        motion, motion_notes = _read_motion(file, common.ego_motion, entries, advice)
+        if motion is not None:
+            _check_covered(file, motion, entries, advice)
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
@@ -124,10 +128,8 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
                 )
 
 
-def _read_motion(
-    file: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...], advice: str
-) -> tuple[EgoMotion | None, tuple[str, ...]]:
-    """The poses, None without any, and notes. advice: for frames at times that the poses do not cover."""
+def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple[str, ...]]:
+    """The poses, None without any, and notes."""
     if use == "static":
         unread = f" ({file.name} is not read)" if is_there(file) else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
@@ -138,7 +140,11 @@ def _read_motion(
         )
     if not is_there(file):
         return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
-    motion = read_ego_motion(file)
+    return read_ego_motion(file), ()
+
+
+def _check_covered(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...], advice: str) -> None:
+    """Raise InputError for a frame or an image at a time that the poses do not cover. advice: what to do."""
     first, last = motion.first_ns, motion.last_ns
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
@@ -149,7 +155,6 @@ def _read_motion(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
                 )
-    return motion, ()
 
 
 def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:
