@@ -34,6 +34,7 @@ class FolderSequence(ListedSequence):
     """A native sequence folder as a `Sequence`.
 
     rig: used in place of the rig of `own` and of calibration.json, if given.
+    Attribute understood: how the images were understood without frames.csv, "" with it.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -50,16 +51,13 @@ class FolderSequence(ListedSequence):
         if rig is None:
             rig, facts = read_rig_and_facts(path / CALIBRATION)
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
-        notes: tuple[str, ...] = ()
-        advice = "add ego-motion, or remove the frame"
-        if is_there(table):
-            entries = read_frames_table(table, rig.names)
-            motion, motion_notes = _read_motion(file, common.ego_motion)
-        else:
+        entries = read_frames_table(table, rig.names) if is_there(table) else ()
+        motion, motion_notes = _read_motion(file, common.ego_motion)
+        self.understood, advice = "", "add ego-motion, or remove the frame"
+        if not entries:
             from bevcli.sequences.native.unlisted import find_frames
 
-            motion, motion_notes = _read_motion(file, common.ego_motion)
-            entries, notes = find_frames(path, rig.names, own, motion)
+            entries, self.understood = find_frames(path, rig.names, own, motion)
             advice = "state the time of the first image by `start_ns`, or in timing.toml"
         if not common.allow_outside:
             _check_paths(path, entries)
@@ -72,7 +70,7 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*bev_frame_notes(rig), *notes, *motion_notes)
+        notes = (*bev_frame_notes(rig), *filter(None, [self.understood]), *motion_notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 

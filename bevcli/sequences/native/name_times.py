@@ -262,7 +262,8 @@ def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> 
 
 def _steps(values: Mapping[str, Times]) -> list[Times]:
     """Of each camera with two or more images, the steps from one to the next."""
-    return [np.diff(np.sort(each)) for each in values.values() if len(each) > 1]
+    ordered = [np.sort(each) for each in values.values() if len(each) > 1]
+    return [each[1:] - each[:-1] for each in ordered]
 
 
 def _has_rate(values: Mapping[str, Times]) -> bool:

@@ -31,7 +31,7 @@ from bevcli.sequences.videos import VIDEO_SUFFIXES, count_and_rate
 
 FILE_NAME = "timing.toml"
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
-Found = tuple[tuple[FrameEntry, ...], tuple[str, ...]]  # frames, and a note
+Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understood
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def find_frames(
         )
     entries, left_out = _with_poses(found, motion)
     outside = f"; {counted(left_out, 'frames')} outside of the poses left out" if left_out else ""
-    return entries, (f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}{outside}",)
+    return entries, f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}{outside}"
 
 
 def _with_poses(entries: tuple[FrameEntry, ...], motion: EgoMotion | None) -> tuple[tuple[FrameEntry, ...], int]:
@@ -155,7 +155,7 @@ def _folders(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.is_dir())
 
 
-def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None) -> Found:
     """Frames of image files, and what their names were understood as."""
     found = _folders(folder)
     matched = match_names(timing.cameras, found)
@@ -189,9 +189,7 @@ def _image_files(folder: Path) -> list[Path]:
     return list(images.values())
 
 
-def _from_times(
-    paths: Mapping[str, list[Path]], reading: Reading, timing: Timing
-) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timing) -> Found:
     """Frames of images whose names are times: of all cameras those that are nearest to each other."""
     start, first = timing.start_ns, min(int(times.min()) for times in reading.values.values())
     moved = 0 if start is None or reading.is_known_origin else start - first
@@ -222,7 +220,7 @@ def _missing(missing: int, images: int) -> str:
 
 def _from_indices(
     folder: Path, paths: Mapping[str, list[Path]], reading: Reading, timing: Timing, motion: EgoMotion | None
-) -> tuple[tuple[FrameEntry, ...], str]:
+) -> Found:
     """Frames of numbered images: each has the images of one number."""
     numbered = {camera: dict(zip(reading.values[camera].tolist(), of, strict=True)) for camera, of in paths.items()}
     numbers = sorted(set().union(*numbered.values()))
@@ -272,7 +270,7 @@ def _times_of_indices(
     return [start + round((number - first) * 1e9 / rate) for number in numbers], f"at {rate:g} Hz{assumed}"
 
 
-def _from_videos(folder: Path, timing: Timing) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_videos(folder: Path, timing: Timing) -> Found:
     """Frames of videos, one for each image of the slowest, and what was understood."""
     files: dict[str, list[Path]] = {}
     for path in sorted((folder / "videos").iterdir()):
