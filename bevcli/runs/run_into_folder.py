@@ -39,8 +39,9 @@ def run_into_folder(
     """Run a model over a sequence and write recording, boxes, tracks, maps and summary.json into a folder.
 
     Whatever ends the run: the files hold all finished frames, summary.json is written, and the state is saved, so that
-    `resume` can go on. A run that an error ends before its first frame with images leaves no files. The files of a killed process hold all finished frames too, predictions.json as
-    predictions.json.partial; its run goes on from the last saved state.
+    `resume` can go on. A run that an error ends before its first frame with images leaves no files. The files of a
+    killed process hold all finished frames too, predictions.json as predictions.json.partial; its run goes on from the
+    last saved state.
 
     Args:
         model: of `load_model`.
