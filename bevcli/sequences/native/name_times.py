@@ -249,7 +249,7 @@ def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> 
     possible = [reading for reading in made if reading is not None]
     if not possible:
         example = next(iter(names.values()))[0]
-        expected = "a date and a time such as 20260301120000" if kind == "date" else "a number"
+        expected = "a date such as 20260301120000" if kind == "date" else f"a number that is possible in {WORDS[kind]}"
         raise InputError(
             f'{where}: `times="{kind}"`: expected in each name {expected} that differs from image to image, found '
             f"{example}: pass another unit"

@@ -10,6 +10,8 @@ from bevcli.sequences.options import RigOptions
 
 # Seconds and their parts, a date with a time of day, or the index of an image.
 TimeKind = Literal["s", "ms", "us", "ns", "date", "index"]
+RATES_HZ = (0.001, 10_000.0)
+LARGEST_NS = 1 << 61  # of a stated time, so that sums have 64 bits
 
 
 @options("Input")
@@ -32,5 +34,8 @@ class FolderOptions(RigOptions):
     )
 
     def __post_init__(self) -> None:
-        if self.image_rate_hz is not None and not 0 < self.image_rate_hz < 10_000:
-            raise InputError(f"`image_rate_hz={self.image_rate_hz:g}`: expected images per second, above 0")
+        slowest, fastest = RATES_HZ
+        if self.image_rate_hz is not None and not slowest <= self.image_rate_hz <= fastest:
+            raise InputError(f"`image_rate_hz={self.image_rate_hz:g}`: expected images per second, {slowest:g} or more")
+        if self.start_ns is not None and abs(self.start_ns) > LARGEST_NS:
+            raise InputError(f"`start_ns={self.start_ns}`: expected nanoseconds, at most {LARGEST_NS}")

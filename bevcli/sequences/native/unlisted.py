@@ -26,7 +26,7 @@ from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.sequences.native.camera_names import match_names, renamed
 from bevcli.sequences.native.matching import CameraImages, Matched, match, measured_periods
 from bevcli.sequences.native.name_times import NUMBER, Reading, read_names
-from bevcli.sequences.native.options import FolderOptions, TimeKind
+from bevcli.sequences.native.options import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
 from bevcli.sequences.videos import VIDEO_SUFFIXES, count_and_rate
 
 FILE_NAME = "timing.toml"
@@ -96,7 +96,7 @@ def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[s
 
 def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int | None:
     value = table.get(key)
-    if value is not None and (not isinstance(value, int) or isinstance(value, bool)):
+    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or abs(value) > LARGEST_NS):
         raise InputError(f"{path}: {where}{key}: expected an integer (nanoseconds), found {value!r}")
     return value
 
@@ -105,7 +105,7 @@ def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
     value = table.get("rate_hz")
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 10_000:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not RATES_HZ[0] <= value <= RATES_HZ[1]:
         raise InputError(f"{path}: {where}rate_hz: expected images per second, above 0, found {value!r}")
     return float(value)
 
