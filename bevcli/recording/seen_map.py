@@ -25,10 +25,10 @@ class SeenCells:
         """
         rows, columns = ground_map.cells.shape
         if frame.rig is not self._rig:
-            area = {"x_range_m": ground_map.x_range_m, "y_range_m": ground_map.y_range_m}
-            pillars = replace(grid, rows=rows, columns=columns, **area).pillars()
-            points = apply(frame.rig.ego_from_bev, pillars[::-1])  # (Y, X, Z, 3), the largest y first
-            self._of_camera = {camera.name: camera.sees(points).any(-1) for camera in frame.rig.cameras}
+            x_range_m, y_range_m = ground_map.x_range_m, ground_map.y_range_m
+            of_map = replace(grid, rows=rows, columns=columns, x_range_m=x_range_m, y_range_m=y_range_m)
+            points = apply(frame.rig.ego_from_bev, of_map.pillars()[::-1])  # (Y, X, Z, 3), the largest y first
+            self._of_camera = {camera.name: np.any(camera.sees(points), axis=-1) for camera in frame.rig.cameras}
             self._rig = frame.rig
         seen = np.zeros((rows, columns), dtype=bool)
         for camera in frame.images:

@@ -150,11 +150,11 @@ def test_frames_before_the_first_pose_are_left_out(drive):
     [
         ([f"{10**14 + n * 250 * 10**9}" for n in range(5)], {}, r"no times of a camera in any unit.*`times`"),
         (["a_1", "a_2", "a_3_4"], {}, r"a_3_4 has 2 numbers, and a_1 has 1: rename"),
-        ([f"{START_S}{n}00000" for n in range(5)], {"times": "ms"}, r"a number that is possible in milliseconds"),
+        ([f"{START_S}{n}00000" for n in range(5)], {"times": "ms"}, r"expected milliseconds, different"),
         (["1", "2", "3"], {"image_rate_hz": 1e-300}, r"expected images per second, 0.001 or more"),
         (["1", "2", "3"], {"start_ns": 10**30}, r"expected nanoseconds, at most"),
-        (["1", "2", "3"], {"times": "date"}, r"expected in each name a date such as"),
-        (["a1", "b1"], {"times": "index"}, r"expected in each name a number that is possible in indices, another"),
+        (["1", "2", "3"], {"times": "date"}, r"expected dates such as 20260301120000, different"),
+        (["a1", "b1"], {"times": "index"}, r"expected indices, different in each image of a camera, found a1"),
     ],
 )  # fmt: skip
 def test_names_without_a_reading_are_refused(drive, names, options, expected):

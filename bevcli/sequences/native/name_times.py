@@ -249,10 +249,10 @@ def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> 
     possible = [reading for reading in made if reading is not None]
     if not possible:
         example = next(iter(names.values()))[0]
-        expected = "a date such as 20260301120000" if kind == "date" else f"a number that is possible in {WORDS[kind]}"
+        expected = "dates such as 20260301120000" if kind == "date" else WORDS[kind]
         raise InputError(
-            f'{where}: `times="{kind}"`: expected in each name {expected} that differs from image to image, found '
-            f"{example}: pass another unit"
+            f'{where}: `times="{kind}"`: no numbers in the names are possible (expected {expected}, different in each '
+            f"image of a camera, found {example}): pass another unit"
         )
     is_likely: tuple[Callable[[Reading], bool], ...] = (lambda r: r.is_known_origin, lambda r: _has_rate(r.values))
     if kind == "index":
