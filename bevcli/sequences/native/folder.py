@@ -55,9 +55,10 @@ class FolderSequence(ListedSequence):
         motion, motion_notes = _read_motion(file, common.ego_motion)
         self.understood, advice = "", "add ego-motion, or remove the frame"
         if not entries:
-            from bevcli.sequences.native.unlisted import find_frames
+            from bevcli.sequences.native.unlisted import covered, find_frames
 
-            entries, self.understood = find_frames(path, rig.names, own, motion)
+            found = find_frames(path, rig.names, own, motion)
+            entries, self.understood = found if motion is None else covered(found, motion)
             advice = "state the time of the first image by `start_ns`, or in timing.toml"
         if not common.allow_outside:
             _check_paths(path, entries)

@@ -118,37 +118,36 @@ def find_frames(
 ) -> Found:
     """The frames in `images/CAMERA/*`, `CAMERA/*` or `videos/CAMERA.*`, and a note that tells how they were understood.
 
-    motion: the poses, which decide where the names of images have two readings. Frames outside of them are left out.
+    motion: the poses, which decide where the names of images have two readings. None where they are not known yet.
     Raises InputError if there are no images, or their times are not known.
     """
     timing = read_timing(folder, cameras, own)
     if (folder / "images").is_dir():
-        found, line = _from_names(folder / "images", timing, motion)
+        entries, line = _from_names(folder / "images", timing, motion)
     elif (folder / "videos").is_dir():
-        found, line = _from_videos(folder, timing)
+        entries, line = _from_videos(folder, timing)
     elif match_names(cameras, _folders(folder)):
-        found, line = _from_names(folder, timing, motion)
+        entries, line = _from_names(folder, timing, motion)
     else:
         raise InputError(
             f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
             "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
         )
-    entries, left_out = _with_poses(found, motion)
-    outside = f"; {counted(left_out, 'frames')} outside of the poses left out" if left_out else ""
-    return entries, f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}{outside}"
+    return entries, f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}"
 
 
-def _with_poses(entries: tuple[FrameEntry, ...], motion: EgoMotion | None) -> tuple[tuple[FrameEntry, ...], int]:
-    """The frames that the poses cover, and the number of others; all of them where these are most."""
-    if motion is None:
-        return entries, 0
+def covered(found: Found, motion: EgoMotion) -> Found:
+    """The frames that the poses cover, if these are at least half of them; otherwise all, which is an error later."""
+    entries, line = found
     first, last = motion.first_ns - TOLERANCE_NS, motion.last_ns + TOLERANCE_NS
     kept = []
     for entry in entries:
         times = [entry.stamp.timestamp_ns, *(source.timestamp_ns for source in entry.sources.values())]
         if first <= min(times) and max(times) <= last:
             kept.append(entry)
-    return (entries, 0) if 2 * len(kept) < len(entries) else (tuple(kept), len(entries) - len(kept))
+    if len(kept) == len(entries) or 2 * len(kept) < len(entries):
+        return found
+    return tuple(kept), f"{line}; {counted(len(entries) - len(kept), 'frames')} outside of the poses left out"
 
 
 def _folders(folder: Path) -> list[str]:
