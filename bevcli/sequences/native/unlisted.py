@@ -284,15 +284,20 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
             raise InputError(
                 f"{folder / 'videos'}: camera {camera}: expected one video, such as {camera}.mp4, found {found}"
             )
-        videos[camera] = _video(of_camera[0], timing.start_ns or 0, timing.cameras[camera])
+        own = timing.cameras[camera]
+        videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + own.offset_ns, own.rate_hz)
     matched = match(videos)
     is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
     stated = "times as stated" if is_stated else "times from 0 on (state `start_ns`)"
     return matched.entries, f"{stated}, {_matched(videos, matched)}{renamed(names)}"
 
 
-def _video(path: Path, start_ns: int, timing: CameraTiming) -> CameraImages:
-    count, rate_hz = count_and_rate(path)
-    rate_hz = timing.rate_hz or rate_hz
-    times = start_ns + timing.offset_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
+def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) -> CameraImages:
+    """The images of a video. start_ns: time of the first. rate_hz: default the one stated in the video.
+
+    Raises InputError.
+    """
+    count, own_rate_hz = count_and_rate(path)
+    rate_hz = rate_hz or own_rate_hz
+    times = start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
     return CameraImages(path.name, times, 1e9 / rate_hz, lambda index: ImageSource(path, int(times[index]), index))
