@@ -97,7 +97,7 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
         first = next(iter(names.values()))
         raise InputError(
             f"{where}: the names {first[0]} to {first[-1]} are no times of a camera in any unit (expected 0.5 to 240 "
-            "images per second) and no indices: state their unit by `times`, or list the images in frames.csv"
+            "images per second) and no different indices: state their unit by `times`, or list the images in frames.csv"
         )
     for known in chain.from_iterable(found):
         if known.is_known_origin:
