@@ -279,14 +279,17 @@ class BestBoxes(NamedTuple):
         codes = self.codes.gather(1, order[..., None].expand_as(self.codes))
         return BestBoxes(self.query.gather(1, order), self.label.gather(1, order), scores, codes)
 
-    def pairs(self) -> tuple[Tensor, Tensor]:
-        """1 for two boxes of the same class, else 0; squared distances on the ground, m². (B, K, K) float32 each."""
+    def of_same_class(self) -> Tensor:
+        """(B, K, K) float32, 1 where two boxes have the same class, else 0."""
+        label = self.label.float()  # a CPU compares these three times as fast
+        return (label[:, :, None] == label[:, None]).float()
+
+    def squared_distances(self) -> Tensor:
+        """(B, K, K) float32, m², between the boxes on the ground."""
         # A sum over a last axis of two takes several times as long.
         x, y = self.codes[..., :2].float().unbind(-1)
         x, y = x.contiguous(), y.contiguous()
-        label = self.label.float()  # a CPU compares these three times as fast
-        same_class = (label[:, :, None] == label[:, None]).float()
-        return same_class, (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()
+        return (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()
 
 
 def best_boxes(class_logits: Tensor, box_codes: Tensor, config: DecoderConfig) -> BestBoxes:
@@ -314,9 +317,8 @@ def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
     """
     size = boxes.codes[..., 2:4].float().mean(-1, keepdim=True).exp()  # of the logarithms of width and length
     weights = boxes.scores.clamp(min=1e-6)[:, None]
-    same_class, squared_distances = boxes.pairs()
-    near = (squared_distances / -(reach * size).square()).clamp(min=LEAST_EXPONENT).exp()
-    counts = near * same_class * weights  # (B, K, K)
+    near = (boxes.squared_distances() / -(reach * size).square()).clamp(min=LEAST_EXPONENT).exp()
+    counts = near * boxes.of_same_class() * weights  # (B, K, K)
     total = counts.sum(-1)
     places = counts @ boxes.codes[..., :2].float() / total[..., None]
     moved = boxes._replace(codes=torch.cat([places.to(boxes.codes.dtype), boxes.codes[..., 2:]], dim=-1))
@@ -329,13 +331,12 @@ def faded(boxes: BestBoxes, share: float) -> BestBoxes:
     At a distance of d widths of the better box, a score is multiplied by 1 - share · exp(-d / FADING_WIDTHS); of
     several better boxes, the one counts that lowers it most.
     """
-    same_class, squared_distances = boxes.pairs()
-    distances = squared_distances.sqrt()  # (B, better, worse)
+    distances = boxes.squared_distances().sqrt()  # (B, better, worse)
     widths = boxes.codes[..., 2].float().exp()[:, :, None]
     lost = share * (distances / (-FADING_WIDTHS * widths)).clamp(min=LEAST_EXPONENT).exp()
     rank = torch.arange(boxes.scores.shape[1], device=lost.device)
     worse = rank[:, None] < rank  # `triu` takes as long as all the rest
-    return boxes.with_scores(boxes.scores * (1 - same_class * worse * lost).amin(1))
+    return boxes.with_scores(boxes.scores * (1 - boxes.of_same_class() * worse * lost).amin(1))
 
 
 def encode(boxes: Boxes3D) -> Array:

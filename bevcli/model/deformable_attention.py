@@ -89,8 +89,8 @@ class DeformableAttention(nn.Module):
         Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
         (..., heads, maps, L, P), see `GridSampling.weights`.
         """
-        offsets = self.sampling_offsets(query).float().unflatten(-1, (*self.shape, 2))
-        return offsets, self.attention_weights(query).unflatten(-1, self.shape)
+        offsets, logits = self.sampling_offsets(query), self.attention_weights(query)
+        return offsets.float().unflatten(-1, (*self.shape, 2)), logits.unflatten(-1, self.shape)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values (B, Q, C) of queries that sample one map each.
@@ -103,9 +103,10 @@ class DeformableAttention(nn.Module):
         """
         batch, queries, _ = query.shape
         offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
+        reference = reference_points[:, :, None, None, None]
         sizes = self.sampling.level_sizes(level_shapes, offsets.device)
-        locations = sampling_locations(reference_points[:, :, None, None, None], offsets, sizes)
-        samples = locations.flatten(0, 1), self.sampling.weights(logits).flatten(0, 1), [queries] * batch
+        locations, weights = sampling_locations(reference, offsets, sizes), self.sampling.weights(logits)
+        samples = locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch
         sampled = self.sampling(self.values(tokens), level_shapes, *samples)
         attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
         return attended
