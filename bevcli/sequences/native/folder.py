@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import DriveFacts, Frame, FrameStamp
@@ -18,12 +19,13 @@ from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
-from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
+from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_poses
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import true_results
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
-from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
+from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -35,6 +37,7 @@ class FolderSequence(ListedSequence):
     """A native sequence folder as a `Sequence`.
 
     rig: used in place of the rig of `own` and of calibration.json, if given.
+    Attribute understood: how the images were understood without frames.csv, "" with it.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -42,7 +45,7 @@ class FolderSequence(ListedSequence):
         self,
         path: Path,
         common: SequenceOptions = SequenceOptions(),
-        own: RigOptions = RigOptions(),
+        own: FolderOptions = FolderOptions(),
         rig: CameraRig | None = None,
     ) -> None:
         if not path.is_dir():
@@ -50,19 +53,21 @@ class FolderSequence(ListedSequence):
         rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
             rig, facts = read_rig_and_facts(path / CALIBRATION)
-        table = path / "frames.csv"
-        notes: tuple[str, ...] = ()
-        if is_there(table):
-            entries = read_frames_table(table, rig.names)
-        else:
-            from bevcli.sequences.native.unlisted import find_frames
+        table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
+        entries = read_frames_table(table, rig.names) if is_there(table) else ()
+        poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
+        self.understood, advice = "", "add ego-motion, or remove the frame"
+        if not entries:
+            from bevcli.sequences.native.unlisted import covered, find_frames
 
-            entries, notes = find_frames(path, rig.names)
+            found = find_frames(path, rig.names, own, None if poses is None else poses.motion)
+            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(found[0])))
+            entries, self.understood = found if poses.motion is None else covered(found, poses.motion)
+            advice = "state the time of the first image by `start_ns`, or in timing.toml"
+        assert poses is not None
         if not common.allow_outside:
             _check_paths(path, entries)
-        file = own.ego_motion_file or path / "ego_motion.csv"
-        advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-        poses = _read_poses(file, common.ego_motion, own, rig, entries, advice)
+        _check_covered(file, poses, entries, advice)
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
@@ -70,7 +75,7 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*bev_frame_notes(rig), *notes, *poses.notes)
+        notes = (*bev_frame_notes(rig), *filter(None, [self.understood]), *poses.notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 
@@ -126,10 +131,16 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
                 )
 
 
-def _read_poses(
-    file: Path, use: EgoMotionUse, own: RigOptions, rig: CameraRig, entries: tuple[FrameEntry, ...], advice: str
-) -> ReadPoses:
-    """The poses, with notes. advice: for frames at times that the poses do not cover."""
+def _poses_without_frames(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses | None:
+    """The poses; None where the times of the frames, which are not known yet, decide how they are read."""
+    try:
+        return _read_poses(file, use, drive)
+    except FrameTimesNeeded:
+        return None
+
+
+def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
+    """The poses, with notes. Raises FrameTimesNeeded as `read_poses`."""
     if use == "static":
         unread = f" ({file.name} is not read)" if is_there(file) else ""
         return ReadPoses(None, (f"the vehicle is assumed to stand still{unread}",))
@@ -140,9 +151,18 @@ def _read_poses(
         )
     if not is_there(file):
         return ReadPoses(None, ("ego_motion.csv is missing: boxes are in the ego frame",))
-    frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    poses = read_poses(file, DrivePoses(rig, own, frame_times))
-    assert poses.motion is not None
+    return read_poses(file, drive)
+
+
+def _times_of(entries: tuple[FrameEntry, ...]) -> NDArray[np.int64] | None:
+    """The times of frames; None without frames."""
+    return np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64) if entries else None
+
+
+def _check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...], advice: str) -> None:
+    """Raise InputError for a frame or an image at a time that the poses do not cover. advice: what to do."""
+    if poses.motion is None:
+        return
     first, last = poses.motion.first_ns, poses.motion.last_ns
     read_as = f", read as {poses.notes[0]}" if poses.notes else ""
     for entry in entries:
@@ -154,7 +174,6 @@ def _read_poses(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed{read_as}): {advice}"
                 )
-    return poses
 
 
 def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:
