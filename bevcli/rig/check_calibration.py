@@ -31,7 +31,8 @@ from bevcli.writing import write_whole
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
 OFFSET_ERROR_S = 0.5
 JITTER_WARNING_S = 0.05
-NAMES = {"times", "image_rate_hz", "start_ns"}  # options that tell how the names of images are read
+# Options that tell how the names of images and the poses are read.
+NAMES = {"times", "image_rate_hz", "start_ns", "ego_motion_file", "pose_times", "pose_angles", "poses_of"}
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def check_calibration(
         sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
         options: of `open_sequence`, such as allow_outside, or topics for a bag. A native folder takes
-            allow_outside, times, image_rate_hz and start_ns.
+            allow_outside, and those of images without a table and of poses.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
