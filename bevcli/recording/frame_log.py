@@ -20,6 +20,7 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_boxes, log_cameras, log_static
 from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
 from bevcli.recording.log_cameras import ImageLayer, PosedCamera
+from bevcli.recording.seen_map import SeenCells
 
 Features = NDArray[np.float32]
 PosedCameras = tuple[PosedCamera, ...]
@@ -104,6 +105,7 @@ class FrameLog:
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
+        self._seen_cells = SeenCells()
         self._with_meshes = [name for name, settings in recorded.object_classes.items() if settings.mesh]
         self._images = log_cameras.CameraImages(stream, self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
@@ -337,7 +339,7 @@ class FrameLog:
             if posed.camera.name in frame.images:
                 log_cameras.log_pillar_hits(stream, posed, points, colors)
         if prediction.segmentation is not None:
-            self._log_map(prediction.segmentation, ego_from_bev)
+            self._log_map(self._seen_cells.of(prediction.segmentation, frame, grid), ego_from_bev)
         if self._bev_images is not None and prediction.bev is not None:
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
             self._log_bev_images(self._bev_images.push(prediction, features))
