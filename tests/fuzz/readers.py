@@ -73,9 +73,9 @@ def _model(folder: Path) -> None:
 
 def _rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from bevcli.sequences.files.kalibr_ros import read_rig
+        from bevcli.sequences.options import RigOptions
 
-        read_rig(folder / "rig" / name, folder / "rig/extrinsics.json")
+        RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json").rig()
 
     return read
 

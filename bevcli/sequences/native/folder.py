@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
@@ -15,7 +15,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
-from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
+from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_rig
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
@@ -45,9 +45,11 @@ class FolderSequence(ListedSequence):
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
-            rig, facts = read_rig_and_facts(path / CALIBRATION)
+            given = own.draft(path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
+        else:
+            given = RigDraft(rig, ())
+        rig, facts = given.rig, given.facts
         table = path / "frames.csv"
         notes: tuple[str, ...] = ()
         if is_there(table):
@@ -68,7 +70,7 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*bev_frame_notes(rig), *notes, *motion_notes)
+        notes = (*given.notes, *bev_frame_notes(rig), *notes, *motion_notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 

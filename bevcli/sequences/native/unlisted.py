@@ -16,10 +16,10 @@ from typing import Any
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
-from bevcli.parsing.files import is_there, read_text
+from bevcli.parsing.files import VIDEO_SUFFIXES, is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.images import IMAGE_SUFFIXES, FrameEntry, ImageSource
-from bevcli.sequences.videos import VIDEO_SUFFIXES, count_and_rate
+from bevcli.sequences.videos import count_and_rate
 
 FILE_NAME = "timing.toml"
 # A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.

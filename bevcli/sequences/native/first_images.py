@@ -1,0 +1,45 @@
+"""The first image of each camera of a drive, found by names alone: cameras and image sizes that no file states."""
+
+from pathlib import Path
+
+from bevcli.errors import InputError
+from bevcli.parsing.files import MIB, VIDEO_SUFFIXES, read_bytes, size_of_image
+from bevcli.sequences.images import IMAGE_SUFFIXES
+from bevcli.sequences.videos import size_of_video
+
+LARGEST_IMAGE = 256 * MIB
+
+
+def first_images(drive: Path) -> dict[str, Path]:
+    """The first image file or the video of each camera, by the camera's name.
+
+    They are `images/CAMERA/*.jpg`, `videos/CAMERA.mp4` or `CAMERA/*.jpg`, the first of these that is there; of a drive
+    that is a video, it is the video.
+    """
+    if drive.suffix.lower() in VIDEO_SUFFIXES and drive.is_file():
+        return {drive.stem: drive}
+    for folder in (folder for folder in (drive / "images", drive / "videos", drive) if folder.is_dir()):
+        videos = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES}
+        folders = (path for path in sorted(folder.iterdir()) if path.is_dir())
+        images = {path.name: image for path in folders if (image := _first_in(path)) is not None}
+        if videos or images:
+            return videos | images
+    return {}
+
+
+def _first_in(folder: Path) -> Path | None:
+    names = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    return min(names, default=None)
+
+
+def size_of_first(drive: Path | None, camera: str) -> tuple[int, int] | None:
+    """(width, height) in pixels of a camera's first image; None where it has none that can be read."""
+    path = None if drive is None else first_images(drive).get(camera)
+    if path is None:
+        return None
+    try:
+        if path.suffix.lower() in VIDEO_SUFFIXES:
+            return size_of_video(path)
+        return size_of_image(read_bytes(path, LARGEST_IMAGE))
+    except InputError:
+        return None
