@@ -26,6 +26,7 @@ from bevcli.workshop.formats.camera_poses import (
     Direction,
     Fields,
     StatedCamera,
+    StatedPose,
     decide_poses,
     guessed_pose,
     raised,
@@ -101,7 +102,11 @@ def _poses(
     stated = {name: of.pose for name, of in cameras.items() if of.pose is not None}
     lacking = [name for name in cameras if name not in stated]
     if not stated and height is not None:
-        return _guessed_poses(tuple(cameras), height, yaw_deg)
+        starts = tuple(name for name, of in cameras.items() if of.from_previous is None) or tuple(cameras)
+        guessed, how = _guessed_poses(starts, height, yaw_deg)
+        known = {name: StatedPose({"": pose}, "ego_from_camera", exact=True) for name, pose in guessed.items()}
+        linked = _along_chain({name: replace(of, pose=known.get(name)) for name, of in cameras.items()})
+        return decide_poses(where, {name: of.pose for name, of in linked.items() if of.pose}, None)[0], how
     if lacking:
         why = "moves through the file, as in a reconstruction" if cameras[lacking[0]].moves else "is missing"
         raise InputError(
