@@ -116,7 +116,7 @@ def draft_calibration(path: Path) -> RigDraft:
             raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
         return dict(pairs)
 
-    missing = "the file is missing (expected a calibration)"
+    missing = "the file is missing (expected a calibration): pass `calibration=FILE` of another kind, or `fov_deg` and `height`"
     document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=unique)
     if not isinstance(document, dict):
         raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')

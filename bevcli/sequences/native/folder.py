@@ -70,7 +70,8 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*given.notes, *bev_frame_notes(rig), *notes, *motion_notes)
+        notes = (*bev_frame_notes(rig, *(("the calibration",) if given.notes else ())), *notes, *motion_notes)
+        notes = (*given.notes, *notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 

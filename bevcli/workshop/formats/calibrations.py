@@ -82,8 +82,7 @@ def read_rig(
         )
         for name, of in cameras.items()
     )
-    yaws = ", ".join(f"{camera.name} {np.degrees(camera.yaw):.0f}°" for camera in rig)
-    text = f"{calibration.name}: {kind}: {counted(len(rig), 'cameras')}; {how}; yaw {yaws}"
+    text = f"{calibration.name}: {kind}: {counted(len(rig), 'cameras')}; {how}"
     found = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
     return RigDraft(found, (Finding("calibration-read", "info", None, text),))
 
@@ -119,7 +118,10 @@ def _poses(
     if transform is not None and all(pose.exact for pose in stated.values()):
         raise InputError(f"{where}: states what its transforms mean: remove `transform`")
     poses, how = decide_poses(where, stated, transform, level_known=bool(heights))
-    return (raised(poses, heights), f"{how}, raised to `height`") if heights else (poses, how)
+    yaws = ", ".join(f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°" for name, pose in poses.items())
+    if heights:
+        poses, how = raised(poses, heights), f"{how}, raised to `height`"
+    return poses, f"{how}; yaw {yaws}"
 
 
 def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, drive: Path | None) -> Fields:

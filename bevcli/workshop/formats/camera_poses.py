@@ -37,6 +37,12 @@ AXES_TEXT = {
 }
 
 
+ADVICE = {
+    "height": "if the origin is not on the ground, pass `height=1.5`, the mean height of the cameras above it",
+    "unit": "convert the translations to metres",
+}
+
+
 @dataclass(frozen=True)
 class StatedPose:
     """A transform between a camera and the vehicle, as a file states it.
@@ -131,13 +137,9 @@ def decide_poses(
     possible = _distinct([reading for reading in readings if not reasons[reading]], found)
     name = next(pose.name for pose in poses.values() if not pose.exact)
     if not possible:
-        nearest = min(readings, key=lambda reading: (reasons[reading] or ("",))[0] != "height")
+        nearest = min(readings, key=lambda reading: (reasons[reading] or ("",))[0] not in ADVICE)
         code, text = reasons[nearest] or ("", "")
-        advice = (
-            "pass `height=1.5`, that of the cameras above the ground, if the origin is elsewhere"
-            if code == "height"
-            else "correct them, or pass `extrinsics=FILE`"
-        )
+        advice = ADVICE.get(code, "correct them, or pass `extrinsics=FILE`")
         raise InputError(
             f"{where}: {name}: no reading of the transforms puts the cameras on a vehicle (expected above the ground, "
             f"at most {HIGHEST_M:g} m high, upright, looking outwards); as {nearest.text}, {text}: {advice}"
@@ -209,8 +211,9 @@ def _impossible(rig: Mapping[str, Array], *, level_known: bool) -> tuple[str, st
         return "inwards", f"the cameras look inwards, by {-outwards:.2f} m on average"
     for name, pose in rig.items():
         if not level_known and not 0 < pose[2, 3] <= HIGHEST_M:
-            unit = " (in millimetres?)" if pose[2, 3] > 100 else ""
-            return "height", f"{name} is {pose[2, 3]:.2f} m above the origin{unit}"
+            if pose[2, 3] > 100 * HIGHEST_M:
+                return "unit", f"{name} is {pose[2, 3]:.0f} m above the origin (in millimetres?)"
+            return "height", f"{name} is {abs(pose[2, 3]):.2f} m {'above' if pose[2, 3] > 0 else 'below'} the origin"
     return None
 
 

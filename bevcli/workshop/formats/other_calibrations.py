@@ -83,7 +83,10 @@ def read_colmap(path: Path) -> Cameras:
         poses.setdefault((words[8], _folder_of(words[9], f"camera{words[8]}")), []).append(pose)
     if not poses:
         return {f"camera{key}": camera for key, camera in by_id.items()}
-    return {name: _posed(by_id[key], found, "camera_from_ego") for (key, name), found in poses.items()}
+    return {
+        name: _posed(by_id[key], found, images.name, "camera_from_ego", "optical")
+        for (key, name), found in poses.items()
+    }
 
 
 def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamera:
@@ -101,11 +104,11 @@ def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamer
     return StatedCamera(matrix, None, lens_fields(lens, coefficients, where))
 
 
-def _posed(camera: StatedCamera, poses: list[Array], direction: Direction, axes: str = "optical") -> StatedCamera:
+def _posed(camera: StatedCamera, poses: list[Array], name: str, direction: Direction, axes: str) -> StatedCamera:
     """The camera with its pose, where the file has only one place of it."""
     if any(not np.allclose(pose, poses[0], atol=1e-3) for pose in poses):
         return replace(camera, moves=True)
-    return replace(camera, pose=StatedPose({"": poses[0]}, direction, axes=axes, name="images"))
+    return replace(camera, pose=StatedPose({"": poses[0]}, direction, axes=axes, name=name))
 
 
 def _lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
@@ -145,8 +148,11 @@ def read_nerfstudio(path: Path) -> Cameras:
         name, where = _folder_of(str(frame.get("file_path", "")), "camera"), f"{file}: frame {place}"
         entries.setdefault(name, {**document, **frame})
         poses.setdefault(name, []).append(require(parse_numbers, frame, "transform_matrix", (4, 4), where=where))
-    return {name: _posed(_nerf_camera(entry, f"{file}: camera {name}"), poses[name], "ego_from_camera", "opengl")
-            for name, entry in entries.items()}  # fmt: skip
+    made = {name: _nerf_camera(entry, f"{file}: camera {name}") for name, entry in entries.items()}
+    return {
+        name: _posed(camera, poses[name], "transform_matrix", "ego_from_camera", "opengl")
+        for name, camera in made.items()
+    }
 
 
 def _nerf_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
