@@ -15,7 +15,6 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
-from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
 from bevcli.writing import check_output, write_whole
@@ -25,6 +24,7 @@ FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
 PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
 AVERAGES = r"ema_|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
+OFFICIAL = ("img_backbone.", "img_neck.", "pts_bbox_head.")  # of names in the released files
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,19 @@ def read_checkpoint(path: Path) -> Checkpoint:
         state, facts = read_safetensors(path, error=WeightsError)
     else:
         state, facts, not_read = _read_pth(path, left_out)
-    state = _unwrapped(state, left_out)
+    count = len(state)
+    state = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
+    left_out += [f"{count - len(state)} running averages (ema_*)"] if len(state) < count else []
+    prefixes = {match[0] for match in (re.match(PREFIXES, key) for key in state) if match}
+    if len(prefixes) == 1 and "" not in prefixes:
+        (prefix,) = prefixes
+        left_out.append(f'the prefix "{prefix}" of all names')
+        state = {key.removeprefix(prefix): tensor for key, tensor in state.items()}
     _check_numbers(path, state)
-    official = is_official(state)
+    official = any(key.startswith(OFFICIAL) for key in state)
     if official:
+        from bevcli.model.official_keys import from_official
+
         state, parts = from_official(state)
         left_out += [parts] if parts else []
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)
@@ -145,18 +154,6 @@ def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tu
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
         reason = " ".join(str(failure).split())
         raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None
-
-
-def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str, Tensor]:
-    """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
-    kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
-    left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
-    prefixes = {match[0] for match in (re.match(PREFIXES, key) for key in kept) if match}
-    if len(prefixes) != 1 or "" in prefixes:
-        return kept
-    (prefix,) = prefixes
-    left_out.append(f'the prefix "{prefix}" of all names')
-    return {key.removeprefix(prefix): tensor for key, tensor in kept.items()}
 
 
 def bundled_weights(model: str) -> Path | None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import bevcli
 from bevcli.errors import InputError
 from bevcli.sequences.options import RigOptions
+from bevcli.workshop.synth.rig import RigDistribution, draw_rig
 
 STREET = Path(__file__).parents[2] / "samples/street"
 FACTS = json.loads((STREET / "calibration.json").read_text())["cameras"]
@@ -276,6 +277,32 @@ def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):
 
 def scaled(matrix, factors):
     return [(np.array(row) * factors).tolist() for row in matrix[:3]]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drawn_rigs_are_read_right_in_both_directions(tmp_path, seed):
+    """Each camera alone, too: what is decided is what was written."""
+    cameras = draw_rig(RigDistribution(), seed, SIZE).rig.cameras
+    assert_read_right(tmp_path, cameras)
+
+
+def test_real_rigs_are_read_right_in_both_directions(shared, tmp_path):
+    for drive in ("nuscenes-scene-0103", "kitti-straight", "dgp-scene_01"):
+        sequence = bevcli.open_sequence(shared / "data" / drive, ego_motion="optional", ground_truth=False)
+        assert_read_right(tmp_path, sequence.rig.cameras)
+
+
+def assert_read_right(folder, cameras):
+    for rig in (cameras, *((camera,) for camera in cameras)):
+        for stated in (np.array, np.linalg.inv):
+            entries = {
+                camera.name: {"K": camera.intrinsics.tolist(), "T": stated(camera.ego_from_camera).tolist(),
+                              "resolution": [camera.width, camera.height]}
+                for camera in rig
+            }  # fmt: skip
+            found = read(written(folder, entries, "rig.json"), None).rig
+            for camera in rig:
+                np.testing.assert_allclose(found[camera.name].ego_from_camera, camera.ego_from_camera, atol=1e-9)
 
 
 MISTAKES = {

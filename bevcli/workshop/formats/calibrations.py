@@ -67,9 +67,8 @@ def read_rig(
     if fov_deg is not None:
         raise InputError("`calibration` and `fov_deg` exclude each other: pass one of them")
     kind, cameras = _stated(calibration)
-    ego_from_bev = None
     if extrinsics is not None:
-        poses, ego_from_bev = _extrinsics(extrinsics)
+        poses = _extrinsics(extrinsics)
         for name in poses.keys() - cameras.keys():
             raise InputError(f"{extrinsics}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
         cameras = {name: replace(of, pose=poses[name].pose if name in poses else None) for name, of in cameras.items()}
@@ -83,6 +82,7 @@ def read_rig(
         for name, of in cameras.items()
     )
     text = f"{calibration.name}: {kind}: {counted(len(rig), 'cameras')}; {how}"
+    ego_from_bev = _bev_frame(where)
     found = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
     return RigDraft(found, (Finding("calibration-read", "info", None, text),))
 
@@ -166,16 +166,20 @@ def _stated(path: Path) -> tuple[str, Cameras]:
     )
 
 
-def _extrinsics(path: Path) -> tuple[Cameras, Array | None]:
-    """The poses of a file of any kind, and the bev frame if it is stated."""
-    document = read_document(path) if path.suffix.lower() in SUFFIXES else None
-    if path.suffix.lower() == ".json" and not (isinstance(document, dict) and document.keys() - {"ego_from_bev"}):
+def _extrinsics(path: Path) -> Cameras:
+    """The cameras of a file with poses."""
+    if path.suffix.lower() == ".json" and not isinstance(read_document(path), dict):
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
         )
-    _, cameras = _stated(path)
+    return _stated(path)[1]
+
+
+def _bev_frame(path: Path) -> Array | None:
+    """(4, 4) ego_from_bev of a file that states it."""
+    document = read_document(path) if path.suffix.lower() in SUFFIXES and not path.is_dir() else None
     stated = isinstance(document, dict) and "ego_from_bev" in document
-    return cameras, require(parse_transform, document, "ego_from_bev", where=path) if stated else None
+    return require(parse_transform, document, "ego_from_bev", where=path) if stated else None
 
 
 def _along_chain(cameras: Cameras) -> Cameras:

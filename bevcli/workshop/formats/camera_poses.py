@@ -100,9 +100,6 @@ class StatedCamera:
 Cameras: TypeAlias = dict[str, StatedCamera]
 
 
-Cameras: TypeAlias = dict[str, StatedCamera]
-
-
 @dataclass(frozen=True)
 class Reading:
     """One of the ways to read the transforms of a rig."""

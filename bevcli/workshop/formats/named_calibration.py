@@ -167,10 +167,9 @@ def _camera_matrix(value: Any, entry: Mapping[str, Any], where: str) -> Any:
     """(3, 3) of a matrix, nine numbers, fx fy cx cy, or a mapping of these."""
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
+    elif isinstance(value, dict) and (inner := _value(value, *INTRINSICS)) is not None:
+        return _camera_matrix(inner, value, where)
     elif value is None or isinstance(value, dict):
-        inner = None if value is None else _value(value, *INTRINSICS)
-        if inner is not None:
-            return _camera_matrix(inner, value, where)
         value = [_value(entry, *names) for names in (("fx", *FOCAL), ("fy", "fx", *FOCAL), ("cx",), ("cy",))]
         if value == [None] * 4:
             return None
