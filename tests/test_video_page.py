@@ -1,5 +1,6 @@
 """docs/video.md: its commands run, on a video of the sample drive."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import cv2
 import pytest
 from command_line import MINI_TOML, command
+
+import bevcli
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/video.md").read_text()
@@ -34,16 +37,17 @@ def test_the_page_is_one_screen():
 
 def test_the_video_runs_as_on_the_page(folder):
     [run] = [shlex.split(line) for line in COMMANDS if line.startswith("run ")]
-    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/dash-demo")
+    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/dash-demo", "--force")
     assert done.returncode == 0, done.stderr
     assert "without calibration: 1 camera" in done.stderr
     assert "no history is used (--no-temporal)" in done.stderr
-    assert command(folder, *shlex.split(COMMANDS[-1]), "--summary").returncode == 0
 
 
 @pytest.mark.slow
-def test_the_video_is_checked_as_on_the_page(folder):
+def test_the_video_is_checked_and_shown_as_on_the_page(folder):
     assert command(folder, *shlex.split(COMMANDS[0])).returncode == 0
+    test_the_video_runs_as_on_the_page(folder)
+    assert command(folder, *shlex.split(COMMANDS[-1]), "--summary").returncode == 0
     assert (folder / "runs/dash-project-debug/cameras.png").exists()
 
 
@@ -54,6 +58,19 @@ def test_a_video_alone_is_told_in_one_line_what_is_missing(folder, name):
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "pass --fov 70 and --height 1.5, or --calibration FILE" in done.stderr
+
+
+def test_a_video_is_one_camera_of_a_calibration_by_its_name(folder):
+    (folder / "CAM_FRONT.mp4").write_bytes((folder / "dash.mp4").read_bytes())
+    own = ROOT / "samples/street/calibration.json"
+    stated = json.loads(own.read_text())["cameras"]
+    other = folder / "rig.json"
+    other.write_text(json.dumps({name: {**each, "K": each.pop("intrinsics")} for name, each in stated.items()}))
+    for calibration in (own, other):
+        drive = bevcli.open_sequence(folder / "CAM_FRONT.mp4", calibration=calibration, ego_motion="static")
+        assert drive.load(2).images["CAM_FRONT"].pixels_bgr.shape == (450, 800, 3)
+        with pytest.raises(bevcli.BevcliError, match="name the video after its camera"):
+            bevcli.open_sequence(folder / "dash.mp4", calibration=calibration, ego_motion="static")
 
 
 def test_a_converted_video_has_the_rig_that_was_stated(folder):

@@ -43,6 +43,7 @@ from bevcli.workshop.formats.other_calibrations import (
 
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera
+SEVERAL = "is the video of one camera, but the calibration has {} ({}): name the video after its camera"
 HIGHEST_M = 10.0  # of a camera that is stated
 
 
@@ -142,9 +143,15 @@ def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, dri
 
 
 def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:
-    """A single camera has the name of the only folder or video with images."""
+    """A single camera has the name of the only folder or video with images; of several, a video is one by its name."""
     found = list(first_images(drive)) if drive is not None else []
-    return {found[0]: next(iter(cameras.values()))} if len(cameras) == len(found) == 1 else cameras
+    if len(cameras) == len(found) == 1:
+        return {found[0]: next(iter(cameras.values()))}
+    if drive is None or not drive.is_file() or not found:
+        return cameras
+    if found[0] not in cameras:
+        raise InputError(f"{drive}: {SEVERAL.format(counted(len(cameras), 'cameras'), ', '.join(cameras))}")
+    return {found[0]: cameras[found[0]]}
 
 
 # Kinds of files
@@ -239,10 +246,12 @@ def _guessed_poses(names: tuple[str, ...], height: ByCamera, yaw_deg: ByCamera) 
     for name in names:
         if not 0 < heights[name] <= HIGHEST_M:
             raise InputError(f"`height={heights[name]:g}`: expected metres above the ground, 0 to 10")
-    text = ", ".join(f"{name} {heights[name]:g} m high, yaw {yaws[name]:g}°" for name in names)
     poses = {name: guessed_pose(heights[name], np.radians(yaws[name])) for name in names}
-    places = " and ".join(sorted({f"{pose[0, 3]:.1f} m" for pose in poses.values()}))
-    return poses, f"assumed level, {places} ahead of the rear axle, {text}"
+    text = "; ".join(
+        f"{name} yaw {yaws[name]:g}°, {heights[name]:g} m high, {pose[0, 3]:.1f} m ahead of the rear axle"
+        for name, pose in poses.items()
+    )
+    return poses, f"assumed level, {text}"
 
 
 def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str, float]:
