@@ -350,3 +350,16 @@ def test_a_size_that_nothing_states_is_missing(tmp_path):
     path = written(tmp_path, {name: entry(name, T=pose(name).tolist()) for name in NAMES})
     with pytest.raises(InputError, match=re.escape(f"camera {NAMES[0]}: the image size is missing")):
         read(path, None)
+
+
+def test_cameras_and_sizes_are_found_where_the_images_lie(tmp_path):
+    image = cv2.imencode(".jpg", np.zeros((36, 64, 3), np.uint8))[1].tobytes()
+    for folder, path in (("a", "images/front/7.jpg"), ("b", "front/7.jpg"), ("c", "rgb/7.jpg")):
+        file = tmp_path / folder / path
+        file.parent.mkdir(parents=True)
+        file.write_bytes(image)
+    (tmp_path / "c/frames.csv").write_text("frame,timestamp_ns,front\n0,1,\n1,2,rgb/7.jpg\n")
+    for folder in "abc":
+        [camera] = RigOptions(fov_deg=90, height=1.5).rig(tmp_path / folder).cameras
+        assert (camera.name, camera.width, camera.height) == ("front", 64, 36)
+        np.testing.assert_allclose(camera.intrinsics, [[32, 0, 31.5], [0, 32, 17.5], [0, 0, 1]])
