@@ -145,6 +145,49 @@ def test_files_that_opencv_writes(tmp_path, suffix):
     assert_is_the_street(read(tmp_path / "rig", None).rig, lens=True)
 
 
+EUROC = """%YAML:1.0
+sensor_type: camera
+T_BS: {{cols: 4, rows: 4, data: {pose}}}
+resolution: {size}
+camera_model: pinhole
+intrinsics: {four}
+distortion_model: radial-tangential
+distortion_coefficients: {four_of_lens}
+"""
+ORB_SLAM = """%YAML:1.0
+Camera.type: "PinHole"
+{lines}
+T_c_b: {inverse}
+"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: front
+image_width: {size[0]}
+image_height: {size[1]}
+distortion_parameters: {{k1: -0.1, k2: 0.02, p1: 0.001, p2: -0.002}}
+projection_parameters: {{fx: {four[0]}, fy: {four[1]}, cx: {four[2]}, cy: {four[3]}}}
+body_T_cam0: !!opencv-matrix {{rows: 4, cols: 4, dt: d, data: {pose}}}
+"""
+
+
+@pytest.mark.parametrize("text", [EUROC, ORB_SLAM, VINS])
+def test_files_of_other_programs_for_one_camera(tmp_path, text):
+    name = NAMES[1]
+    values = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), [*four(name), *D[:4]], strict=True))
+    lines = "\n".join(
+        f"Camera.{key}: {value}" for key, value in {**values, "width": SIZE[0], "height": SIZE[1]}.items()
+    )
+    facts = {"pose": pose(name).ravel().tolist(), "inverse": np.linalg.inv(pose(name)).tolist(), "lines": lines}
+    text = text.format(**facts, size=list(SIZE), four=four(name), four_of_lens=D[:4])
+    [camera] = read(written(tmp_path, text, "front.yaml"), None).rig.cameras
+    assert camera.name == "front"
+    assert (camera.width, camera.height) == SIZE
+    assert camera.distortion.coefficients == tuple(D[:4])
+    np.testing.assert_allclose(camera.intrinsics, k_of(name))
+    np.testing.assert_allclose(camera.ego_from_camera, pose(name), atol=1e-9)
+
+
 def test_kalibr_and_poses_of_another_file(tmp_path):
     chain = {
         name: {

@@ -24,8 +24,10 @@ from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, Sta
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
-INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "camerak", "mtx", "cameraintrinsic")
-LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff")
+INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
+              "camintrinsic", "projectionparameters")  # fmt: skip
+LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
+        "distortionparameters")  # fmt: skip
 LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
 WIDTH, HEIGHT = ("width", "imagewidth", "w"), ("height", "imageheight", "h")
 SIZE = ("resolution", "imagesize", "size")
@@ -34,7 +36,7 @@ TRANSFORM = ("t", "extrinsics", "extrinsic", "transform", "transformmatrix", "po
 ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "quaternion", "quaternionwxyz",
             "quaternionxyzw", "q", "qvec", "rvec", "orientation")  # fmt: skip
 TRANSLATION = ("translation", "t", "position", "tvec", "location")
-CAMERA_FRAMES = "camera|cam|sensor|c"
+CAMERA_FRAMES = r"camera\d*|cam\d*|sensor|c"
 EGO_FRAMES = "ego|vehicle|car|base|body|imu|rig|world|lidar|velo|b"
 EXACT: dict[str, Direction] = {"egofromcamera": "ego_from_camera", "camerafromego": "camera_from_ego"}
 COEFFICIENTS = {
@@ -102,6 +104,7 @@ def _named_cameras(document: Any, path: Path) -> Cameras:
         document = {"cameras": document}
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
+    document = {re.sub(r"\ACamera\d*\.", "", str(key)): value for key, value in document.items()}  # ORB-SLAM's names
     entries = document.get("cameras", document.get("sensors"))
     if isinstance(entries, list):
         names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{place}")
@@ -141,7 +144,7 @@ def _value(entry: Mapping[Any, Any], *names: str) -> Any:
 
 def _named_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
     """What a mapping states of a camera."""
-    model = str(_value(entry, "cameramodel") or "pinhole").lower()
+    model = _lens_name(_value(entry, "cameramodel", "modeltype") or "pinhole")
     if model not in (*PINHOLES, *LENS_NAMES):
         raise InputError(f"{where}: camera_model {model:.60} is not supported (expected pinhole)")
     intrinsics = _value(entry, *INTRINSICS)
@@ -188,7 +191,7 @@ def lens_of(entry: Mapping[str, Any], camera_model: str, where: str) -> Fields:
     if isinstance(value, dict):
         model = _value(value, "model", "type", *LENS_MODEL) or model
         value = _value(value, "data", "coefficients", "coeffs", "params") or value
-    fisheye = LENS_NAMES.get(str(model or camera_model).lower()) == "kannala_brandt"
+    fisheye = LENS_NAMES.get(_lens_name(model or camera_model)) == "kannala_brandt"
     if value is None or isinstance(value, dict):
         names = COEFFICIENTS["kannala_brandt" if fisheye else "brown_conrady"]
         stated = [_value(value or entry, name) for name in names]
@@ -197,8 +200,12 @@ def lens_of(entry: Mapping[str, Any], camera_model: str, where: str) -> Fields:
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [number for row in value for number in row]  # a column or a row of a matrix
     fallback = camera_model if camera_model in LENS_NAMES else "plumb_bob"
-    stated_model = str(model).lower() if model else fallback
+    stated_model = _lens_name(model) if model else fallback
     return lens_fields(fallback if stated_model in PINHOLES else stated_model, value, where)
+
+
+def _lens_name(model: object) -> str:
+    return str(model).lower().replace("-", "_")
 
 
 def lens_fields(model: object, coefficients: object, where: str) -> Fields:
@@ -207,7 +214,7 @@ def lens_fields(model: object, coefficients: object, where: str) -> Fields:
         raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
     if not any(coefficients):
         return {"model": "none"}
-    lens = LENS_NAMES.get(str(model).lower() or "plumb_bob")
+    lens = LENS_NAMES.get(_lens_name(model) or "plumb_bob")
     if lens is None:
         expected = ", ".join(LENS_NAMES)
         raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {expected})")
