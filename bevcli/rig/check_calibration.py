@@ -108,7 +108,7 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    stated = {name: options[name] for name in defaults(RigOptions) if name in options}
+    stated = {name: options[name] for name in defaults(RigOptions).keys() - {"ego_motion_file"} if name in options}
     if folder is None and is_drive(path):
         given = gather(RigOptions, None, stated).draft(path)
         if given is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):

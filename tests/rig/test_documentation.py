@@ -90,7 +90,7 @@ def sequence_codes(folder):
     without_back = [",".join([*row.split(",")[:3], "", ""]) for row in table[1:]]
     (missing / "frames.csv").write_text("\n".join([table[0], *without_back]))
     write_motion(refused, heading=(1, 0, 0, 0), rows=5)
-    without = check_calibration(missing, fov_deg=70, height=1.5, yaw_deg={"CAM_FRONT": 0, "CAM_BACK": 180})
+    without = check_calibration(late, fov_deg=70, height=1.5, yaw_deg={"CAM_FRONT": 0, "CAM_BACK": 180})
     checks = [without, *(check_calibration(path) for path in (late, missing, refused))]
     return motion.union(*({f.code for f in check.findings} for check in checks))
 
