@@ -8,10 +8,10 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.calibrations",
     "bevcli.results",
     "bevcli.model_uses",
     "bevcli.sequences",
-    "bevcli.calibrations",
     "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",

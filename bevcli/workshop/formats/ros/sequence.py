@@ -214,8 +214,8 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     if path.is_file() and is_packed_bag(path):
         raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
     stated = read_topics_file(own.topics_file, own.topics)
-    given = own.draft(path)
-    rig = None if given is None else given.rig
+    draft = own.draft(path)
+    rig = None if draft is None else draft.rig
     bag = Bag(path)
     rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
     finder = TopicFinder(bag, stated, rig.names if rig else None)
@@ -226,7 +226,7 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     entries, gaps = _covered(_entries(bag, finder.cameras), motion, path)
     notes = (
         finder.table(source),
-        *(() if given is None else given.notes),
+        *(() if draft is None else draft.notes),
         *bag.notes,
         *beside,
         *reader.notes,
