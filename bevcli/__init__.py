@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import Session as Session, run as run
     from bevcli.recording.options import RecordingOptions as RecordingOptions
+    from bevcli.recording.record import record as record
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import show as show
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
+    from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
 
 # The public names by the modules that define them.
@@ -57,11 +59,13 @@ _NAMES = {
     "bevcli.inference.load": "Model load_model",
     "bevcli.inference.run": "Session run",
     "bevcli.recording.options": "RecordingOptions",
+    "bevcli.recording.record": "record",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
+    "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.viewer.recording_file": "show",
 }

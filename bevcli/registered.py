@@ -17,6 +17,7 @@ Group = Literal[
     "bevcli.box_formats",
     "bevcli.label_formats",
     "bevcli.scores",
+    "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",
