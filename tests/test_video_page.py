@@ -40,7 +40,7 @@ def test_the_video_runs_as_on_the_page(folder):
     done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/dash-demo", "--force")
     assert done.returncode == 0, done.stderr
     assert "without calibration: 1 camera" in done.stderr
-    assert "no history is used (--no-temporal)" in done.stderr
+    assert "no history is used" in done.stderr
 
 
 @pytest.mark.slow

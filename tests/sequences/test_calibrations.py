@@ -307,6 +307,23 @@ def test_a_direction_that_is_not_certain_is_asked(tmp_path):
     np.testing.assert_allclose(other["front"].ego_from_camera, np.linalg.inv(matrix))
 
 
+@pytest.mark.parametrize("height", [1.5, -0.3])
+def test_the_sign_of_a_height_alone_decides_nothing(tmp_path, height):
+    """A camera with the vehicle's axes is upright in both directions; the origin may be on the ground or in a lidar."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = (1.2, 0, height)
+    stated = {"K": k_of(NAMES[0]).tolist(), "T": matrix.tolist(), "width": SIZE[0], "height": SIZE[1]}
+    path = written(tmp_path, {"front": stated})
+    with pytest.raises(InputError, match=r'below the origin.*`transform="'):
+        read(path, None)
+    rig = read(path, None, transform="ego_from_camera", height=1.5).rig
+    np.testing.assert_allclose(rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
+    stated["T_ego_cam"] = stated.pop("T")
+    named = written(tmp_path, {"front": stated}, "named.yaml")
+    if height > 0:
+        np.testing.assert_allclose(read(named, None).rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
+
+
 def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):
     lowered = {name: pose(name) for name in NAMES}
     for matrix in lowered.values():
@@ -324,7 +341,7 @@ def scaled(matrix, factors):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drawn_rigs_are_read_right_in_both_directions(tmp_path, seed):
-    """Each camera alone, too: what is decided is what was written."""
+    """A whole rig under a name that states nothing; each camera alone under one that states the direction."""
     cameras = draw_rig(RigDistribution(), seed, SIZE).rig.cameras
     assert_read_right(tmp_path, cameras)
 
@@ -337,10 +354,13 @@ def test_real_rigs_are_read_right_in_both_directions(shared, tmp_path):
 
 def assert_read_right(folder, cameras):
     for rig in (cameras, *((camera,) for camera in cameras)):
-        for stated in (np.array, np.linalg.inv):
+        for name, stated in (("T_ego_cam", np.array), ("T_cam_ego", np.linalg.inv)):
+            key = name if len(rig) == 1 else "T"
             entries = {
-                camera.name: {"K": camera.intrinsics.tolist(), "T": stated(camera.ego_from_camera).tolist(),
-                              "resolution": [camera.width, camera.height]}
+                camera.name: {
+                    "K": camera.intrinsics.tolist(), key: stated(camera.ego_from_camera).tolist(),
+                    "resolution": [camera.width, camera.height],
+                }
                 for camera in rig
             }  # fmt: skip
             found = read(written(folder, entries, "rig.json"), None).rig

@@ -3,7 +3,7 @@
 The cameras of a vehicle are above the ground, their images are upright, and they look outwards.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -37,8 +37,10 @@ AXES_TEXT = {
 }
 
 
+ORIGIN = "if the origin is not on the ground, pass `height=1.5`, the mean height of the cameras above it"
 ADVICE = {
-    "height": "if the origin is not on the ground, pass `height=1.5`, the mean height of the cameras above it",
+    "below": ORIGIN,
+    "height": ORIGIN,
     "unit": "convert the translations to metres",
 }
 
@@ -123,41 +125,54 @@ def decide_poses(
     asked: the direction that the user states. level_known: the origin need not be on the ground, as heights are given.
     Raises InputError where no reading is possible, or where several are and neither a name nor `asked` decides.
     """
-    if all(pose.exact for pose in poses.values()):
-        return {
-            name: pose.ego_from_camera(Reading("ego_from_camera", "optical", "")) for name, pose in poses.items()
-        }, "poses as stated"
+    free = [pose for pose in poses.values() if not pose.exact]
+    if not free:
+        exact = Reading("ego_from_camera", "optical", "")
+        return {name: pose.ego_from_camera(exact) for name, pose in poses.items()}, "poses as stated"
     _check_rotations(where, poses)
-    readings = list(_readings(poses, asked))
-    found = {reading: {name: pose.ego_from_camera(reading) for name, pose in poses.items()} for reading in readings}
-    reasons = {reading: _impossible(rig, level_known=level_known) for reading, rig in found.items()}
-    possible = _distinct([reading for reading in readings if not reasons[reading]], found)
-    name = next(pose.name for pose in poses.values() if not pose.exact)
-    if not possible:
-        nearest = min(readings, key=lambda reading: (reasons[reading] or ("",))[0] not in ADVICE)
+    rigs = {each: {name: pose.ego_from_camera(each) for name, pose in poses.items()} for each in _readings(free, asked)}
+    reasons = {reading: _impossible(rig, level_known=level_known) for reading, rig in rigs.items()}
+    possible = _distinct([reading for reading in rigs if not reasons[reading]], rigs)
+    stated = next((pose.direction for pose in free if pose.direction), None)
+    chosen = [reading for reading in possible if reading.direction == stated] or possible
+    _check_certain(f"{where}: {free[0].name}", chosen, reasons, stated)
+    why = "as stated" if asked or len(possible) > 1 else "the only reading with the cameras on a vehicle"
+    if stated and stated != chosen[0].direction and not asked:
+        why += f"; its name says {stated}"
+    return rigs[chosen[0]], f"{free[0].name} is {chosen[0].text} ({why})"
+
+
+def _check_certain(
+    where: str, chosen: list[Reading], reasons: Mapping[Reading, tuple[str, str] | None], stated: Direction | None
+) -> None:
+    """Raise InputError unless one reading is chosen, and more than the sign of a height decides it.
+
+    reasons: why readings are impossible. stated: the direction that a name states.
+    """
+    if not chosen:
+        nearest = min(reasons, key=lambda reading: (reasons[reading] or ("",))[0] not in ADVICE)
         code, text = reasons[nearest] or ("", "")
-        advice = ADVICE.get(code, "correct them, or pass `extrinsics=FILE`")
         raise InputError(
-            f"{where}: {name}: no reading of the transforms puts the cameras on a vehicle (expected above the ground, "
-            f"at most {HIGHEST_M:g} m high, upright, looking outwards); as {nearest.text}, {text}: {advice}"
+            f"{where}: no reading of the transforms puts the cameras on a vehicle (expected above the ground, "
+            f"at most {HIGHEST_M:g} m high, upright, looking outwards); as {nearest.text}, {text}: "
+            f"{ADVICE.get(code, 'correct them, or pass `extrinsics=FILE`')}"
         )
-    stated = next((pose.direction for pose in poses.values() if pose.direction), None)
-    named = [reading for reading in possible if reading.direction == stated]
-    chosen = named if len(possible) > 1 and named else possible
-    if len({reading.direction for reading in chosen}) > 1:
+    first = chosen[0].direction
+    if any(reading.direction != first for reading in chosen):
         raise InputError(
-            f"{where}: {name}: can be read in two directions, and both put the cameras on a vehicle: pass "
+            f"{where}: can be read in two directions, and both put the cameras on a vehicle: pass "
             f'`transform="{DIRECTIONS[0]}"` or `transform="{DIRECTIONS[1]}"`'
         )
     if len(chosen) > 1:
         raise InputError(
-            f"{where}: {name}: the order of its quaternions is not certain: name them rotation_wxyz or rotation_xyzw"
+            f"{where}: the order of the quaternions is not certain: name them rotation_wxyz or rotation_xyzw"
         )
-    reading = chosen[0]
-    why = "as stated" if asked or len(possible) > 1 else "the only reading with the cameras on a vehicle"
-    if stated and stated != reading.direction and not asked:
-        why += f"; its name says {stated}"
-    return found[reading], f"{name} is {reading.text} ({why})"
+    for other, reason in reasons.items():
+        if first != stated and other.direction != first and reason and reason[0] == "below":  # the origin of a lidar?
+            raise InputError(
+                f"{where}: as {other.text}, {reason[1]}, and as {first} above it: pass "
+                f'`transform="{first}"`; or `transform="{other.direction}"` and `height=1.5`'
+            )
 
 
 def _check_rotations(where: Path, poses: Mapping[str, StatedPose]) -> None:
@@ -172,8 +187,8 @@ def _check_rotations(where: Path, poses: Mapping[str, StatedPose]) -> None:
                 )
 
 
-def _readings(poses: Mapping[str, StatedPose], asked: Direction | None) -> Iterator[Reading]:
-    free = [pose for pose in poses.values() if not pose.exact]
+def _readings(free: Sequence[StatedPose], asked: Direction | None) -> Iterator[Reading]:
+    """The ways to read transforms that are not exact. asked: the only direction."""
     orders = sorted({order for pose in free for order in pose.matrices})
     axes = next(((pose.axes,) for pose in free if pose.axes), ("optical", "vehicle"))
     for direction, kind, order in product((asked,) if asked else DIRECTIONS, axes, orders):
@@ -210,7 +225,9 @@ def _impossible(rig: Mapping[str, Array], *, level_known: bool) -> tuple[str, st
         if not level_known and not 0 < pose[2, 3] <= HIGHEST_M:
             if pose[2, 3] > 100 * HIGHEST_M:
                 return "unit", f"{name} is {pose[2, 3]:.0f} m above the origin (in millimetres?)"
-            return "height", f"{name} is {abs(pose[2, 3]):.2f} m {'above' if pose[2, 3] > 0 else 'below'} the origin"
+            if pose[2, 3] <= 0:
+                return "below", f"{name} is {-pose[2, 3]:.2f} m below the origin"
+            return "height", f"{name} is {pose[2, 3]:.2f} m above the origin"
     return None
 
 

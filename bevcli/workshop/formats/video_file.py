@@ -43,7 +43,7 @@ def open_video(path: Path, common: SequenceOptions, own: RigOptions) -> ListedSe
     notes = (*given.notes, *bev_frame_notes(rig, "the calibration"), *rotation_notes([path]))
     notes += (f"{count} images at {rate_hz:g} per second, starting at time 0",)
     if motion is None:
-        notes += ("a video has no poses: no history is used (`temporal=False`), and boxes are in the ego frame",)
+        notes += ("a video has no poses: no history is used, and boxes are in the ego frame",)
     sequence = ListedSequence(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
     return sequence
