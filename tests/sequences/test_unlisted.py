@@ -107,13 +107,23 @@ def test_milliseconds_with_jitter_are_no_indices(drive, seed):
 def test_two_possible_readings_need_the_option(drive):
     """0, 100, 200, … are milliseconds at 10 Hz, or every hundredth image."""
     names = [f"{n * 100:06d}" for n in range(20)]
-    with pytest.raises(InputError, match=r'milliseconds \(10 Hz\), or indices.* pass `times="ms"` or `times="index"`$'):
+    with pytest.raises(
+        InputError, match=r'milliseconds \(10 Hz\) or indices of images: pass `times="ms"` or `times="index"`$'
+    ):
         opened(drive, names)
     standing = {"ego_motion": "static"}
     assert seconds(open_sequence(drive, times="ms", **standing))[:3] == [0, 0.1, 0.2]
     assert seconds(open_sequence(drive, times="index", image_rate_hz=500, **standing))[:3] == [0, 0.2, 0.4]
     (drive / "timing.toml").write_text('times = "ms"\nstart_ns = 5000000000\n')
     assert open_sequence(drive, **standing).stamps[1].timestamp_ns == 5_100_000_000
+
+
+def test_ten_seconds_since_1970_may_be_ten_milliseconds(drive):
+    """Images every 10 s by their Unix time, or at 100 Hz on a computer that was started 20 days ago."""
+    names = [str(1_700_000_000 + 10 * n) for n in range(20)]
+    with pytest.raises(InputError, match=r"seconds since 1970 \(0.1 Hz\) or milliseconds \(100 Hz\): pass `times"):
+        opened(drive, names)
+    assert seconds(open_sequence(drive, times="s", ego_motion="static"))[1] == 10
 
 
 def test_the_poses_decide_between_two_readings(drive):

@@ -30,6 +30,7 @@ WORDS: dict[TimeKind, str] = {
 SINCE_1970_NS = (978_307_200 * 10**9, 4_102_444_800 * 10**9)  # the years 2001 to 2099
 LONGEST_NS = 24 * 3600 * 10**9  # of a drive
 PERIODS_NS = (1e9 / 240 / 1.1, 1e9 / 0.5 * 1.1)  # of a camera, with a tenth for jitter
+LONGEST_PERIOD_NS = 60e9  # of images since 1970 that are taken at intervals
 JITTER, STEADY = 0.3, 0.8  # of a period; share of the steps that are whole periods
 DENSE_STEP, LARGEST_STEP, SPARSE_STEP = 5, 100, 1000  # of indices: surely, possibly, only if they are no times
 LARGEST_INDEX = 10**9
@@ -99,26 +100,26 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
             f"{where}: the names {first[0]} to {first[-1]} are no times of a camera in any unit (expected 0.5 to 240 "
             "images per second) and no different indices: state their unit by `times`, or list the images in frames.csv"
         )
-    for known in chain.from_iterable(found):
-        if known.is_known_origin:
-            return known
     alone = [readings[0] for readings in found if len(readings) == 1]
+    known = [reading for reading in alone if reading.is_known_origin]
     times = [reading for reading in alone if reading.kind != "index"]
-    return (times or alone or [_decided(where, found[0], motion)])[0]
+    return (known or times or alone or [_decided(where, names, found[0], motion)])[0]
 
 
-def _decided(where: Path, readings: list[Reading], motion: EgoMotion | None) -> Reading:
+def _decided(where: Path, names: Texts, readings: list[Reading], motion: EgoMotion | None) -> Reading:
     """The one of several readings that fits the poses: times that they cover, or else the indices."""
-    index = next(reading for reading in readings if reading.kind == "index")
-    times = [reading for reading in readings if reading is not index]
+    times = [reading for reading in readings if reading.kind != "index"]
     if motion is not None:
-        return next((reading for reading in times if reading.is_covered(motion)), index)
-    camera, values = next((camera, values) for camera, values in index.values.items() if len(values) > 1)
-    rates = [f"{WORDS[each.kind]} ({1e9 / np.median(_steps(each.values)[0]):.3g} Hz)" for each in times]
-    options = " or ".join(f'`times="{each.kind}"`' for each in (*times, index))
+        fitting = [reading for reading in times if reading.is_covered(motion)]
+        fitting = fitting or [reading for reading in readings if reading.kind == "index"]
+        if len(fitting) == 1:
+            return fitting[0]
+    words = [f"{each.words} ({1e9 / np.median(_steps(each.values)[0]):.3g} Hz)" for each in times]
+    words += ["indices of images"] if len(times) < len(readings) else []
+    options = " or ".join(f'`times="{each.kind}"`' for each in readings)
+    first = next(iter(names.values()))
     raise InputError(
-        f"{where}: camera {camera}: the numbers {values.min()} to {values.max()} in the image names may be "
-        f"{' or '.join(rates)}, or indices of images: pass {options}"
+        f"{where}: the numbers in the image names {first[0]} to {first[-1]} may be {' or '.join(words)}: pass {options}"
     )
 
 
@@ -156,7 +157,7 @@ def _check_counts(where: Path, names: Texts, split: Mapping[str, list[list[str]]
 
 def _readings(column: Texts) -> list[Reading]:
     """The possible readings of a column. One that is a time since 1970 at the rate of a camera is the only one."""
-    found, slow = [], []
+    found, slow = list[Reading](), list[Reading]()
     for kind in UNITS_NS:
         reading = _read(column, kind)
         if reading is None:
@@ -165,7 +166,8 @@ def _readings(column: Texts) -> list[Reading]:
         if reading.is_known_origin and (_has_rate(reading.values) or not steps):
             return [reading]
         if reading.is_known_origin and all(np.median(each) >= PERIODS_NS[0] for each in steps):
-            slow.append(reading)  # images at long intervals, if no other unit fits
+            is_usual = all(np.median(each) <= LONGEST_PERIOD_NS for each in steps)
+            (found if is_usual else slow).append(reading)  # the slow ones if no other unit fits
         elif _has_rate(reading.values) and _is_steady(steps) and _extent(reading.values) <= LONGEST_NS:
             found.append(reading)
     found = found or slow
