@@ -16,8 +16,9 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.format import GROUP, format_of, formats, option_classes
+from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import RigOptions, SequenceOptions
+from bevcli.sequences.options import SequenceOptions
 
 PLUG_IN = '''
 from pathlib import Path
@@ -31,6 +32,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.images import AT_REST
+from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.options import RigOptions
 
 
@@ -95,7 +97,7 @@ def strip(tmp_path, drive) -> dict:
 
 def test_each_option_is_stated_once():
     common = {field.name for field in fields(SequenceOptions)}
-    shared = {field.name for field in fields(RigOptions)}
+    shared = {field.name for field in fields(FolderOptions)}  # of a folder and a video; those of a rig are among them
     own = [{field.name for field in fields(one.options)} for one in formats()]
     assert not common & set().union(*own)
     for number, names in enumerate(own):
