@@ -28,7 +28,7 @@ if TYPE_CHECKING:
         Prediction as Prediction,
         Sequence as Sequence,
     )
-    from bevcli.geometry.boxes import Boxes3D as Boxes3D
+    from bevcli.geometry.boxes import Box3D as Box3D, Boxes3D as Boxes3D
     from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import show as show
+    from bevcli.viewer.views import screenshot as screenshot, video as video
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.synth.drive import render as render
 
@@ -50,7 +51,7 @@ _NAMES = {
     "bevcli.errors": "BevcliError",
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
-    "bevcli.geometry.boxes": "Boxes3D",
+    "bevcli.geometry.boxes": "Box3D Boxes3D",
     "bevcli.geometry.cameras": "Camera CameraRig Distortion",
     "bevcli.geometry.ego_motion": "Kinematics",
     "bevcli.geometry.transforms": "Pose",
@@ -64,6 +65,7 @@ _NAMES = {
     "bevcli.sequences.open": "open_sequence",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.viewer.recording_file": "show",
+    "bevcli.viewer.views": "screenshot video",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = list(_MODULES)

@@ -223,6 +223,8 @@ class Runner:
             grid=self.config.bev_grid,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
+            object_classes=self.config.object_classes,
+            frame=frame,
             **{"boxes": Boxes3D.empty(), "bev": None, **fields},
         )
 

@@ -139,13 +139,18 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
     stream.log(entities.BEV_ON_GROUND, painted.on_ground(grid, ego_from_bev, GROUND_OPACITY))
 
 
-def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
-    """Writes a segmentation into the BEV view and onto the ground of the scene, in the colours of the map classes."""
+def map_image(segmentation: BevMap) -> NDArray[np.uint8]:
+    """A segmentation as an image (rows, columns, 3) RGB in the colours of the map classes."""
     palette = np.full((256, 3), BACKGROUND, dtype=np.uint8)
     contents = replace(segmentation, cells=np.arange(256, dtype=np.uint8))
     for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
         palette[contents.layer(name)] = color
-    painted = _Painted(palette.take(segmentation.cells, axis=0))
+    return palette.take(segmentation.cells, axis=0)
+
+
+def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
+    """Writes a segmentation into the BEV view and onto the ground of the scene, in the colours of the map classes."""
+    painted = _Painted(map_image(segmentation))
     stream.log(entities.BEV_SEGMENTATION, painted.flat(segmentation, draw_order=-5))
     stream.log(entities.SEGMENTATION_ON_GROUND, painted.on_ground(segmentation, ego_from_bev, 255))
 
