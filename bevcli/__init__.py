@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import show as show
     from bevcli.viewer.views import screenshot as screenshot, video as video
+    from bevcli.weights.model_file import model_file_for as model_file_for
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.synth.drive import render as render
 
@@ -63,6 +64,7 @@ _NAMES = {
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
+    "bevcli.weights.model_file": "model_file_for",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.viewer.recording_file": "show",
     "bevcli.viewer.views": "screenshot video",

@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from math import nan
-from operator import index
-from typing import Annotated, Any, Literal, SupportsIndex, overload
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,7 +65,7 @@ class Box3D:
 
 
 # What selects several boxes: a mask (N,) bool, an index array or a slice.
-Selection = slice | Sequence[int] | Sequence[bool] | NDArray[Any]
+Selection = slice | Sequence[int] | Sequence[bool] | NDArray[Any] | np.bool
 
 
 @dataclass(frozen=True)
@@ -112,15 +111,15 @@ class Boxes3D:
         return len(self.centers)
 
     @overload
-    def __getitem__(self, selection: SupportsIndex) -> Box3D: ...
+    def __getitem__(self, selection: int | np.integer[Any]) -> Box3D: ...
 
     @overload
     def __getitem__(self, selection: Selection) -> "Boxes3D": ...
 
-    def __getitem__(self, selection: SupportsIndex | Selection) -> "Box3D | Boxes3D":
+    def __getitem__(self, selection: int | np.integer[Any] | Selection) -> "Box3D | Boxes3D":
         """The box at an index, or the boxes of a mask (N,) bool, an index array or a slice."""
-        if not isinstance(selection, slice) and np.ndim(selection) == 0:
-            return self._box(index(selection))
+        if isinstance(selection, int | np.integer):
+            return self._box(int(selection))
         key = selection if isinstance(selection, slice) else np.asarray(selection)
         chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
         return Boxes3D(**chosen)

@@ -394,12 +394,10 @@ def installed_engines() -> dict[str, Any]:
 
 def _model_of(weights: Path) -> str:
     """The first known model that a file of weights fits."""
-    models = read_checkpoint(weights).models
-    if not models:
-        raise WeightsError(
-            f"{weights}: fits none of the known models ({', '.join(known_models())}): name its own by `model=FILE.toml`"
-        )
-    return models[0]
+    checkpoint = read_checkpoint(weights)
+    if not checkpoint.models:
+        raise WeightsError(f"{weights}: {checkpoint.misfit}")
+    return checkpoint.models[0]
 
 
 def choose_device(name: str | torch.device) -> torch.device:

@@ -120,8 +120,8 @@ def _draw_from_above(
         velocity = boxes.velocities[index] * (1, -1)
         if np.linalg.norm(velocity) > MOVING_M_S:  # not of NaN
             start = boxes.centers[index, :2] * (1, -1)
-            ends = to_canvas(np.stack([start, start + velocity])).astype(int).tolist()
-            cv2.arrowedLine(canvas, *ends, _bgr(own[index]), 1, cv2.LINE_AA, 0, 0.25)
+            tail, tip = to_canvas(np.stack([start, start + velocity])).astype(int).tolist()
+            cv2.arrowedLine(canvas, tail, tip, _bgr(own[index]), 1, cv2.LINE_AA, 0, 0.25)
     for strip in default_vehicle().top_view:
         _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, strip))[None], EGO_COLOR, 2)
 

@@ -26,14 +26,13 @@ from pathlib import Path
 
 import torch
 
-from bevcli.config import TRAINING, load_config, load_table, read_model_file
+from bevcli.config import TRAINING, as_toml, load_config, load_table, read_model_file
 from bevcli.inference.load import choose_device
 from bevcli.printing import say
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training import files
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
-from bevcli.workshop.training.model_file import _toml
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.trainer import Trainer
 
@@ -107,7 +106,7 @@ def model_file(path: Path) -> Path:
             part.clear()
         part.update(changes)
     table["name"] = "photographs"
-    path.write_text(_toml(table))
+    path.write_text(as_toml(table))
     return path
 
 
