@@ -16,7 +16,7 @@ EXAMPLE = 'such as {"CAM_FRONT": image}'
 
 
 def checked_images(
-    images: Mapping[str, NDArray[np.uint8]], rig: CameraRig, color_order: ColorOrder, timestamp_ns: int
+    images: Mapping[str, NDArray[Any]], rig: CameraRig, color_order: ColorOrder, timestamp_ns: int
 ) -> dict[str, CameraImage]:
     """The images of a frame. Raises InputError where they are not images of cameras of the rig, by name."""
     if not isinstance(images, Mapping):
@@ -53,7 +53,7 @@ def whole_nanoseconds(timestamp_ns: Any) -> int:
         raise InputError(f"`timestamp_ns`: expected whole nanoseconds (found {found}): {advice}") from None
 
 
-def _check_image(pixels: NDArray[np.uint8], camera: Camera) -> None:
+def _check_image(pixels: NDArray[Any], camera: Camera) -> None:
     """Raise InputError where pixels are not an image of a camera."""
     shape, kind = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
     if shape != (camera.height, camera.width, 3) or kind != np.uint8:

@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -83,7 +82,7 @@ class Model:
 
     def __call__(
         self,
-        images: Mapping[str, NDArray[np.uint8]],
+        images: Mapping[str, NDArray[Any]],
         calibration: CameraRig | str | Path | None = None,
         *,
         color_order: ColorOrder = "bgr",

@@ -144,7 +144,7 @@ class Session:
 
     def step(
         self,
-        images: Mapping[str, NDArray[np.uint8]],
+        images: Mapping[str, NDArray[Any]],
         world_from_ego: Pose | ArrayLike,
         timestamp_ns: int,
         *,
