@@ -9,23 +9,20 @@ from bevcli.cli.stop_signals import EndSignals
 
 def main() -> None:
     """The program. Ctrl-C and SIGTERM end it without a traceback, also while it imports packages."""
-    _open_streams()
-    signals = EndSignals()
-    signals.start()
-    atexit.register(signals.stop)  # Python waits for threads before this
-    from bevcli.cli.main import run_app
-
-    run_app()
-
-
-def _open_streams() -> None:
-    """Make closed streams of the program, as of `>&-`, /dev/null: the next file would take their place."""
+    # Streams that are closed, as by `>&-`, become /dev/null: the next file would take their place.
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115, open until the program ends
+    signals = EndSignals()
+    signals.start()
+    atexit.register(signals.stop)  # Python waits for threads before this
+    from bevcli.cli.main import app, program
+
+    with program():
+        app()
 
 
 if __name__ == "__main__":

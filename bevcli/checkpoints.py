@@ -15,7 +15,6 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
-from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
 from bevcli.printing import counted
@@ -29,6 +28,7 @@ AVERAGES = r"ema[_.]|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
 AVERAGED_PREFIXES = r"(?:(?:ema_)?(?:module|model)\.|ema[_.])*"  # where a file has averages only
 WRAPPERS = ("state_dict", "model", "model_state_dict")  # keys that a file may hold its state dict under
 LEAST_SHARE = 0.5  # of a model's tensors, that a file must hold for a difference in words
+OFFICIAL = ("img_backbone.", "img_neck.", "pts_bbox_head.")  # of names in the released files
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
         state, facts, not_read = _read_pth(path, left_out)
     state = _unwrapped(state, left_out)
     _check_numbers(path, state)
-    official = is_official(state)
+    official = any(key.startswith(OFFICIAL) for key in state)
     if official:
+        from bevcli.model.official_keys import from_official
+
         state, parts = from_official(state)
         left_out += [parts] if parts else []
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)

@@ -7,7 +7,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -46,9 +46,9 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
 
     Paths of meshes are relative to the folder of `file`.
     """
-    architecture, known = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
-    if architecture not in known:
-        expected = " or ".join(f'"{name}"' for name in known)
+    architecture, architectures = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
+    if architecture not in architectures:
+        expected = " or ".join(f'"{name}"' for name in architectures)
         raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r:.60}')
     settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
     model: type[TemporalModel] = load("bevcli.models", architecture)
@@ -110,7 +110,9 @@ def _key(name: str) -> str:
 def _plain(settings: Any) -> dict[str, Any]:
     """The fields of a dataclass as TOML has them: nested dictionaries; lists for tuples; None is left out."""
     table = settings if isinstance(settings, dict) else msgspec.to_builtins(settings)
-    return {key: _plain(each) if isinstance(each, dict) else each for key, each in table.items() if each is not None}
+    return {
+        key: _plain(value) if isinstance(value, dict) else value for key, value in table.items() if value is not None
+    }
 
 
 def read_model_file(name: str) -> tuple[dict[str, Any], str]:
@@ -119,28 +121,21 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
-    published = {} if name.endswith(".toml") else read_sources()
-    if name in published and published[name].model:
-        contents, file = _read_toml(published[name].model)
-        return contents | {"name": name}, file
-    return _read_toml(name, published)
-
-
-def _read_toml(name: str, published: Iterable[str] = ()) -> tuple[dict[str, Any], str]:
-    """As `read_model_file`, for a known model or a FILE.toml. published: further names, for the error."""
-    known = known_models()
-    if name.endswith(".toml"):
-        path, file = Path(name), name
-        if not path.is_file():
-            raise ConfigError(f"{path}: file not found; known models are {', '.join(known)}")
-        text = read_text(path, TOML_BYTES, error=ConfigError)
+    known, published = known_models(), {} if name.endswith(".toml") else read_sources()
+    of_weights = published[name].model if name in published else ""
+    file = model = of_weights or name
+    if model.endswith(".toml"):
+        if not Path(model).is_file():
+            raise ConfigError(f"{model}: file not found; known models are {', '.join(known)}")
+        text = read_text(Path(model), TOML_BYTES, error=ConfigError)
     else:
-        if name not in known:
+        if model not in known:
             names = ", ".join(dict.fromkeys([*known, *published]))
-            raise ConfigError(f'unknown model "{name}"; expected one of {names}, or a FILE.toml')
-        file = f"{name}.toml"
+            raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml')
+        file = f"{model}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
-    return parse_toml(text, file, ConfigError), file
+    contents = parse_toml(text, file, ConfigError)
+    return contents | {"name": name} if of_weights else contents, file
 
 
 def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:

@@ -4,7 +4,12 @@ A message states what is wrong and where, what was expected and found, and what 
 ``calibration.json: camera CAM_BACK: "intrinsics" is missing (expected 3x3)``.
 """
 
+from concurrent.futures import Future, TimeoutError as FutureTimeout
+from typing import TypeVar
+
 from bevcli.printing import one_line
+
+T = TypeVar("T")
 
 
 class BevcliError(Exception):
@@ -35,3 +40,17 @@ class WaitError(BevcliError):
 
     A thread may still wait for it, so the command line then ends the process without waiting for its threads.
     """
+
+
+def result_within(future: Future[T], seconds: float, what: str) -> T:
+    """The result of a task in another thread. An exception of the task is raised here.
+
+    what: what the task does, for the error message: "reading frame 7".
+    Raises WaitError if the task takes longer. Its thread goes on.
+    """
+    try:
+        return future.result(seconds)
+    except FutureTimeout:
+        if future.done():  # the exception of the task itself, such as a network folder's time-out
+            raise
+        raise WaitError(f"{what}: no answer within {seconds:.0f} s") from None

@@ -71,6 +71,13 @@ class BevMap:
         """(rows, columns) bool, the cells of a class; all False for a class that the map does not have."""
         return (self.cells & np.uint8(self.classes.get(name, 0))) > 0
 
+    def painted(self, colors: Mapping[str, Color], background: Color) -> NDArray[np.uint8]:
+        """(rows, columns, 3) RGB: each cell in the colour of the last of its classes, by their order in `colors`."""
+        palette = np.full((256, 3), background, dtype=np.uint8)
+        for name, color in colors.items():
+            palette[(np.arange(256) & self.classes.get(name, 0)) > 0] = color
+        return palette.take(self.cells, axis=0)
+
 
 @dataclass(frozen=True)
 class GroundLines:

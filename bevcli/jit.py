@@ -38,14 +38,6 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-def is_compiled(function: Any) -> bool:
-    """True if the cache has the compiled function of this file's present state."""
-    code = function.py_func.__code__
-    name = f"{Path(code.co_filename).stem}.{function.py_func.__qualname__}-{code.co_firstlineno}.*.nbi"
-    folder, changed = function.stats.cache_path, Path(code.co_filename).stat().st_mtime
-    return folder is not None and any(file.stat().st_mtime >= changed for file in Path(folder).glob(name))
-
-
 @cache
 def _temporary_cache() -> bool:
     """Sets numba's cache folder to one in the temporary folder, once. False where there is no such place."""

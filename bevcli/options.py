@@ -16,7 +16,7 @@ command line prints such a name as its flag: "pass --force".
 import dataclasses
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, Field
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform, get_type_hints
 
@@ -77,18 +77,12 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
     def decorate(cls: _Class) -> _Class:
         made: Any = dataclasses.dataclass(frozen=True)(cls)
         made.panel = panel
-        stated = ((field.name, option_of(field)) for field in dataclasses.fields(made))
-        attributes = [f"    {name}: {found.help}" for name, found in stated if found]
+        stated = ((field.name, field.metadata.get("option")) for field in dataclasses.fields(made))
+        attributes = [f"    {name}: {option.help}" for name, option in stated if option]
         made.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *attributes])
         return made
 
     return decorate
-
-
-def option_of(field: Field[Any]) -> Option | None:
-    """The option of a field; None for a field that is none."""
-    found: Option | None = field.metadata.get("option")
-    return found
 
 
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:
@@ -105,13 +99,13 @@ def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, A
 
 def defaults(kind: type[Any]) -> dict[str, Any]:
     """The default of each option of a dataclass that has one."""
-    found = {}
+    values = {}
     for field in dataclasses.fields(kind):
         if field.default_factory is not MISSING:
-            found[field.name] = field.default_factory()
+            values[field.name] = field.default_factory()
         elif field.default is not MISSING:
-            found[field.name] = field.default
-    return found
+            values[field.name] = field.default
+    return values
 
 
 def parse_pairs(texts: Iterable[str], expected: str) -> dict[str, str]:

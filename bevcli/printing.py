@@ -33,7 +33,7 @@ def reason_of(error: BaseException) -> str:
 def say(*texts: object, err: bool = False) -> None:
     """Print texts, each on lines of its own. err: on stderr."""
     text = "\n".join(map(str, texts))
-    if not text.isprintable():
+    if not text.replace("\n", "").isprintable():
         text = "".join(char if char in "\n\t" else _escaped(char) for char in text)
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
@@ -75,8 +75,8 @@ def _escaped(char: str) -> str:
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
     """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
     columns = []
-    for place, column in enumerate(zip(*rows, strict=True)):
-        pad, width = str.ljust if place in left else str.rjust, max(map(len, column))
+    for index, column in enumerate(zip(*rows, strict=True)):
+        pad, width = str.ljust if index in left else str.rjust, max(map(len, column))
         columns.append([pad(cell, width) for cell in column])
     return "\n".join("  ".join(row).rstrip() for row in zip(*columns, strict=True))
 

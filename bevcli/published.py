@@ -17,8 +17,7 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.user_folders import user_cache, user_folder
-from bevcli.writing import write_whole
+from bevcli.writing import user_cache, user_folder, write_whole
 
 FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
 HASHES = "hashes.json"
@@ -159,11 +158,19 @@ def own_table() -> Path:
 
 def read_sources() -> dict[str, Source]:
     """All sources by name; those of the user's own file replace those of the package. Raises ConfigError."""
-    text = resources.files("bevcli").joinpath("weights", "sources.toml").read_text(encoding="utf-8")
-    sources = _parse(text, "sources.toml")
-    own = own_table()
+    package, own = resources.files("bevcli").joinpath("weights", "sources.toml"), own_table()
+    texts = {"sources.toml": package.read_text(encoding="utf-8")}
     if own.is_file():
-        sources |= _parse(read_text(own, TOML_BYTES, error=ConfigError), str(own))
+        texts[str(own)] = read_text(own, TOML_BYTES, error=ConfigError)
+    sources = {}
+    for file, text in texts.items():
+        for name, table in parse_toml(text, file, ConfigError).items():
+            if not _NAME.fullmatch(name):
+                raise ConfigError(f"{file}: [{name:.60}]: expected a name of letters, digits and - . + _")
+            try:
+                sources[name] = msgspec.convert(table, Source)
+            except msgspec.ValidationError as error:
+                raise ConfigError(f"{file}: [{name}]: {error}") from None
     return sources
 
 
@@ -184,18 +191,6 @@ def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     if name not in known:
         raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(known)})')
     return known[name]
-
-
-def _parse(text: str, file: str) -> dict[str, Source]:
-    sources = {}
-    for name, table in parse_toml(text, file, ConfigError).items():
-        if not _NAME.fullmatch(name):
-            raise ConfigError(f"{file}: [{name:.60}]: expected a name of letters, digits and - . + _")
-        try:
-            sources[name] = msgspec.convert(table, Source)
-        except msgspec.ValidationError as error:
-            raise ConfigError(f"{file}: [{name}]: {error}") from None
-    return sources
 
 
 def _read_hashes(folder: Path) -> dict[str, Known]:

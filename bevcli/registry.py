@@ -29,29 +29,31 @@ def installed() -> Any:
 @cache
 def entries(group: Group) -> dict[str, EntryPoint]:
     """The entries of a group by name, in the order of their names. Raises BevcliError where two have the same name."""
-    found = {name: EntryPoint(name, value, group) for name, value in own(group).items()}
+    by_name = {name: EntryPoint(name, value, group) for name, value in own(group).items()}
     for entry in installed().select(group=group):
         if entry.value.startswith("bevcli."):  # of an earlier version, which an editable install may still list
             continue
-        other = found.setdefault(entry.name, entry)
+        other = by_name.setdefault(entry.name, entry)
         if other.value != entry.value:
             raise BevcliError(
                 f'entry point {group}: two packages register "{entry.name}": {other.value} and {entry.value}: '
                 "uninstall one of them"
             )
-    return dict(sorted(found.items()))
+    return dict(sorted(by_name.items()))
 
 
 @cache
 def load(group: Group, name: str) -> Any:
     """The object of an entry. Raises BevcliError for an unknown name, or for one that cannot be imported."""
-    known = entries(group)
-    if name not in known:
-        raise BevcliError(f'entry point {group}: "{name}" is unknown (expected {", ".join(known)})')
+    registered = entries(group)
+    if name not in registered:
+        raise BevcliError(f'entry point {group}: "{name}" is unknown (expected {", ".join(registered)})')
     try:
-        return known[name].load()
+        return registered[name].load()
     except Exception as error:  # whatever a package of somebody else does
-        raise BevcliError(f"entry point {group}: {name} = {known[name].value} cannot be imported: {error}") from error
+        raise BevcliError(
+            f"entry point {group}: {name} = {registered[name].value} cannot be imported: {error}"
+        ) from error
 
 
 def for_model(use: str, model: type) -> list[Any]:

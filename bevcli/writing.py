@@ -1,4 +1,7 @@
-"""Writing of files under another name first, so that an interrupted command leaves no partial file."""
+"""Writing of files under another name first, so that an interrupted command leaves no partial file.
+
+And the folders of a user, as the XDG base directory specification has them.
+"""
 
 import os
 import shutil
@@ -10,6 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bevcli.errors import OutputError
+
+NO_HOME = Path("/nonexistent")  # as in the passwd of Debian; caches that cannot be written are done without
 
 
 @contextmanager
@@ -64,7 +69,9 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
             if parents:
                 path.parent.mkdir(parents=True, exist_ok=True)
             unfinished.unlink(missing_ok=True)  # it may be a link
-            mode = _mode_of_new_files(unfinished)
+            unfinished.touch(exist_ok=False)
+            mode = unfinished.stat().st_mode & 0o777  # that the umask gives to new files
+            unfinished.unlink()
             yield unfinished
             unfinished.chmod(mode)  # some libraries, such as safetensors, write files that only their owner can read
             os.replace(unfinished, path)
@@ -73,38 +80,10 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
             unfinished.unlink()
 
 
-def _mode_of_new_files(path: Path) -> int:
-    """The mode that the umask gives to a file of this name, which does not exist before or after."""
-    path.touch(exist_ok=False)
-    mode = path.stat().st_mode & 0o777
-    path.unlink()
-    return mode
-
-
 def write_whole(path: Path, content: bytes, **how: bool) -> None:
     """Write a file, so that readers see the old or the new contents. how: of `whole_file`."""
     with whole_file(path, **how) as unfinished:
         unfinished.write_bytes(content)
-
-
-@contextmanager
-def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
-    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
-
-    So is the folder itself if it was missing before. Other files in it are kept.
-    Raises OutputError where the folder cannot be made.
-    """
-    is_new = not folder.exists()
-    with output_errors(folder, "created"):
-        folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            remove_parts(folder, parts)
-            if is_new:
-                folder.rmdir()
-        raise
 
 
 def remove_parts(folder: Path, parts: Iterable[str]) -> None:
@@ -118,5 +97,18 @@ def remove_parts(folder: Path, parts: Iterable[str]) -> None:
 
 def check_output(path: Path, *inputs: Path) -> None:
     """Raises OutputError where a file to be written is one that the command reads."""
-    if path.exists() and any(each.exists() and path.samefile(each) for each in inputs):
+    if path.exists() and any(source.exists() and path.samefile(source) for source in inputs):
         raise OutputError(f"{path}: is the input (expected another file to write)")
+
+
+def user_cache() -> Path:
+    """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
+    return user_folder("XDG_CACHE_HOME", ".cache")
+
+
+def user_folder(variable: str, below_home: str) -> Path:
+    """The folder of bevcli in that of an environment variable, by default in one below the user's home folder."""
+    try:
+        return Path(os.environ.get(variable) or Path.home() / below_home) / "bevcli"
+    except RuntimeError:  # no HOME, and no entry in the system's list of users
+        return NO_HOME / below_home / "bevcli"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO
 from unittest.mock import patch
 
-from bevcli.cli.main import run_app
+from bevcli.cli import main
 
 MINI_TOML = """
 name = "mini"
@@ -62,7 +62,8 @@ def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
         stack.enter_context(patch.object(sys, "argv", ["bevcli", *map(str, arguments)]))
         code = 0
         try:
-            run_app()
+            with main.program():
+                main.app()
         except SystemExit as end:
             code = end.code or 0
         texts = [flushed(file) for file in (out, err)]

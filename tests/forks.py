@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from bevcli.cli.main import run_app
+from bevcli.cli.main import app, program
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
@@ -43,4 +43,5 @@ def run_in_fork(
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
     if before:
         before()
-    run_app()
+    with program():
+        app()

@@ -8,7 +8,7 @@ from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.step import NUSCENES_YAWS_DEG
 
 
 def make_camera(name: str, yaw_deg: float, width: int = 320, height: int = 180) -> Camera:

@@ -13,20 +13,18 @@ from warm_python import WarmPython
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.inference.cpu_settings import keep_freed_memory
+from bevcli.inference.machine import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
+from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.viewer import recording_file
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig
-from bevcli.workshop.vad.motion_head import MotionConfig
-from bevcli.workshop.vad.vad import VAD
+from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
+from bevcli.workshop.vad.vad import VAD, VADConfig
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -309,12 +309,12 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     """
     device = SimulatedDevice(name)
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
-    monkeypatch.setattr("bevcli.inference.transfer.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
+    monkeypatch.setattr("bevcli.inference.pipeline.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
     monkeypatch.setattr(torch.mps, "synchronize", lambda: None)
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
         provide_triton(monkeypatch)
-        from bevcli.model.kernels import triton_attention, triton_convolution, triton_stem
+        from bevcli.model.kernels import triton_attention, triton_convolution
 
         monkeypatch.setattr(triton_convolution, "deformable_convolution", predicted_deformable_convolution)
         monkeypatch.setattr(torch, "cudnn_convolution_relu", convolution_relu)
@@ -322,7 +322,7 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
         for module, name, plain in (
             (triton_attention, "_sample", sample),
             (triton_attention, "_sample_hits", hits_plainly),
-            (triton_stem, "_pool", pool),
+            (triton_convolution, "_pool", pool),
         ):
             monkeypatch.setattr(module, name, Kernel(device, plain))
     with device:

@@ -9,7 +9,7 @@ from recorded_drive import with_truth
 
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.options import ModelOptions
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions
 from bevcli.workshop.batch.job import Job

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import bevcli
-from bevcli.jit import is_compiled
+from bevcli.workshop.synth.commands import is_compiled
 
-CODE = "import bevcli.model.kernels.bilinear, bevcli.workshop.synth.renderer; print('ok')"
+CODE = "import bevcli.model.kernels.loops, bevcli.workshop.synth.renderer; print('ok')"
 
 
 @pytest.fixture

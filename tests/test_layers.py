@@ -21,7 +21,7 @@ LAYERS = (
     {"_version", "findings", "printing"},
     {"errors", "registered"},
     {"options", "registry"},
-    {"parsing", "jit", "user_folders", "waiting", "writing"},
+    {"parsing", "jit", "writing"},
     {"published"},
     {"geometry"},
     {"frame"},
@@ -47,11 +47,11 @@ WINGS: dict[str, set[str]] = {
     "engines": set(),
     "formats": set(),
     "robustness": {"calibration", "synth"},
-    "synth": {"formats", "vad"},
+    "synth": {"formats"},
     "scores": set(),
     "training": {"synth"},
     "uniad": set(),
-    "vad": {"engines", "training"},
+    "vad": {"formats", "training"},
 }
 WORKSHOP = "bevcli.workshop."
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

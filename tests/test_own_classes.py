@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, are_nuscenes, object_classes
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.recording.colors import class_colors
+from bevcli.recording.entities import class_colors
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.workshop.formats.kitti import kitti_labels
 from bevcli.workshop.scores.tracking import TrackingConfig

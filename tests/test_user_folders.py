@@ -3,7 +3,7 @@
 import pwd
 
 from bevcli.published import own_table, read_sources
-from bevcli.user_folders import user_cache
+from bevcli.writing import user_cache
 
 
 def test_a_user_without_a_home_has_folders_that_are_not_there(monkeypatch):

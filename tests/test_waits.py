@@ -31,9 +31,9 @@ ALLOWED = {
     ("inference/preprocess.py", "task.result"): "the task is done",
     ("model/kernels/compiled.py", "helper.result"): "the tasks only compute",
     ("workshop/synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("workshop/training/loading.py", "clip.result"): "in a thread whose own result has a limit",
+    ("workshop/training/samples.py", "clip.result"): "in a thread whose own result has a limit",
     ("workshop/robustness/conditions.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("workshop/calibration/measure.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("workshop/calibration/views.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("workshop/calibration/road.py", "ThreadPoolExecutor"): "the tasks only compute",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.

@@ -18,7 +18,7 @@ import typer
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
-from bevcli.options import Option, Reads, defaults, option_of
+from bevcli.options import Option, Reads, defaults
 from bevcli.printing import one_line, say
 from bevcli.registered import Group
 from bevcli.registry import entries, load
@@ -62,9 +62,6 @@ class Part:
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     classes: Callable[[], list[type[Any]]] = option_classes
-
-    def __contains__(self, name: str) -> bool:
-        return name not in self.without and (not self.only or name in self.only)
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,10 @@ class _Flag:
 
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
-        stated, kind, default = self.option, _plain(self.kind), self.default
+        stated, kind, default = self.option, self.kind, self.default
+        kinds = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+        if Path in kinds:  # of several that Python takes, such as `str | Path | None`
+            kind = Path | None if type(None) in kinds else Path
         if stated.flag_value is not None:
             kind, default = bool, False
         elif stated.repeatable or stated.parse is not None:
@@ -130,9 +130,13 @@ class _Flag:
             kind = types.GenericAlias(list, (kind,)) if stated.repeatable else kind
             if default is not Parameter.empty:
                 kind, default = kind | None, None
+        value = kind  # what `--help` calls by its name: PATH, TEXT or the choices
+        while get_origin(value) in (list, tuple, Union, types.UnionType):
+            value = get_args(value)[0]
+        metavar = None if value is bool else "|".join(get_args(value)) or _METAVARS.get(value)
         settings: dict[str, Any] = {
-            "help": _with_flags(stated.help, flags),
-            "metavar": stated.metavar or self._metavar(kind),
+            "help": _ARGUMENT.sub(partial(_as_flag, flags), stated.help),
+            "metavar": stated.metavar or (self.name.upper() if stated.is_argument else metavar),
         }
         if stated.is_argument:
             info = typer.Argument(**settings)
@@ -140,14 +144,6 @@ class _Flag:
             settings |= {"min": stated.minimum, "max": stated.maximum, "autocompletion": stated.complete}
             info = typer.Option(*self.spellings, rich_help_panel=self.panel, **settings)
         return Parameter(self.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
-
-    def _metavar(self, kind: Any) -> str | None:
-        """The name of the value in `--help`: that of an argument, else PATH, TEXT or the choices."""
-        while get_origin(kind) in (list, tuple, Union, types.UnionType):
-            kind = get_args(kind)[0]
-        if self.option.is_argument:
-            return self.name.upper()
-        return None if kind is bool else "|".join(get_args(kind)) or _METAVARS.get(kind)
 
     def value(self, given: Any) -> Any:
         """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
@@ -163,93 +159,83 @@ class _Flag:
             raise typer.BadParameter(str(error), param_hint=self.yes) from None
 
 
+# Of the command that runs, or ran last.
 _flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
 
 
-def command(function: Callable[..., None]) -> Callable[..., None]:
-    """The function for typer: each parameter that is a dataclass of options becomes one parameter for each field.
+def command(function: Callable[..., None]) -> Callable[..., dict[str, Any]]:
+    """The arguments of a function from what typer has read, for `PlainCommand`, which calls the function itself.
 
-    Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
+    Each parameter that is a dataclass of options becomes one parameter for each field. Arguments in backticks in a help
+    text become flags.
     """
     parts: list[Parameter | _Flag] = []
     flags: dict[str, _Flag] = {}  # of the dataclasses, which the texts of the library name
     makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in signature(function).parameters.items():
-        make, found = _flags_of(hints[name])
-        for twice in found.keys() & flags.keys():  # one of them is of another package
+        hint, marks = hints[name], getattr(hints[name], "__metadata__", ())
+        make, fields = _flags_of(hint)
+        for twice in fields.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
-        if make is None:
-            parts.append(_direct(parameter, hints[name]))
-        else:
-            makers[name] = make, found
-        flags |= found
-        parts += found.values()
-    stated = [part for part in parts if isinstance(part, _Flag)]
-    inputs = [flag for flag in stated if flag.option.reads]
+        if make is not None:
+            makers[name] = make, fields
+        elif marks and isinstance(marks[0], Option):
+            parts.append(_Flag(name, marks[0], get_args(hint)[0], parameter.default, marks[0].panel or None))
+        else:  # without an `Option` it stays as typer has it
+            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
+        flags |= fields
+        parts += fields.values()
+    inputs = [part for part in parts if isinstance(part, _Flag) and part.option.reads]
 
-    def called(**given: Any) -> None:
-        before = _flags.set(flags)
-        try:
-            read = [(given[flag.name], flag) for flag in inputs]
-            for parameter, (make, found) in makers.items():
-                values = {name: flag.value(given.pop(name)) for name, flag in found.items()}
-                given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
-            for value, flag in read:  # before anything is imported that takes seconds
-                _require(value, flag)
-            function(**given)
-        except BevcliError as error:
-            error.args = (as_flags(str(error)), *error.args[1:])
-            raise
-        finally:
-            _flags.reset(before)
+    def arguments(**given: Any) -> dict[str, Any]:
+        _flags.set(flags)
+        read = [(given[flag.name], flag) for flag in inputs]
+        for parameter, (make, fields) in makers.items():
+            values = {name: flag.value(given.pop(name)) for name, flag in fields.items()}
+            given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
+        for value, flag in read:  # before anything is imported that takes seconds
+            _require(value, flag)
+        return given
 
-    called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
+    arguments.__name__, arguments.__doc__ = function.__name__, function.__doc__
+    arguments.__module__ = function.__module__
     made = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
-    called.__signature__ = Signature(made)  # type: ignore[attr-defined]
-    return called
-
-
-def _direct(parameter: Parameter, hint: Any) -> Parameter | _Flag:
-    """A parameter that is no dataclass of options; one without an `Option` in its annotation stays as typer has it."""
-    marks = getattr(hint, "__metadata__", ())
-    if marks and isinstance(marks[0], Option):
-        return _Flag(parameter.name, marks[0], get_args(hint)[0], parameter.default, marks[0].panel or None)
-    return parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint)
+    vars(arguments).update(__signature__=Signature(made), function=function)
+    return arguments
 
 
 def _require(value: Any, flag: _Flag) -> None:
     """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name.
 
+    The partial file of a killed run counts as the file. Other errors of a path are told where it is read.
+
     value: one or several, or None.
     """
     reads, complete = flag.option.reads, flag.option.complete
     for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
-        if not text or "://" in text or _exists(Path(text)):
+        if not text or "://" in text:
+            continue
+        try:
+            Path(text).stat()
+            continue
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            from bevcli.sequences.files.incremental_json import partial_path
+
+            if Path(text).name and partial_path(Path(text)).exists():
+                continue
+        except OSError:
             continue
         if reads == "path or name" and not Path(text).suffix and os.sep not in text:
-            known = [text] if complete is None else list(complete(""))
-            if text not in known:
-                near = difflib.get_close_matches(text, known, n=1)
-                hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
+            names = [text] if complete is None else list(complete(""))
+            if text not in names:
+                near = difflib.get_close_matches(text, names, n=1)
+                hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(names)}, or a file"
                 raise InputError(f"{flag.yes} {text}: is unknown: {hint}")
         elif reads != "path or pattern" or not glob.has_magic(text):
             raise InputError(f"{text}: there is no such file or folder")
         elif next(glob.iglob(text), None) is None:
             raise InputError(f"{text}: nothing matches this pattern (expected drives)")
-
-
-def _exists(path: Path) -> bool:
-    """False for a path without a file, or the partial file of a killed run. Other errors are told where it is read."""
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError, ValueError):
-        from bevcli.sequences.files.incremental_json import partial_path
-
-        return bool(path.name) and partial_path(path).exists()
-    except OSError:
-        return True
-    return True
 
 
 def as_flags(text: str) -> str:
@@ -258,7 +244,7 @@ def as_flags(text: str) -> str:
     So do arguments with a value of other commands, such as `weights=FILE` in `bevcli weights fetch`.
     """
     flags = _flags.get()
-    return _OTHER_ARGUMENT.sub(_other_flag, _with_flags(text, flags)) if flags else text
+    return _OTHER_ARGUMENT.sub(_other_flag, _ARGUMENT.sub(partial(_as_flag, flags), text)) if flags else text
 
 
 def print_note(text: str) -> None:
@@ -266,20 +252,16 @@ def print_note(text: str) -> None:
     say(f"note: {one_line(as_flags(text))}", err=True)
 
 
-def _with_flags(text: str, flags: Mapping[str, _Flag]) -> str:
-    def flag(found: re.Match[str]) -> str:
-        return _as_flag(flags[found[1]], found[2]) if found[1] in flags else found[0]
-
-    return _ARGUMENT.sub(flag, text)
+def _other_flag(argument: re.Match[str]) -> str:
+    flag = f"--{argument[1].replace('_', '-')}"
+    return flag if argument[2] == "True" else f"{flag} {argument[2]}"
 
 
-def _other_flag(found: re.Match[str]) -> str:
-    flag = f"--{found[1].replace('_', '-')}"
-    return flag if found[2] == "True" else f"{flag} {found[2]}"
-
-
-def _as_flag(flag: _Flag, value: str | None) -> str:
-    """The flag with a value that a text of the library states as Python."""
+def _as_flag(flags: Mapping[str, _Flag], argument: re.Match[str]) -> str:
+    """The flag of an argument, with the value that a text of the library states as Python."""
+    flag, value = flags.get(argument[1]), argument[2]
+    if flag is None:
+        return argument[0]
     if value is None:
         return flag.yes
     if value == "False":
@@ -298,40 +280,35 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     """The maker of a parameter's value, and its options by name; None for a parameter without options."""
     marks = getattr(hint, "__metadata__", ())
     hint = get_args(hint)[0] if marks else hint
-    part = next((each for each in marks if isinstance(each, Part)), Part())
-    extended = next((each.command for each in marks if isinstance(each, ExtensionsOf)), None)
+    part = next((mark for mark in marks if isinstance(mark, Part)), Part())
+    extended = next((mark.command for mark in marks if isinstance(mark, ExtensionsOf)), None)
     make: Callable[..., Any] = hint
     classes: list[type[Any]] = [hint]
     if extended is not None:
         extensions = [load(EXTENSIONS, name) for name in entries(EXTENSIONS) if name.startswith(f"{extended}.")]
-        make, classes = partial(_steps, extensions), [each.options for each in extensions]
+        make, classes = partial(_steps, extensions), [extension.options for extension in extensions]
     elif hint == FormatValues:
         make, classes = dict, part.classes()
     elif not dataclasses.is_dataclass(hint):
         return None, {}
-    found: dict[str, _Flag] = {}
+    flags: dict[str, _Flag] = {}
     for kind in classes:
-        kinds, known = get_type_hints(kind), defaults(kind)
+        kinds, values = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
-            stated, name = option_of(field), field.name
-            if stated is not None and not stated.hidden and name in part:
-                default = known.get(name, Parameter.empty)
-                found.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
-    assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
-    return make, found
+            stated, name = field.metadata.get("option"), field.name
+            is_taken = name not in part.without and (not part.only or name in part.only)
+            if stated is not None and not stated.hidden and is_taken:
+                default = values.get(name, Parameter.empty)
+                flags.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
+    assert set(part.only) <= flags.keys(), f"{hint}: {part.only}"
+    return make, flags
 
 
 def _steps(extensions: list[Extension], **values: Any) -> Steps:
     """The steps of extensions with their options. values: of all options, by name."""
     steps = []
-    for each in extensions:
-        names = {field.name for field in dataclasses.fields(each.options)}
-        options = each.options(**{name: value for name, value in values.items() if name in names})
-        steps.append(partial(each.apply, options))
+    for extension in extensions:
+        names = {field.name for field in dataclasses.fields(extension.options)}
+        options = extension.options(**{name: value for name, value in values.items() if name in names})
+        steps.append(partial(extension.apply, options))
     return tuple(steps)
-
-
-def _plain(hint: Any) -> Any:
-    """The type that typer parses: of several that Python takes, such as `str | Path | None`, the path."""
-    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    return (Path | None if type(None) in kinds else Path) if Path in kinds else hint

@@ -9,6 +9,8 @@ import os
 import re
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -16,9 +18,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from bevcli._version import __version__
-from bevcli.cli.bridge import command
+from bevcli.cli.bridge import as_flags, command
 from bevcli.errors import BevcliError, WaitError
-from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
+from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, prepare_output, reason_of, say
 from bevcli.registry import entries, load
 
@@ -42,7 +44,12 @@ def printable(text: str) -> str:
 
 
 class PlainCommand(TyperCommand):
-    """A command whose `--help` lists its options by their panels."""
+    """A command of a function that takes dataclasses of options; its `--help` lists the options by their panels."""
+
+    def __init__(self, *arguments: Any, callback: Any, **settings: Any) -> None:
+        """callback: of typer, for `bevcli.cli.bridge.command`: it returns the arguments of the function."""
+        super().__init__(*arguments, callback=callback.function, **settings)
+        self._arguments = callback
 
     def get_help(self, ctx: Any) -> str:
         return printable(super().get_help(ctx))
@@ -50,36 +57,43 @@ class PlainCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse; an empty path, as of a variable that is not set, would be the current folder."""
         given, *_ = self.make_parser(ctx).parse_args(args=list(args))
-        takes = inspect.signature(self.callback).parameters if self.callback else {}
+        takes = inspect.signature(self._arguments).parameters
         parameters: list[Any] = self.get_params(ctx)
-        for each in parameters:
-            value = given.get(each.name)
+        for param in parameters:
+            value = given.get(param.name)
             empty = "" in (value if isinstance(value, list | tuple) else [value])
-            if empty and each.name in takes and _takes_path(takes[each.name].annotation):
-                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=each)
-        return super().parse_args(ctx, args)
+            if empty and param.name in takes and _takes_path(takes[param.name].annotation):
+                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=param)
+        rest = super().parse_args(ctx, args)
+        if not ctx.resilient_parsing:  # as for completion in a shell
+            try:
+                ctx.params = self._arguments(**ctx.params)
+            except typer.BadParameter as error:
+                error.ctx = ctx
+                raise
+        return rest
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The options and the arguments, without hidden ones."""
-        shown = [each for each in self.get_params(ctx) if not getattr(each, "hidden", False)]
-        return ["[OPTIONS]", *(piece.strip("{}") for each in shown for piece in each.get_usage_pieces(ctx))]
+        shown = [param for param in self.get_params(ctx) if not getattr(param, "hidden", False)]
+        return ["[OPTIONS]", *(piece.strip("{}") for param in shown for piece in param.get_usage_pieces(ctx))]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options by panels, last those without one."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
-        for each in self.get_params(ctx):
-            is_argument = each.param_type_name == "argument"
-            panel = "Arguments" if is_argument else getattr(each, "rich_help_panel", None)
-            row = each.get_help_record(ctx)
+        for param in self.get_params(ctx):
+            is_argument = param.param_type_name == "argument"
+            panel = "Arguments" if is_argument else getattr(param, "rich_help_panel", None)
+            row = param.get_help_record(ctx)
             if row is not None:
-                name = each.metavar if is_argument and each.metavar else row[0]
+                name = param.metavar if is_argument and param.metavar else row[0]
                 panels.setdefault(panel or "Options", []).append((name, row[1]))
         panels["Options"] = panels.pop("Options", [])
         write_panels(panels, formatter)
 
 
 def _takes_path(hint: Any) -> bool:
-    return hint is Path or any(_takes_path(each) for each in get_args(hint))
+    return hint is Path or any(_takes_path(part) for part in get_args(hint))
 
 
 def write_panels(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
@@ -102,8 +116,13 @@ class _Group(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of this name, None for an unknown one."""
-        if cmd_name in self.list_commands(ctx) and self.commands[cmd_name] is None:
-            self.commands[cmd_name] = click_command(cmd_name, load(GROUP, cmd_name))
+        if self.commands.get(cmd_name) is None and cmd_name in entries(GROUP):
+            app = load(GROUP, cmd_name)  # a function, or a Typer with several
+            if not isinstance(app, typer.Typer):
+                app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+                app.command(cmd_name, cls=PlainCommand)(command(load(GROUP, cmd_name)))
+            self.commands[cmd_name] = typer.main.get_command(app)
+            self.commands[cmd_name].name = cmd_name
         return self.commands.get(cmd_name)
 
     def get_help(self, ctx: Any) -> str:
@@ -113,24 +132,13 @@ class _Group(TyperGroup):
         """Write the commands by panels, with the summaries of their docstrings."""
         panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
         for name, entry in entries(GROUP).items():
-            found = load(GROUP, name)
-            text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+            command = load(GROUP, name)
+            text = command.info.help if isinstance(command, typer.Typer) else command.__doc__
             summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
             panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
             panel = panel if isinstance(panel, str) else panel[name]
             panels.setdefault(panel, []).append((name, summary))
         write_panels(panels, formatter)
-
-
-def click_command(name: str, found: Any) -> Any:
-    """The command of an entry: a function, which may take dataclasses of options, or a Typer with several."""
-    app = found
-    if not isinstance(found, typer.Typer):
-        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand)(command(found))
-    made = typer.main.get_command(app)
-    made.name = name
-    return made
 
 
 app = typer.Typer(
@@ -157,19 +165,23 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and look at the results."""
 
 
-def run_app() -> None:
-    """Run the given command: a user's mistake is one line on stderr and exit code 1, never a traceback."""
+@contextmanager
+def program() -> Iterator[None]:
+    """Settings and exit codes of a process that runs commands in the block.
+
+    A user's mistake is one line on stderr and exit code 1, never a traceback. Arguments in backticks become flags.
+    """
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
     prepare_output()
     keep_freed_memory()
     try:
         try:
-            app()
+            yield
         finally:
             sys.stdout.flush()  # here, where an error can still be told
     except BevcliError as error:
-        say(f"error: {error}", err=True)
+        say(f"error: {as_flags(str(error))}", err=True)
         if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
             os._exit(1)
         sys.exit(1)

@@ -66,7 +66,11 @@ class Progress:
         self.done += count
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=self.done, state=self.state())
-        elif self._line_is_due(count):
+            return
+        step, now = max(1, self.total // LINES_ON_A_PIPE), time.perf_counter()
+        is_slow_first = self.done == count and now - self.started >= SLOW_S
+        is_next = self.done == self.total or self.done // step != (self.done - count) // step
+        if is_slow_first or is_next or now - self._printed >= LONGEST_SILENCE_S:
             print(self.state(), file=self.stream, flush=True)
             self._printed = time.perf_counter()
 
@@ -96,13 +100,6 @@ class Progress:
         pace = f"{1 / unit_s:.2f} per second" if unit_s <= SLOW_S else f"{unit_s:.1f} s each"
         left = f"{duration((self.total - self.done) * unit_s)} left"
         return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, left, self.detail)))
-
-    def _line_is_due(self, count: int) -> bool:
-        step = max(1, self.total // LINES_ON_A_PIPE)
-        now = time.perf_counter()
-        if (self.done == count and now - self.started >= SLOW_S) or now - self._printed >= LONGEST_SILENCE_S:
-            return True
-        return self.done == self.total or self.done // step != (self.done - count) // step
 
 
 def _bar(stream: TextIO) -> "rich.progress.Progress":

@@ -93,24 +93,24 @@ def run(
 
 def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:
     """Notes on a model and a drive before the run starts. live: whether a viewer follows the run."""
-    found = list(drive.notes)
+    notes = list(drive.notes)
     if model.untrained:
-        found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+        notes.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
     if model.engine_note:
-        found.append(model.engine_note)
+        notes.append(model.engine_note)
     if model.is_exported:
-        found.append("an exported file shows no attention: the recording has no history map, pillars and probes")
+        notes.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:
-        found.append(f"{model.weights}: left out {model.left_out}, which a run does not need")
+        notes.append(f"{model.weights}: left out {model.left_out}, which a run does not need")
     if model.not_read:
-        found.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
+        notes.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
     later = model.config.later_frames
     if live and later:
-        found.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
-    found += model.training_notes(drive.rig)
+        notes.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
+    notes += model.training_notes(drive.rig)
     if model.bundled and not drive.facts.rendered:
-        found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
-    return found
+        notes.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
+    return notes
 
 
 def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
@@ -119,11 +119,11 @@ def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
     from bevcli.geometry.boxes import IMPOSSIBLE
 
     where = f"frame {frame.stamp.index}"
-    found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
+    warnings = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if frame.impossible_boxes:
-        found.append(f"{where}: {counted(frame.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
+        warnings.append(f"{where}: {counted(frame.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
     if prediction.failure:
-        found.append(f"{where}: {prediction.failure}")
+        warnings.append(f"{where}: {prediction.failure}")
     if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:
-        found.append(f"{where}: no history: {prediction.started_anew}")
-    return found
+        warnings.append(f"{where}: no history: {prediction.started_anew}")
+    return warnings

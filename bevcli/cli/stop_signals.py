@@ -5,7 +5,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Mapping
 from contextlib import suppress
 from types import FrameType
 from typing import Self
@@ -19,18 +19,20 @@ class _Signals:
     """Handles signals within a `with` block. A second one ends the process, also where a library stays in one call.
 
     limit_s: time from the first signal to the end of the process; None without a limit.
+    keeps_ignored: a signal that is ignored or handled already stays so. A job in the background ignores SIGINT.
     """
 
     limit_s: float | None = None
-
-    def __init__(self) -> None:
-        self._number = 0
-        self._before: dict[signal.Signals, object] = {}
+    keeps_ignored = False
+    _number = 0  # of the first signal
+    _before: Mapping[signal.Signals, object] = {}  # number of a signal -> its handler before
 
     def start(self) -> Self:
         """Handle signals from now on."""
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
-            self._before = {number: signal.signal(number, self._receive) for number in self._handled()}
+            unchanged = (signal.default_int_handler, signal.SIG_DFL)
+            handled = [n for n in SIGNALS if not self.keeps_ignored or signal.getsignal(n) in unchanged]
+            self._before = {number: signal.signal(number, self._receive) for number in handled}
             reader, self._writer = socket.socketpair()
             self._writer.setblocking(False)
             self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
@@ -49,9 +51,6 @@ class _Signals:
 
     __enter__, __exit__ = start, stop
 
-    def _handled(self) -> Iterable[signal.Signals]:
-        return SIGNALS
-
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if not self._number:
             self._number = number
@@ -68,11 +67,7 @@ class EndSignals(_Signals):
     """
 
     limit_s = CLEANUP_S
-
-    def _handled(self) -> Iterable[signal.Signals]:
-        """A job in the background ignores SIGINT, and keeps to that."""
-        unchanged = (signal.default_int_handler, signal.SIG_DFL)
-        return [number for number in SIGNALS if signal.getsignal(number) in unchanged]
+    keeps_ignored = True
 
     def _react(self, number: int, frame: FrameType | None) -> None:
         while frame is not None:
@@ -91,7 +86,6 @@ class StopSignals(_Signals):
     """
 
     def __init__(self, work: str, *, at_once: bool = False) -> None:
-        super().__init__()
         self._work, self._at_once = work, at_once
 
     def received(self) -> bool:

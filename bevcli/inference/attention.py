@@ -38,7 +38,7 @@ class SpatialSamples:
     weights: Tensor
 
 
-class AttentionProbe:
+class AttentionProbe(ExitStack):
     """Observes the attentions of one encoder layer, in a plain or a prepared model.
 
     Forward hooks read the inputs and outputs of the layer's parts. They exist inside the `with` block only:
@@ -56,13 +56,13 @@ class AttentionProbe:
     """
 
     def __init__(self, model: TemporalModel, layer: int, cells: Tensor) -> None:
+        super().__init__()
         self.cells = cells
         self.spatial: SpatialSamples | None = None
         self.history_share: Tensor | None = None
         observed = model.get_submodule(f"encoder.layers.{layer}")
         assert isinstance(observed, EncoderLayer)
         self._layer = observed
-        self._hooks = ExitStack()
 
     def __enter__(self) -> "AttentionProbe":
         temporal, spatial = self._layer.temporal_self_attention, self._layer.spatial_cross_attention
@@ -72,15 +72,12 @@ class AttentionProbe:
             (spatial, self._see_hits),
             (self._layer, self._see_layer),
         ):
-            self._hooks.enter_context(module.register_forward_hook(see))
+            self.enter_context(module.register_forward_hook(see))
         # As in the plain model: faster classes compute no sampling locations.
         for part, kind in ((temporal, TemporalSelfAttention), (spatial, SpatialCrossAttention)):
             vars(part)["sample"] = MethodType(vars(kind)["sample"], part)
-            self._hooks.callback(vars(part).pop, "sample")
+            self.callback(vars(part).pop, "sample")
         return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._hooks.close()
 
     def _see_temporal_samples(self, _module: object, arguments: tuple[Any, ...], sampled: Tensor) -> None:
         cells = math.prod(arguments[1][0])  # of the one level, the BEV map

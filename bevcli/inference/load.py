@@ -221,7 +221,8 @@ class Model:
 
     def runner(self, *, track: bool, **asked: Any) -> Runner:
         """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
-        return Runner(self.prepared, self.device, StepOptions(tracker=self.tracker if track else None, **asked))
+        tracker = self.tracker if track else None
+        return Runner(self.prepared, self.device, StepOptions(tracker=tracker, takes_pixels=self.is_exported, **asked))
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:
@@ -355,6 +356,8 @@ def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -
 def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torch.device, Precision | Literal["int8"]]:
     """The engine, device and precision that the options ask for; by default PyTorch, or for INT8 one that has it.
 
+    The default precision of PyTorch is fp32 on the CPU and bf16 on a GPU.
+
     Raises BevcliError for what is not there, does not fit the model, or excludes each other.
     """
     engine, device, is_int8 = options.engine, choose_device(options.device), options.precision == "int8"
@@ -367,16 +370,17 @@ def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torc
         if engine is None:
             raise BevcliError("`precision=int8`: no engine is installed: run pip install 'bevcli[openvino]'")
     if engine in (None, TORCH):
-        return TORCH, device, choose_precision(options.precision, device)
+        assert options.precision != "int8"
+        return TORCH, device, options.precision or ("bf16" if device.type == "cuda" else "fp32")
     _engine(engine).check_options(engine, options, config)
     return engine, torch.device("cpu"), options.precision or "fp32"
 
 
 def _engine(name: str) -> Any:
     """The class of another engine than PyTorch, see `bevcli.workshop.engines.engine.Engine`. Raises BevcliError."""
-    known = list(entries("bevcli.engines"))
-    if name not in known:
-        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *known))})")
+    engines = list(entries("bevcli.engines"))
+    if name not in engines:
+        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *engines))})")
     return load("bevcli.engines", name)
 
 
@@ -421,9 +425,3 @@ def choose_device(name: str | torch.device) -> torch.device:
     if name == "auto":
         name = "cuda" if available else "cpu"
     return torch.device(name)
-
-
-def choose_precision(chosen: Precision | Literal["int8"] | None, device: torch.device) -> Precision:
-    """The chosen precision of PyTorch, or by default fp32 on the CPU and bf16 on a GPU."""
-    assert chosen != "int8"
-    return chosen or ("bf16" if device.type == "cuda" else "fp32")

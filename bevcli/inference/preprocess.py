@@ -17,9 +17,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
-from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.step import PreparedFrame
+from bevcli.model.step import CameraAssignment, PreparedFrame, assign_cameras
 
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
@@ -78,7 +77,7 @@ class Preprocessor:
             for camera, name in present:
                 write(camera, name)
         else:
-            for task in wait([self._threads.submit(write, *each) for each in present]).done:
+            for task in wait([self._threads.submit(write, *camera) for camera in present]).done:
                 task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
@@ -94,16 +93,16 @@ class Preprocessor:
         )
 
     def _facts_of(self, rig: CameraRig) -> "_OfRig":
-        known = self._of_rig
-        if known is None or known.rig is not rig:
+        rig_facts = self._of_rig
+        if rig_facts is None or rig_facts.rig is not rig:
             bev_frame = self.config.bev_frame
             model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
             assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
             image = image_for_rig(rig, self.config.image)
             if self.pixels:
                 image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
-            known = self._of_rig = _OfRig(rig, model_rig, assignment, image)
-        return known
+            rig_facts = self._of_rig = _OfRig(rig, model_rig, assignment, image)
+        return rig_facts
 
 
 class _OfRig(NamedTuple):
@@ -177,8 +176,8 @@ def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: 
     left, top, right, bottom = image.crop_box
     resize_and_normalize(
         pixels_bgr,
-        pixel_weights(height, round(height * scale), method)[top:bottom],
-        pixel_weights(width, round(width * scale), method)[left:right],
+        pixel_weights(height, round(height * scale), method, top, bottom),
+        pixel_weights(width, round(width * scale), method, left, right),
         np.asarray(image.mean, dtype=np.float32),
         np.asarray(image.std, dtype=np.float32),
         out,
@@ -212,14 +211,15 @@ class PixelWeights:
     first: NDArray[np.int64]
     weights: NDArray[np.float32]
 
-    def __getitem__(self, chosen: slice) -> "PixelWeights":
-        """The weights of some of the n pixels."""
-        return PixelWeights(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
-
 
 @lru_cache(maxsize=64)
-def pixel_weights(length: int, new_length: int, method: Literal["linear", "area"]) -> PixelWeights:
-    """The weights that resize a row of `length` pixels to `new_length`, as OpenCV's INTER_LINEAR or INTER_AREA."""
+def pixel_weights(
+    length: int, new_length: int, method: Literal["linear", "area"], start: int = 0, stop: int | None = None
+) -> PixelWeights:
+    """The weights that resize a row of `length` pixels to `new_length`, as OpenCV's INTER_LINEAR or INTER_AREA.
+
+    start, stop: the pixels of the resized row that are computed.
+    """
     scale, index = length / new_length, np.arange(new_length)[:, None]
     center = np.clip((index + 0.5) * scale - 0.5, 0, length - 1)
 
@@ -235,7 +235,7 @@ def pixel_weights(length: int, new_length: int, method: Literal["linear", "area"
     first, count = np.take_along_axis(near, used.argmax(1)[:, None], 1), used.sum(1).max()
     first = np.minimum(first, length - count)
     weights = weigh(first + np.arange(count)).astype(np.float32)
-    return PixelWeights(first[:, 0], np.ascontiguousarray(weights.T))
+    return PixelWeights(first[start:stop, 0], np.ascontiguousarray(weights.T[:, start:stop]))
 
 
 def resize_and_normalize(

@@ -174,7 +174,10 @@ class Session:
         pose = _pose(world_from_ego, "`world_from_ego`")
         poses = self._poses.with_pose(stamp.timestamp_ns, pose)
         given = (world_from_ego_at or {}).items()
-        at = {name: _pose(one, f"`world_from_ego_at`: camera {name}") for name, one in given}
+        at = {
+            name: _pose(world_from_ego_then, f"`world_from_ego_at`: camera {name}")
+            for name, world_from_ego_then in given
+        }
         check_cameras(at, self.rig, "world_from_ego_at")
         frame = Frame(
             stamp=stamp,

@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
+from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.frame import BevMap, Frame, FrameResult, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
-from bevcli.inference.background import read_ahead
+from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
-from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
@@ -59,6 +58,7 @@ class StepOptions:
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
         commands: of the driver, for a model that plans.
         tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
+        takes_pixels: whether the model is an exported file: see `PreparedFrame.pixels`.
     """
 
     temporal: bool = True
@@ -66,10 +66,14 @@ class StepOptions:
     probes: tuple[tuple[float, float], ...] = ()
     commands: Commands = ()
     tracker: TrackerConfig | None = None
+    takes_pixels: bool = False
 
 
 class Runner:
-    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
+    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none.
+
+    Raises InputError for a probe outside the BEV grid.
+    """
 
     def __init__(self, model: TemporalModel, device: torch.device, options: StepOptions | None = None) -> None:
         self.model = model.to(device).eval()
@@ -77,10 +81,15 @@ class Runner:
         self.device = device
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model, device, model.stages)
+        # The boxes have the identities of the model's own tracks.
+        self._tracks = self.options.tracker is not None and self.options.temporal and self.config.has_tracks
+        self._probed: Tensor | None = None
+        if self.options.ask_attention and isinstance(model, Network):
+            self._probed = probe_cells(self.options.probes, self.config.bev_grid).to(device)
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
         """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
-        return Preprocessor(self.config, cameras, pixels=getattr(self.model, "takes_pixels", False))
+        return Preprocessor(self.config, cameras, pixels=self.options.takes_pixels)
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
@@ -103,7 +112,9 @@ class Runner:
             state = self._restarted(state)
         if not frame.images:
             return state, self._prediction(prepared, started_anew, skipped=True)
-        probe = self._probe()
+        probe = None
+        if self._probed is not None:
+            probe = AttentionProbe(self.model, self.config.encoder.layers - 1, self._probed)
         autocast = torch.autocast(self.device.type, enabled=False)  # the parts of a model have precisions of their own
         with torch.inference_mode(), self.clock:
             with autocast, probe or contextlib.nullcontext():
@@ -119,7 +130,7 @@ class Runner:
             else:
                 after, fields = self._restarted(state), {"not_finite": place}
         tracks, prediction = state.tracks, self._prediction(prepared, started_anew, **fields)
-        if self.options.tracker is not None and not self.tracks:
+        if self.options.tracker is not None and not self._tracks:
             tracks, prediction = track(self.options.tracker, tracks, prediction)
         return replace(after, tracks=tracks), prediction
 
@@ -129,7 +140,7 @@ class Runner:
         boxes, segmentation, results = Boxes3D.empty(), None, []
         for decoded in self.model.decode(last_layers):
             if isinstance(decoded, Boxes3D):
-                boxes = without_identities(decoded) if self.config.has_tracks and not self.tracks else decoded
+                boxes = without_identities(decoded) if self.config.has_tracks and not self._tracks else decoded
                 self.clock.mark("box_decoding")
             elif isinstance(decoded, BevMap):
                 segmentation = decoded
@@ -169,13 +180,10 @@ class Runner:
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
+        if self.device.type != "cuda":
+            return preprocessor
         upload_images = image_uploader(self.device)
         return lambda frame: upload_images(preprocessor(frame))
-
-    @property
-    def tracks(self) -> bool:
-        """The boxes have identities, those of the model's own tracks."""
-        return self.options.tracker is not None and self.options.temporal and self.config.has_tracks
 
     def _restarted(self, state: RunnerState[Any]) -> RunnerState[Any]:
         """The state before a frame without history: what the model keeps over scenes, and the tracks."""
@@ -206,12 +214,6 @@ class Runner:
             usable.append(later)
             stamp = later.frame.stamp
         return usable
-
-    def _probe(self) -> AttentionProbe | None:
-        if not self.options.ask_attention or not isinstance(self.model, Network):
-            return None
-        cells = probe_cells(self.options.probes, self.config.bev_grid)
-        return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
 
     def _prediction(self, prepared: PreparedFrame, started_anew: NewStart | None, **fields: Any) -> Prediction:
         """The prediction for a frame. fields: those that the model computed; by default it has no boxes."""
@@ -257,22 +259,22 @@ def read_commands(command: str | None, config: ModelConfig) -> Commands:
     path = Path(command)
     if path.suffix != ".json":
         return one_command(command, config)
-    known = _known(command, config)
-    found = read_json(path)
-    if not isinstance(found, dict) or not found:
-        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{known[0]}"}}, by frame index)')
-    for frame, name in found.items():
-        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
-            expected = f"expected {', '.join(known)}, by frame index"
+    names = _known(command, config)
+    commands = read_json(path)
+    if not isinstance(commands, dict) or not commands:
+        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{names[0]}"}}, by frame index)')
+    for frame, name in commands.items():
+        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in names:
+            expected = f"expected {', '.join(names)}, by frame index"
             raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected})')
-    return tuple(sorted((int(frame), name) for frame, name in found.items()))
+    return tuple(sorted((int(frame), name) for frame, name in commands.items()))
 
 
 def one_command(command: str, config: ModelConfig) -> Commands:
     """A command by its name, for all frames. Raises InputError for a model that does not plan, or another name."""
-    known = _known(command, config)
-    if command not in known:
-        raise InputError(f"`command={command}`: is unknown (expected {', '.join(known)} or a FILE.json)")
+    names = _known(command, config)
+    if command not in names:
+        raise InputError(f"`command={command}`: is unknown (expected {', '.join(names)} or a FILE.json)")
     return ((0, command),)
 
 

@@ -65,7 +65,7 @@ class TrackerConfig:
         unknown = self.gates_m.keys() - {OTHER, *classes, *NUSCENES_CLASSES}
         if unknown:
             raise ValueError(f'gates_m.{min(unknown)}: the model has no class "{min(unknown)}"')
-        return replace(self, gates_m={name: one.gate_m for name, one in classes.items()} | dict(self.gates_m))
+        return replace(self, gates_m={name: of_class.gate_m for name, of_class in classes.items()} | dict(self.gates_m))
 
     def gates_of(self, classes: NDArray[np.str_]) -> Array:
         """(N,) the gates of boxes of these classes (N,), metres."""
@@ -155,17 +155,26 @@ def step(
     """
     scores = np.zeros(len(boxes)) if boxes.scores is None else boxes.scores
     number = 0 if state is None else state.next_number
-    tracks = _living(config, state, stamp)
+    tracks = Tracks.empty()
+    if state is not None and state.stamp.scene == stamp.scene and stamp.timestamp_ns > state.stamp.timestamp_ns:
+        tracks = state.tracks[stamp.timestamp_ns - state.tracks.seen_ns <= config.coast_s * 1e9]
     order = np.argsort(-scores, kind="stable")
     duplicates = find_duplicates(boxes, order, config.duplicate_widths)
     usable = order[~duplicates[order] & (scores[order] >= config.keep_score)]
     matches = _match(config, tracks, boxes, usable, stamp)
     born = usable[(matches[usable] < 0) & (scores[usable] >= config.birth_score)]
     matches[born] = len(tracks) + np.arange(len(born))
-    tracks = _with_births(tracks, boxes, born, number)
+    nothing, nowhere = np.zeros(len(born), dtype=np.int64), np.zeros((len(born), 2))
+    numbers, no_scores = number + np.arange(len(born)), np.zeros(len(born))
+    new = Tracks(numbers, boxes.classes[born], nowhere, nowhere, nothing, nothing, no_scores)
+    tracks = Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
     owned = np.flatnonzero(matches >= 0)
     owners = matches[owned]
-    _add_boxes(tracks, owners, boxes[owned], scores[owned], stamp)
+    tracks.centers_xy[owners] = boxes.centers[owned, :2]
+    tracks.velocities[owners] = boxes.velocities[owned]
+    tracks.seen_ns[owners] = stamp.timestamp_ns
+    tracks.frames[owners] += 1
+    tracks.score_sums[owners] += scores[owned]
     instances = np.full(len(boxes), "", dtype="<U20")
     instances[owned] = tracks.numbers[owners].astype("<U20")
     track_scores = np.full(len(boxes), np.nan)
@@ -201,13 +210,6 @@ def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> 
     return duplicates
 
 
-def _living(config: TrackerConfig, state: TrackerState | None, stamp: FrameStamp) -> Tracks:
-    """The tracks that may go on in a frame."""
-    if state is None or state.stamp.scene != stamp.scene or stamp.timestamp_ns <= state.stamp.timestamp_ns:
-        return Tracks.empty()
-    return state.tracks[stamp.timestamp_ns - state.tracks.seen_ns <= config.coast_s * 1e9]
-
-
 def _match(
     config: TrackerConfig, tracks: Tracks, boxes: Boxes3D, usable: NDArray[np.int64], stamp: FrameStamp
 ) -> NDArray[np.int64]:
@@ -228,20 +230,3 @@ def _match(
             matches[box] = nearest
             away[:, nearest] = np.inf
     return matches
-
-
-def _with_births(tracks: Tracks, boxes: Boxes3D, born: NDArray[np.int64], number: int) -> Tracks:
-    """The tracks, followed by a new one, without any box so far, for each of these boxes."""
-    count = len(born)
-    nothing, nowhere = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
-    new = Tracks(number + np.arange(count), boxes.classes[born], nowhere, nowhere, nothing, nothing, np.zeros(count))
-    return Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
-
-
-def _add_boxes(tracks: Tracks, owners: NDArray[np.int64], boxes: Boxes3D, scores: Array, stamp: FrameStamp) -> None:
-    """Add K boxes to the tracks `owners` (K,), in place."""
-    tracks.centers_xy[owners] = boxes.centers[:, :2]
-    tracks.velocities[owners] = boxes.velocities
-    tracks.seen_ns[owners] = stamp.timestamp_ns
-    tracks.frames[owners] += 1
-    tracks.score_sums[owners] += scores

@@ -1,9 +1,7 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -18,22 +16,39 @@ _BEV_TILT_DEG = 4.0  # published weights were trained with nuScenes' LIDAR_TOP, 
 
 def training_rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
     """Warnings where a rig lies outside the training distribution, at most two: the cameras, and the bev frame."""
-    return (*_cameras_note(rig, config), *_bev_frame_note(rig, config))
-
-
-def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
-    """The table [training_rigs] of a model that is trained on some rigs."""
-    rigs = [rig for rig in rigs if rig.cameras]
-    cameras = [camera for rig in rigs for camera in rig.cameras]
-    counts = [len(rig.cameras) for rig in rigs]
-    fovs = [_fov_deg(camera) for camera in cameras]
-    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
-    return {
-        "cameras": [min(counts), max(counts)],
-        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
-        "height_m": [round(min(heights), 2), round(max(heights), 2)],
-        "tilt_deg": round(max(map(_tilt_deg, cameras)), 1),
-    }
+    notes, trained = [], config.training_rigs
+    if trained.known and rig.cameras:
+        count, heights = len(rig.cameras), [float(camera.ego_from_camera[2, 3]) for camera in rig.cameras]
+        fovs = [fov_deg(camera) for camera in rig.cameras]
+        tilt = max(tilt_deg(camera) for camera in rig.cameras)
+        far = []
+        if not trained.cameras[0] <= count <= trained.cameras[1]:
+            far.append(f"{counted(count, 'cameras')} ({_range(trained.cameras, '')})")
+        if min(heights) < trained.height_m[0] - _HEIGHT_M or max(heights) > trained.height_m[1] + _HEIGHT_M:
+            stated = _range(trained.height_m, " m")
+            far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({stated})")
+        if min(fovs) < trained.fov_deg[0] - _FOV_DEG or max(fovs) > trained.fov_deg[1] + _FOV_DEG:
+            far.append(f"fields of view {_range((min(fovs), max(fovs)), '°', 0)} ({_range(trained.fov_deg, '°', 0)})")
+        if tilt > trained.tilt_deg + _TILT_DEG:
+            far.append(f"pitch or roll up to {tilt:.1f}° ({trained.tilt_deg:g}°)")
+        if far:
+            cost = f"; measured: {trained.cost}" if trained.cost else ""
+            theirs = "the rig is unlike those that the weights were trained on (theirs in brackets)"
+            notes.append(f"{theirs}: {', '.join(far)}{cost}")
+    tilt = float(np.degrees(np.arccos(np.clip(rig.ego_from_bev[2, 2], -1, 1))))
+    height, expected = float(rig.ego_from_bev[2, 3]), config.bev_frame
+    if expected.level and (tilt >= 0.1 or abs(height - expected.height_m) >= 0.05):
+        notes.append(
+            f"the bev frame is tilted by {tilt:.1f}° and {height:.2f} m high, but the weights expect a level one "
+            f"at {expected.height_m:g} m: the model computes in such a frame, and gives boxes back in ego and world"
+        )
+    if not expected.level and tilt > _BEV_TILT_DEG:
+        off = 30 * np.tan(np.radians(tilt))
+        notes.append(
+            f"the bev frame is tilted by {tilt:.1f}°, but the weights were trained with one tilted by up to 3°: "
+            f'boxes 30 m away may be {off:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
+        )
+    return tuple(notes)
 
 
 def weights_facts(config: ModelConfig) -> dict[str, str]:
@@ -71,57 +86,16 @@ def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
         )
 
 
-def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:
-    trained = config.training_rigs
-    if not trained.known or not rig.cameras:
-        return
-    count, heights = len(rig.cameras), [float(camera.ego_from_camera[2, 3]) for camera in rig.cameras]
-    fovs = [_fov_deg(camera) for camera in rig.cameras]
-    tilt = max(_tilt_deg(camera) for camera in rig.cameras)
-    far = []
-    if not trained.cameras[0] <= count <= trained.cameras[1]:
-        far.append(f"{counted(count, 'cameras')} ({_range(trained.cameras, '')})")
-    if _is_outside(heights, trained.height_m, _HEIGHT_M):
-        far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({_range(trained.height_m, ' m')})")
-    if _is_outside(fovs, trained.fov_deg, _FOV_DEG):
-        far.append(f"fields of view {_range((min(fovs), max(fovs)), '°', 0)} ({_range(trained.fov_deg, '°', 0)})")
-    if tilt > trained.tilt_deg + _TILT_DEG:
-        far.append(f"pitch or roll up to {tilt:.1f}° ({trained.tilt_deg:g}°)")
-    if far:
-        cost = f"; measured: {trained.cost}" if trained.cost else ""
-        yield f"the rig is unlike those that the weights were trained on (theirs in brackets): {', '.join(far)}{cost}"
-
-
-def _bev_frame_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:
-    tilt_deg = float(np.degrees(np.arccos(np.clip(rig.ego_from_bev[2, 2], -1, 1))))
-    height, expected = float(rig.ego_from_bev[2, 3]), config.bev_frame
-    if expected.level and (tilt_deg >= 0.1 or abs(height - expected.height_m) >= 0.05):
-        yield (
-            f"the bev frame is tilted by {tilt_deg:.1f}° and {height:.2f} m high, but the weights expect a level one "
-            f"at {expected.height_m:g} m: the model computes in such a frame, and gives boxes back in ego and world"
-        )
-    if not expected.level and tilt_deg > _BEV_TILT_DEG:
-        off = 30 * np.tan(np.radians(tilt_deg))
-        yield (
-            f"the bev frame is tilted by {tilt_deg:.1f}°, but the weights were trained with one tilted by up to 3°: "
-            f'boxes 30 m away may be {off:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
-        )
-
-
-def _fov_deg(camera: Camera) -> float:
+def fov_deg(camera: Camera) -> float:
     """Horizontal field of view without distortion, degrees."""
     focal, center = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
     return float(np.degrees(np.arctan(center / focal) + np.arctan((camera.width - center) / focal)))
 
 
-def _tilt_deg(camera: Camera) -> float:
+def tilt_deg(camera: Camera) -> float:
     """The larger of pitch and roll, degrees; a camera upside down or on its side has a roll near 0."""
     heights = np.abs(camera.ego_from_camera[2, [0, 2]])  # of the axes to the right and ahead
     return float(np.degrees(np.arcsin(np.clip(heights, 0, 1))).max())
-
-
-def _is_outside(values: list[float], trained: tuple[float, float], margin: float) -> bool:
-    return min(values) < trained[0] - margin or max(values) > trained[1] + margin
 
 
 def _range(ends: tuple[float, float], unit: str, digits: int = 1) -> str:

@@ -17,7 +17,14 @@ class BevQueries(nn.Module):
         self.embedding = nn.Parameter(torch.randn(grid.rows * grid.columns, channels))
         self.row_embedding = nn.Parameter(torch.rand(grid.rows, channels // 2))
         self.column_embedding = nn.Parameter(torch.rand(grid.columns, channels // 2))
-        self.can_bus_embedding = can_bus_mlp(channels) if can_bus else None
+        self.can_bus_embedding: nn.Sequential | None = None
+        if can_bus:
+            hidden = nn.Linear(CAN_BUS_SIZE, channels // 2), nn.ReLU()
+            output = nn.Linear(channels // 2, channels), nn.ReLU(), nn.LayerNorm(channels)
+            self.can_bus_embedding = nn.Sequential(*hidden, *output)
+            for layer in (hidden[0], output[0]):
+                nn.init.xavier_uniform_(layer.weight)
+                nn.init.zeros_(layer.bias)
 
     def forward(self, can_bus: Tensor) -> Tensor:
         """can_bus: (B, 18) -> BEV queries (B, Y·X, C)."""
@@ -57,19 +64,3 @@ class BevQueries(nn.Module):
 def _interpolated(rows: Tensor, count: int) -> Tensor:
     """(N, C) -> (count, C), linearly."""
     return nn.functional.interpolate(rows.float().T[None], count, mode="linear")[0].T
-
-
-def can_bus_mlp(channels: int) -> nn.Sequential:
-    """(B, 18) can-bus numbers -> (B, C)."""
-    layers = nn.Sequential(
-        nn.Linear(CAN_BUS_SIZE, channels // 2),
-        nn.ReLU(),
-        nn.Linear(channels // 2, channels),
-        nn.ReLU(),
-        nn.LayerNorm(channels),
-    )
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
-    return layers

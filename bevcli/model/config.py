@@ -149,6 +149,7 @@ class ModelConfig:
         architecture: name of the registered model; the key `architecture` of a TOML file chooses it.
         has_tracks: the model gives its boxes identities over time.
         trains_with_gaps: a training clip leaves out one of its earlier frames, as published for BEVFormer.
+        trains_with_more_levels: the neck may have more levels than there are level embeddings, for training only.
         name: of the model.
         classes: of the objects, in the order of the class logits.
         class_settings: settings of classes by name, where they differ from the defaults.
@@ -173,6 +174,7 @@ class ModelConfig:
     architecture: ClassVar[str] = "BEVFormer"
     has_tracks: ClassVar[bool] = False
     trains_with_gaps: ClassVar[bool] = True
+    trains_with_more_levels: ClassVar[bool] = False
 
     name: str
     classes: tuple[str, ...]
@@ -213,7 +215,8 @@ class ModelConfig:
             raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")
         if self.encoder.spatial_points % grid.pillar_points:
             raise ValueError("encoder.spatial_points must be a multiple of bev_grid.pillar_points")
-        if not len(self.backbone.output_stages) <= levels <= self._most_neck_levels():
+        most = levels if self.trains_with_more_levels else self.image_tokens.level_embeddings
+        if not len(self.backbone.output_stages) <= levels <= most:
             raise ValueError(
                 f"neck.levels is {levels}; expected at least the number of backbone.output_stages, "
                 f"at most image_tokens.level_embeddings"
@@ -276,17 +279,14 @@ class ModelConfig:
     def check_training(self, clip_frames: int) -> None:
         """Raise ConfigError if the model cannot be trained on clips of this many frames."""
 
-    def _most_neck_levels(self) -> int:
-        return self.image_tokens.level_embeddings
-
 
 def _check_numbers(config: Any, prefix: str = "") -> None:
     """Raises ValueError for a whole number that no model has, before anything of its size is made."""
-    for each in fields(config):
-        value = getattr(config, each.name)
+    for setting in fields(config):
+        value = getattr(config, setting.name)
         if is_dataclass(value):
-            _check_numbers(value, f"{prefix}{each.name}.")
-        most = LARGEST.get(each.name, LARGEST.get(each.name.rpartition("_")[2], LARGEST_NUMBER))
+            _check_numbers(value, f"{prefix}{setting.name}.")
+        most = LARGEST.get(setting.name, LARGEST.get(setting.name.rpartition("_")[2], LARGEST_NUMBER))
         for number in value if isinstance(value, tuple) else (value,):
             if type(number) is int and abs(number) > most:
-                raise ValueError(f"{prefix}{each.name} is {number} (expected at most {most})")
+                raise ValueError(f"{prefix}{setting.name} is {number} (expected at most {most})")

@@ -1,18 +1,28 @@
-"""The object decoder and its detection head, after Deformable DETR: queries that attend to the BEV map find objects."""
+"""The object decoder and its detection head, after Deformable DETR: queries that attend to the BEV map find objects.
+
+A box code of the head is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). As in the released code, its angle is
+measured clockwise from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
+"""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, wrap_angle
 from bevcli.model.deformable_attention import DeformableAttention
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward
 
 BOX_CODE_SIZE = 10
+FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
+SUPPORT = 0.5  # share of its score that a duplicate adds to that of another box, where neither is near 1
+LEAST_EXPONENT = -60.0  # what is less adds nothing, and takes a CPU up to fifty times as long
 
 
 @dataclass(frozen=True)
@@ -28,9 +38,9 @@ class DecoderConfig:
         dropout: probability, 0 to below 1.
         max_boxes: number of boxes that are decoded, those with the best scores.
         merge_duplicates: distance, in sizes of a box, within which boxes of its class count as the same object: they
-            share their places; see `box_coding.merged`. With 0, as published, boxes stay where they are.
+            share their places; see `merged`. With 0, as published, boxes stay where they are.
         fade_duplicates: share of its score that a box loses at the place of a better box of its class, and less beside
-            it; see `box_coding.faded`. With 0, as published, scores stay as they are.
+            it; see `faded`. With 0, as published, scores stay as they are.
         training_groups: number of sets of queries that are trained side by side, each to find every object
             (Group DETR, Chen et al. 2023). Inference uses the first set only.
     """
@@ -163,16 +173,13 @@ class DecoderLayer(nn.Module):
             bev: (B, Y·X, C).
             groups: number of groups of queries; queries of different groups do not attend to each other.
         """
-        query = self.norms[0](query + self.dropout(self._attend_to_queries(query, position, groups)))
-        attended = self.cross_attention.attend(query + position, reference_points, bev, self.level_shapes)
-        query = self.norms[1](query + self.dropout(attended))
-        return self.norms[2](query + self.feed_forward(query))
-
-    def _attend_to_queries(self, query: Tensor, position: Tensor, groups: int) -> Tensor:
         value = query.unflatten(1, (groups, -1)).flatten(0, 1)  # (B · groups, Q / groups, C)
         key = value + position.unflatten(1, (groups, -1)).flatten(0, 1)
         attended, _ = self.self_attention(key, key, value, need_weights=False)
-        return attended.reshape(query.shape)
+        query = self.norms[0](query + self.dropout(attended.reshape(query.shape)))
+        attended = self.cross_attention.attend(query + position, reference_points, bev, self.level_shapes)
+        query = self.norms[1](query + self.dropout(attended))
+        return self.norms[2](query + self.feed_forward(query))
 
 
 class DetectionHead(nn.Module):
@@ -244,3 +251,111 @@ def branch(channels: int, layers: int, outputs: int) -> RegressionBranch:
     """(..., C) -> (..., outputs)."""
     hidden = [module for _ in range(layers - 1) for module in (nn.Linear(channels, channels), nn.ReLU())]
     return RegressionBranch(*hidden, nn.Linear(channels, outputs))
+
+
+class BestBoxes(NamedTuple):
+    """The K boxes of each batch element with the best scores, by falling score.
+
+    Attributes:
+        query: (B, K), index of the object query.
+        label: (B, K), index of the class.
+        scores: (B, K).
+        codes: (B, K, 10).
+    """
+
+    query: Tensor
+    label: Tensor
+    scores: Tensor
+    codes: Tensor
+
+    def decoded(self, classes: Sequence[str]) -> Boxes3D:
+        """The boxes of a batch of one, bev frame. classes: of the class logits."""
+        codes, scores = (column[0].double().cpu().numpy() for column in (self.codes, self.scores))
+        return boxes_of_codes(codes, np.asarray(classes)[self.label[0].cpu().numpy()], scores)
+
+    def with_scores(self, scores: Tensor) -> "BestBoxes":
+        """The same boxes with other scores (B, K), by falling score."""
+        scores, order = scores.topk(scores.shape[1])
+        codes = self.codes.gather(1, order[..., None].expand_as(self.codes))
+        return BestBoxes(self.query.gather(1, order), self.label.gather(1, order), scores, codes)
+
+    def of_same_class(self) -> Tensor:
+        """(B, K, K) float32, 1 where two boxes have the same class, else 0."""
+        label = self.label.float()  # a CPU compares these three times as fast
+        return (label[:, :, None] == label[:, None]).float()
+
+    def squared_distances(self) -> Tensor:
+        """(B, K, K) float32, m², between the boxes on the ground."""
+        # A sum over a last axis of two takes several times as long.
+        x, y = self.codes[..., :2].float().unbind(-1)
+        x, y = x.contiguous(), y.contiguous()
+        return (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()
+
+
+def best_boxes(class_logits: Tensor, box_codes: Tensor, config: DecoderConfig) -> BestBoxes:
+    """The config.max_boxes best boxes, with duplicates merged and faded as the configuration says.
+
+    class_logits: (B, Q, classes). box_codes: (B, Q, 10).
+    """
+    scores, query, label = best_classes(class_logits.float(), config.max_boxes)
+    codes = box_codes.gather(1, query[..., None].expand(-1, -1, box_codes.shape[-1]))
+    boxes = BestBoxes(query, label, scores, codes)
+    if config.merge_duplicates:
+        boxes = merged(boxes, config.merge_duplicates)
+    if config.fade_duplicates:
+        boxes = faded(boxes, config.fade_duplicates)
+    return boxes
+
+
+def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
+    """Each box at the mean place of the boxes of its class around it, which also raise its score.
+
+    Several queries that find the same object err differently, so that their mean is nearer to it (weighted boxes
+    fusion, Solovyev et al. 2019, does so with boxes in images). A box at a distance of d counts by its score times
+    exp(-(d / (reach · size))²), where the size is the root of width times length. If those of the others add up to n, a
+    score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
+    """
+    size = boxes.codes[..., 2:4].float().mean(-1, keepdim=True).exp()  # of the logarithms of width and length
+    weights = boxes.scores.clamp(min=1e-6)[:, None]
+    near = (boxes.squared_distances() / -(reach * size).square()).clamp(min=LEAST_EXPONENT).exp()
+    counts = near * boxes.of_same_class() * weights  # (B, K, K)
+    total = counts.sum(-1)
+    places = counts @ boxes.codes[..., :2].float() / total[..., None]
+    moved = boxes._replace(codes=torch.cat([places.to(boxes.codes.dtype), boxes.codes[..., 2:]], dim=-1))
+    return moved.with_scores(1 - (1 - boxes.scores) ** (1 + SUPPORT * (total - weights[:, 0])))
+
+
+def faded(boxes: BestBoxes, share: float) -> BestBoxes:
+    """Boxes near a better box of their class with lower scores, as by soft non-maximum suppression.
+
+    At a distance of d widths of the better box, a score is multiplied by 1 - share · exp(-d / FADING_WIDTHS); of
+    several better boxes, the one counts that lowers it most.
+    """
+    distances = boxes.squared_distances().sqrt()  # (B, better, worse)
+    widths = boxes.codes[..., 2].float().exp()[:, :, None]
+    lost = share * (distances / (-FADING_WIDTHS * widths)).clamp(min=LEAST_EXPONENT).exp()
+    rank = torch.arange(boxes.scores.shape[1], device=lost.device)
+    worse = rank[:, None] < rank  # `triu` takes as long as all the rest
+    return boxes.with_scores(boxes.scores * (1 - boxes.of_same_class() * worse * lost).amin(1))
+
+
+def encode(boxes: Boxes3D) -> Array:
+    """Boxes in the bev frame -> codes (N, 10), the targets of training; unknown velocities are NaN."""
+    length, width, height = boxes.sizes_lwh.T
+    angle = -boxes.yaws - np.pi / 2
+    x, y, z = boxes.centers.T
+    columns = [x, y, np.log(width), np.log(length), z, np.log(height), np.sin(angle), np.cos(angle)]
+    return np.concatenate([np.stack(columns, axis=-1), boxes.velocities], axis=-1)
+
+
+def boxes_of_codes(code: Array, classes: np.ndarray, scores: Array) -> Boxes3D:
+    """The inverse of `encode`, for codes (N, 10) with the classes (N,) and scores (N,) of their boxes."""
+    angle = np.arctan2(code[:, 6], code[:, 7])
+    return Boxes3D(
+        centers=code[:, [0, 1, 4]],
+        sizes_lwh=np.exp(code[:, [3, 2, 5]]),
+        yaws=wrap_angle(-angle - np.pi / 2),
+        velocities=code[:, 8:],
+        classes=classes,
+        scores=scores,
+    )

@@ -69,28 +69,28 @@ class DeformableAttention(nn.Module):
         self.value_projection = nn.Linear(channels, channels)
         self.output_projection = nn.Linear(channels, channels)
         self.sampling = GridSampling()
-        self._initialize()
+        # As published: heads sample in a ring of directions, farther with each point, all with the same weight.
+        angles = torch.arange(heads) * (2 * math.pi / heads)
+        ring = torch.stack([angles.cos(), angles.sin()], -1)
+        ring = ring / ring.abs().amax(-1, keepdim=True)  # (heads, 2)
+        bias = ring[:, None, None, None] * torch.arange(1, points + 1)[:, None] * torch.ones(*self.shape, 1)
+        nn.init.zeros_(self.sampling_offsets.weight)
+        nn.init.zeros_(self.attention_weights.weight)
+        nn.init.zeros_(self.attention_weights.bias)
+        with torch.no_grad():
+            self.sampling_offsets.bias.copy_(bias.flatten())
+        for projection in (self.value_projection, self.output_projection):
+            nn.init.xavier_uniform_(projection.weight)
+            nn.init.zeros_(projection.bias)
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets and logits of the weights of the samples of queries (..., query_channels).
 
         Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
-        (..., heads, maps, L, P), see `weights`.
+        (..., heads, maps, L, P), see `GridSampling.weights`.
         """
-        return self.as_samples(self.sampling_offsets(query), self.attention_weights(query))
-
-    def as_samples(self, offsets: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets (..., heads · maps · L · P · 2) and logits (..., heads · maps · L · P) in the form of `predict`."""
+        offsets, logits = self.sampling_offsets(query), self.attention_weights(query)
         return offsets.float().unflatten(-1, (*self.shape, 2)), logits.unflatten(-1, self.shape)
-
-    def weights(self, logits: Tensor) -> Tensor:
-        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
-        return self.sampling.softmax(logits.flatten(-2)).view_as(logits)
-
-    def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
-        """Reference points plus predicted offsets; see `sampling_locations`."""
-        sizes = self.sampling.level_sizes(level_shapes, offsets.device)
-        return sampling_locations(reference_points, offsets, sizes)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values (B, Q, C) of queries that sample one map each.
@@ -102,47 +102,26 @@ class DeformableAttention(nn.Module):
             level_shapes: (height, width) of each of the L levels.
         """
         batch, queries, _ = query.shape
-        locations, weights = self.sampling_points(query, reference_points, level_shapes)
+        offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
+        reference = reference_points[:, :, None, None, None]
+        sizes = self.sampling.level_sizes(level_shapes, offsets.device)
+        locations, weights = sampling_locations(reference, offsets, sizes), self.sampling.weights(logits)
         samples = locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch
         sampled = self.sampling(self.values(tokens), level_shapes, *samples)
         attended: Tensor = self.output_projection(sampled.unflatten(0, (batch, queries)))
         return attended
 
-    def sampling_points(
-        self, query: Tensor, reference_points: Tensor, level_shapes: LevelShapes
-    ) -> tuple[Tensor, Tensor]:
-        """Locations (B, Q, heads, L, P, 2) and weights (B, Q, heads, L, P) of `attend`."""
-        offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
-        return self.locations(reference_points[:, :, None, None, None], offsets, level_shapes), self.weights(logits)
-
     def values(self, tokens: Tensor) -> Tensor:
         """The values (G, S, heads, C / heads) of tokens (G, S, C)."""
         return self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))
-
-    def _initialize(self) -> None:
-        """As published: heads sample in a ring of directions, farther with each point, all with the same weight."""
-        heads = self.shape[0]
-        angles = torch.arange(heads) * (2 * math.pi / heads)
-        ring = torch.stack([angles.cos(), angles.sin()], -1)
-        ring = ring / ring.abs().amax(-1, keepdim=True)  # (heads, 2)
-        steps = torch.arange(1, self.shape[-1] + 1)
-        bias = ring[:, None, None, None] * steps[:, None] * torch.ones(*self.shape, 1)
-        nn.init.zeros_(self.sampling_offsets.weight)
-        nn.init.zeros_(self.attention_weights.weight)
-        nn.init.zeros_(self.attention_weights.bias)
-        with torch.no_grad():
-            self.sampling_offsets.bias.copy_(bias.flatten())
-        for projection in (self.value_projection, self.output_projection):
-            nn.init.xavier_uniform_(projection.weight)
-            nn.init.zeros_(projection.bias)
 
 
 class GridSampling(nn.Module):
     """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another."""
 
-    def softmax(self, logits: Tensor) -> Tensor:
-        """Over the last axis."""
-        return logits.softmax(-1)
+    def weights(self, logits: Tensor) -> Tensor:
+        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
+        return logits.flatten(-2).softmax(-1).view_as(logits)
 
     def level_sizes(self, level_shapes: LevelShapes, device: torch.device) -> Tensor:
         """See the function `level_sizes`."""

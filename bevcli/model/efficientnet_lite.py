@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.backbone import Backbone
+from bevcli.model.resnet import Backbone
 
 VARIANTS = ((1.0, 1.0), (1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.4, 1.8))  # factors of width and depth of lite0 to lite4
 STEM_CHANNELS = 32  # of all variants
@@ -85,7 +85,8 @@ class EfficientNetLite(Backbone):
     """See `EfficientNetLiteConfig`. Images are RGB, with mean 127 and standard deviation 128 where it is pretrained."""
 
     def __init__(self, config: EfficientNetLiteConfig) -> None:
-        super().__init__(config.output_stages)
+        super().__init__()
+        self.output_stages = config.output_stages
         self.conv1 = SameConvolution(3, STEM_CHANNELS, 3)
         self.bn1 = _norm(STEM_CHANNELS)
         self.stages = nn.ModuleList(_stage(number, config) for number in range(1, max(config.output_stages) + 1))
@@ -160,4 +161,4 @@ def _stage(number: int, config: EfficientNetLiteConfig) -> nn.Sequential:
     channels = config.channels(number)
     before = STEM_CHANNELS if number == 1 else config.channels(number - 1)
     inputs = [(before, stride)] + (config.blocks(number) - 1) * [(channels, 1)]
-    return nn.Sequential(*(InvertedResidual(size, channels, kernel_size, each, expansion) for size, each in inputs))
+    return nn.Sequential(*(InvertedResidual(size, channels, kernel_size, stride, expansion) for size, stride in inputs))

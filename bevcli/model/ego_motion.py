@@ -5,12 +5,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
+from bevcli.geometry.transforms import Pose, yaw_of_quaternion
 from bevcli.model.upload import upload
 
 CAN_BUS_SIZE = 18
@@ -77,30 +76,28 @@ def ego_motion_inputs(
         previous_pose: world_from_ego of the previous frame. None for a scene's first frame, which has neither
             translation nor rotation, and where config.first_frame is "original" for the first frame of the run.
     """
-    position = np.asarray(pose.translation, dtype=np.float64)
-    yaw_deg = heading_deg(pose.quaternion)
-    moved, turned_deg = np.zeros(3), 0.0
-    if previous_pose is None and config.first_frame == "original":
-        previous_pose = Pose.identity()
-    if previous_pose is not None:
-        moved = position - np.asarray(previous_pose.translation, dtype=np.float64)
-        # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
-        turned_deg = yaw_deg - heading_deg(previous_pose.quaternion)
+    if previous_pose is None:
+        previous_pose = Pose.identity() if config.first_frame == "original" else pose
+    poses = pose, previous_pose
+    position, previous_position = (np.asarray(at.translation, dtype=np.float64) for at in poses)
+    moved = position - previous_position
+    yaw_deg, previous_yaw_deg = (float(np.degrees(yaw_of_quaternion(at.quaternion)) % 360.0) for at in poses)
+    # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
+    turned_deg = yaw_deg - previous_yaw_deg
     w, x, y, z = np.asarray(pose.quaternion, dtype=np.float64)
     quaternion = [w, w, w, w] if config.can_bus_quaternion == "w" else [w, x, y, z]
     yaws = [np.radians(yaw_deg), turned_deg]
     sensors = (kinematics.acceleration, kinematics.angular_rate, kinematics.velocity)
     can_bus = np.concatenate([moved, quaternion, *sensors, yaws])
+    # The translation to the right and ahead of the ego, over the extent of the BEV map.
+    distance, angle = np.hypot(moved[0], moved[1]), np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
+    extent_x, extent_y = (end - start for start, end in (grid.x_range_m, grid.y_range_m))
+    shift = np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
     return EgoMotionInputs(
         can_bus=can_bus.astype(np.float32),
-        shift=(_history_shift(moved, yaw_deg, grid) * config.shift).astype(np.float32),
+        shift=(shift * config.shift).astype(np.float32),
         rotation_deg=turned_deg * config.rotation,
     )
-
-
-def heading_deg(quaternion: ArrayLike) -> float:
-    """Yaw of a pose in degrees, in [0, 360), from its quaternion (4,) w, x, y, z."""
-    return float(np.degrees(yaw_of_quaternion(quaternion)) % 360.0)
 
 
 def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
@@ -117,20 +114,18 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
 def turned_history(history: Tensor, rotation: Tensor, grid: BevGrid) -> Tensor:
     """The part of `rotate_history` on the history's device. rotation: (B, 2, 3) of `map_rotation`."""
     rows, columns = grid.rows, grid.columns
-    row, column = _source_cells(rotation, grid)  # (B, Y, X) each
+    by_x, by_y, translation = rotation.unbind(-1)  # (B, 2) each
+    x = torch.arange(columns, device=rotation.device) + 0.5 - columns / 2  # (X,)
+    y = torch.arange(rows, device=rotation.device) + 0.5 - rows / 2  # (Y,)
+    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
+    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
+    # The old cell that each cell takes its history from, (B, Y, X) int64 each.
+    row = (((source_y + 1) * rows - 1) / 2).round().long()
+    column = (((source_x + 1) * columns - 1) / 2).round().long()
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     source = (row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)).flatten(1)  # (B, Y·X)
     batch = torch.arange(len(history), device=history.device)[:, None]
     return history[batch, source] * inside.flatten(1)[..., None]
-
-
-def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
-    """A translation (3,) in world metres as (2,), to the right and ahead of the ego, over the extent of the BEV."""
-    distance = np.hypot(moved[0], moved[1])
-    angle = np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
-    extent_x = grid.x_range_m[1] - grid.x_range_m[0]
-    extent_y = grid.y_range_m[1] - grid.y_range_m[0]
-    return np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
 
 
 def map_rotation(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
@@ -149,15 +144,3 @@ def map_rotation(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) ->
     translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
     scaled = rotation.float() / half[:, None]  # (B, 2, 2)
     return torch.cat([scaled, translation[..., None]], dim=-1)
-
-
-def _source_cells(rotation: Tensor, grid: BevGrid) -> tuple[Tensor, Tensor]:
-    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from."""
-    by_x, by_y, translation = rotation.unbind(-1)  # (B, 2) each
-    x = torch.arange(grid.columns, device=rotation.device) + 0.5 - grid.columns / 2  # (X,)
-    y = torch.arange(grid.rows, device=rotation.device) + 0.5 - grid.rows / 2  # (Y,)
-    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
-    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
-    row = (((source_y + 1) * grid.rows - 1) / 2).round().long()
-    column = (((source_x + 1) * grid.columns - 1) / 2).round().long()
-    return row, column

@@ -1,14 +1,15 @@
 """The BEV encoder: layers of temporal self-attention, spatial cross-attention and a feed-forward network."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
 from bevcli.model.ego_motion import EgoMotionConfig
-from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
 
 
@@ -161,9 +162,10 @@ class TemporalSelfAttention(nn.Module):
         batch, cells = offsets.shape[:2]
         maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-        locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+        sizes = self.attention.sampling.level_sizes(self.level_shapes, offsets.device)
+        locations = sampling_locations(reference, offsets, sizes)  # (B, Y·X, heads, 2, 1, P, 2)
         locations = locations.movedim(3, 1).flatten(0, 2)
-        weights = self.attention.weights(logits).movedim(3, 1).flatten(0, 2)
+        weights = self.attention.sampling.weights(logits).movedim(3, 1).flatten(0, 2)
         queries_per_map = [2 * cells // maps] * (maps * batch)
         values = self.attention.values(tokens)
         sampled = self.attention.sampling(values, self.level_shapes, locations, weights, queries_per_map)
@@ -204,8 +206,9 @@ class SpatialCrossAttention(nn.Module):
         tokens, level_shapes = image_features.tokens, image_features.level_shapes
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
-        offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.weights(logits)))
-        locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
+        offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.sampling.weights(logits)))
+        sizes = self.attention.sampling.level_sizes(level_shapes, offsets.device)
+        locations = sampling_locations(reference[:, None, None], offsets, sizes)  # (M, heads, L, P, 2)
         values = self.attention.values(tokens)
         sampled: Tensor = self.attention.sampling(values, level_shapes, locations, weights, hits.hits_per_camera)
         return sampled
@@ -216,3 +219,23 @@ def normalized_centers(grid: BevGrid) -> Tensor:
     x = (torch.arange(grid.columns, dtype=torch.float32) + 0.5) / grid.columns
     y = (torch.arange(grid.rows, dtype=torch.float32) + 0.5) / grid.rows
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
+
+
+class FeedForward(nn.Module):
+    """Linear, activation, linear, with dropout after each linear layer."""
+
+    def __init__(self, channels: int, width: int, dropout: float, activation: Literal["relu", "gelu"] = "relu") -> None:
+        super().__init__()
+        self.activation = activation
+        self.expand = nn.Linear(channels, width)
+        self.reduce = nn.Linear(width, channels)
+        self.dropout = nn.Dropout(dropout)
+        for layer in (self.expand, self.reduce):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (..., C) -> (..., C), without the residual."""
+        expanded = self.expand(x)
+        activated = F.gelu(expanded) if self.activation == "gelu" else F.relu(expanded, inplace=True)
+        return self.dropout(self.reduce(self.dropout(activated)))

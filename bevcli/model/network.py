@@ -6,13 +6,12 @@ from torch import Tensor
 
 from bevcli.errors import BevcliError
 from bevcli.model.bev_queries import BevQueries
-from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import Decoder, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
-from bevcli.model.image_tokens import ImageTokens
+from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import ModelOutputs

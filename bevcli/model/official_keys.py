@@ -1,40 +1,12 @@
 """Translates the key names of the official weights files to ours."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 from torch import Tensor
 
+from bevcli.model.temporal_model import OfficialNames, Renames
 from bevcli.registry import entries, load
-
-Renames = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
-
-
-@dataclass(frozen=True)
-class OfficialNames:
-    """The names of tensors in the released files of a model, beside those that all models share.
-
-    Attributes:
-        mark: pattern of a key that only these files have; "" for a model with shared names only.
-        renames: pattern of the official name, and ours, in the order of use.
-        unused: pattern of the keys without effect at inference, which are left out.
-        unused_text: those in words, with their `count` and the `first` of them.
-    """
-
-    mark: str = ""
-    renames: Renames = ()
-    unused: str = ""
-    unused_text: str = "{count} keys, such as {first}"
-
-    def without_unused(self, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-        """The state dict without the unused keys, and these in words."""
-        unused = [key for key in state if self.unused and re.match(self.unused, key)]
-        text = self.unused_text.format(count=len(unused), first=unused[0]) if unused else ""
-        return {key: tensor for key, tensor in state.items() if key not in unused}, text
-
-
-_PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
 
 # Of the parts that models share. All rules are applied to every key, in their order, after those of the model.
 _RENAMES: Renames = (
@@ -70,11 +42,6 @@ _RENAMES: Renames = (
 _TRAINING_ONLY = ("pts_bbox_head.code_weights",)
 _OBJECT_QUERIES = "pts_bbox_head.query_embedding.weight"
 _QUERIES_OF_A_GROUP = 900
-
-
-def is_official(state: Mapping[str, Tensor]) -> bool:
-    """A state dict uses the official key names."""
-    return any(key.startswith(_PREFIXES) for key in state)
 
 
 def from_official(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:

@@ -94,7 +94,7 @@ class Pillars(nn.Module):
 
     def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
         """The pairs of a camera and a cell that it sees; arguments as for `project_pillars`."""
-        return find_hits(self.project(image_from_bev, image_size, has_image))
+        return find_hits(project_pillars(image_from_bev, self.points, image_size, has_image))
 
     def project(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarProjection:
         """The pillars in every camera; arguments as for `project_pillars`."""
@@ -140,7 +140,12 @@ def find_hits(projection: PillarProjection) -> PillarHits:
     hit = projection.hit
     _, cameras, cells = hit.shape
     hits_per_camera = tuple(hit.sum(-1).flatten().tolist())
-    index = _true_positions(hit.flatten(), sum(hits_per_camera))  # in B·N·Y·X
+    # The positions of true elements in B·N·Y·X, as `nonzero` without its wait: all false elements write to one more
+    # place at the end, which is cut off.
+    mask, count = hit.flatten(), sum(hits_per_camera)
+    order = mask.cumsum(0)  # from 1, at the true elements
+    position = (order - 1).masked_fill(~mask, count)
+    index = order.new_empty(count + 1).scatter_(0, position, torch.arange(len(mask), device=mask.device))[:count]
     batch = index // (cameras * cells)
     return PillarHits(
         cell=batch * cells + index % cells,
@@ -148,12 +153,3 @@ def find_hits(projection: PillarProjection) -> PillarHits:
         hits_per_camera=hits_per_camera,
         cameras_per_cell=hit.sum(1).flatten(),
     )
-
-
-def _true_positions(mask: Tensor, count: int) -> Tensor:
-    """The positions (count,) int64 of the `count` true elements of a mask (K,), as `nonzero` without its wait."""
-    order = mask.cumsum(0)  # from 1, at the true elements
-    # All false elements write to one more place at the end, which is cut off.
-    position = (order - 1).masked_fill(~mask, count)
-    positions = order.new_empty(count + 1).scatter_(0, position, torch.arange(len(mask), device=mask.device))
-    return positions[:count]

@@ -14,15 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import DecoderLayer, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
-from bevcli.model.image_tokens import ImageTokens
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms, in_place_of
+from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
+from bevcli.model.kernels import choose
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
-from bevcli.model.kernels.last_call import KeptCalibrationEmbedding, KeptPillars
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
@@ -55,32 +53,31 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         fix_constant_parts(network)
     points_on_cpu = {name: module.points for name, module in network.named_modules() if isinstance(module, Pillars)}
     network.to(device)
-    fold_batch_norms(network, device)
-    choose_kernels(network, device)
+    choose.fold_batch_norms(network, device)
+    choose.choose_kernels(network, device)
     kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
     if device.type != "cpu":
-        from bevcli.model.kernels.gpu_layers import finish_gpu_parts, gpu_kinds
+        from bevcli.model.kernels import gpu
 
-        kinds = gpu_kinds(device)
+        kinds = gpu.gpu_kinds(device)
     for name, module in list(network.named_modules()):
         if kind := kinds.get(type(module)):
-            network.set_submodule(name, in_place_of(module, kind))
+            network.set_submodule(name, choose.in_place_of(module, kind))
     if device.type != "cpu":
-        finish_gpu_parts(network, points_on_cpu)
+        gpu.finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
     if isinstance(network, Network):
         network.backbone.to(dtype)
         network.neck.to(dtype)
         network.backbone.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
-    round_attentions(network, dtype, temporal=rounds, queries=rounds or (precision != "fp32" and device.type == "cuda"))
+    if dtype != torch.float32:
+        round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")
     _check_finite(network)
     if device.type == "cuda":
-        from bevcli.model.cuda_graph import Captured
-
         for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
-            captured: Any = Captured(getattr(network, name), network, device, rounds=precision != "fp32")
+            captured: Any = gpu.Captured(getattr(network, name), network, device, rounds=precision != "fp32")
             setattr(network, name, captured)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)
@@ -94,8 +91,6 @@ def round_attentions(network: nn.Module, dtype: torch.dtype, *, temporal: bool, 
     Those are the values of the image features, with `temporal` those of the BEV maps, and with `queries` the attention
     of object queries to each other.
     """
-    if dtype == torch.float32:
-        return
     for module in list(network.modules()):
         if isinstance(module, SpatialCrossAttention) or (temporal and isinstance(module, TemporalSelfAttention)):
             projection = module.attention.value_projection
@@ -112,7 +107,7 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     loaded = threading.Event()
     for name, module in list(network.named_modules()):
         if isinstance(module, ResNet):
-            network.set_submodule(f"{name}.pool", CompiledPool(module.pool, loaded))
+            network.set_submodule(f"{name}.pool", choose.in_place_of(module.pool, CompiledPool, loaded=loaded))
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
@@ -216,8 +211,8 @@ class TokensInBlocks(ImageTokens):
 
 # The classes that take the place of plain ones on a CPU, beside those of `choose_kernels`.
 CPU_KINDS: dict[type[nn.Module], type[nn.Module]] = {
-    Pillars: KeptPillars,
-    CalibrationEmbedding: KeptCalibrationEmbedding,
+    Pillars: choose.KeptPillars,
+    CalibrationEmbedding: choose.KeptCalibrationEmbedding,
     EfficientNetLite: EfficientNetLiteByImage,
     ImageTokens: TokensInBlocks,
 }

@@ -1,14 +1,12 @@
-"""ResNet (He et al. 2016) with bottlenecks: the image backbone."""
+"""ResNet (He et al. 2016) with bottlenecks: the image backbone, and the base class of all backbones."""
 
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-from bevcli.model.backbone import Backbone
-from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 
 @dataclass(frozen=True)
@@ -59,16 +57,73 @@ class ResNetConfig:
         return ResNet(self)
 
 
+class Backbone(nn.Module):
+    """Images to feature maps of the configured output stages. A subclass makes `conv1`, `bn1` and the stages.
+
+    Attributes:
+        output_stages: the stages, from 1, whose maps are returned.
+        conv1: the convolution of the stem.
+        bn1: the batch norm after it.
+        stages: from the first to the last one whose map is returned.
+        frozen_stages: so many first stages, and the stem, keep their weights and statistics in a training.
+        frozen_maps: computes the maps of the first stages in place of the stem and these stages, during a training
+            that keeps their weights.
+    """
+
+    output_stages: tuple[int, ...]
+    conv1: nn.Conv2d
+    bn1: nn.BatchNorm2d
+    stages: nn.ModuleList
+    frozen_stages: int = 0
+    frozen_maps: Callable[[Tensor], list[Tensor]] | None = None
+
+    @abstractmethod
+    def stem(self, images: Tensor) -> Tensor:
+        """images: (B, 3, H, W) -> the input of the first stage."""
+
+    def freeze(self, stages: int) -> None:
+        """Keeps the stem and so many first stages as they are in a training; with 0 nothing is frozen."""
+        self.frozen_stages = stages
+        for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else ():
+            part.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> "Backbone":
+        """As `nn.Module.train`; batch norms of frozen parts stay in evaluation mode."""
+        super().train(mode)
+        for part in [self.conv1, self.bn1, *self.stages[: self.frozen_stages]] if self.frozen_stages else ():
+            part.eval()
+        return self
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / stride, W / stride) for each output stage."""
+        maps: list[Tensor] = []
+        if self.frozen_maps is not None:
+            maps = self.frozen_maps(images)
+        x = maps[-1] if maps else self.stem(images)
+        for blocks in self.stages[len(maps) :]:
+            x = blocks(x)
+            maps.append(x)
+        return [maps[stage - 1] for stage in self.output_stages]
+
+
 class ResNet(Backbone):
     """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32."""
 
     def __init__(self, config: ResNetConfig) -> None:
-        super().__init__(config.output_stages)
+        super().__init__()
+        self.output_stages = config.output_stages
         width = config.width
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.pool = nn.MaxPool2d(3, stride=2, padding=1)
-        self.stages = nn.ModuleList(_stage(number, config) for number in range(1, max(config.output_stages) + 1))
+        self.stages, in_channels = nn.ModuleList(), width
+        for number, blocks in enumerate(config.blocks[: max(config.output_stages)], 1):
+            channels, deformable = width * 2 ** (number - 1), number in config.deformable_stages
+            # The first bottleneck of a stage has the stride; the stem has that of the first stage.
+            inputs = [(in_channels, 1 if number == 1 else 2)] + (blocks - 1) * [(4 * channels, 1)]
+            stage = (Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs)
+            self.stages.append(nn.Sequential(*stage))
+            in_channels = 4 * channels
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
     def stem(self, images: Tensor) -> Tensor:
@@ -89,6 +144,8 @@ class Bottleneck(nn.Module):
         self.bn1 = nn.BatchNorm2d(channels)
         self.conv2: nn.Module
         if deformable:
+            from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+
             self.conv2 = ModulatedDeformableConvolution(channels, channels, stride2)
         else:
             self.conv2 = nn.Conv2d(channels, channels, 3, stride2, padding=1, bias=False)
@@ -133,12 +190,3 @@ class BasicBlock(nn.Module):
         """x: (B, in_channels, Y, X) -> (B, channels, Y, X)."""
         y = F.relu(self.bn1(self.conv1(x)))
         return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
-
-
-def _stage(number: int, config: ResNetConfig) -> nn.Sequential:
-    """The bottlenecks of a stage (1 to 4); the first of them has the stride."""
-    channels, deformable = config.width * 2 ** (number - 1), number in config.deformable_stages
-    # The stage before has half the channels, the stem as many as the first stage.
-    first = (config.width, 1) if number == 1 else (2 * channels, 2)
-    inputs = [first] + (config.blocks[number - 1] - 1) * [(4 * channels, 1)]
-    return nn.Sequential(*(Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs))

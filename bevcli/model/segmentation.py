@@ -17,7 +17,7 @@ from bevcli.frame import BevMap, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig, DecoderLayer, branch, inverse_sigmoid
 from bevcli.model.deformable_attention import DeformableAttention
-from bevcli.model.feed_forward import FeedForward
+from bevcli.model.encoder import FeedForward
 
 # Each stuff class has one query of its own. The thing class has many; training matches them to instances.
 STUFF_CLASSES = ("drivable_road", "lane_boundary", "pedestrian_crossing")
@@ -57,11 +57,7 @@ class SegmentationConfig:
             raise ValueError("mask_layers and map_scale must be positive")
         if not (0 <= self.min_stuff <= 1 and 0 <= self.min_thing <= 1):
             raise ValueError("min_stuff and min_thing must be from 0 to 1")
-        self.location_decoder()  # checks the other numbers
-
-    def location_decoder(self) -> DecoderConfig:
-        """The location decoder's layers, which are those of the object decoder."""
-        return DecoderConfig.of_head(self, self.location_layers, self.thing_queries)
+        DecoderConfig.of_head(self, self.location_layers, self.thing_queries)  # checks the other numbers
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,8 @@ class SegmentationHead(nn.Module):
     def __init__(self, config: SegmentationConfig, channels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
         self.stuff_queries = nn.Parameter(torch.randn(len(STUFF_CLASSES), channels))
-        self.location_decoder = LocationDecoder(config.location_decoder(), channels, bev_shape)
+        decoder = DecoderConfig.of_head(config, config.location_layers, config.thing_queries)
+        self.location_decoder = LocationDecoder(decoder, channels, bev_shape)
         self.mask_layers = nn.ModuleList(
             MaskDecoderLayer(channels, config.attention_heads, config.feed_forward_width, config.dropout)
             for _ in range(config.mask_layers)
@@ -222,7 +219,7 @@ def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: B
     """
     layers = outputs.map_layers
     if layers is None:
-        logits, of_class = (each[-1, 0].detach().float() for each in (outputs.mask_logits, outputs.class_logits))
+        logits, of_class = (layers[-1, 0].detach().float() for layers in (outputs.mask_logits, outputs.class_logits))
         used = logits.amax(-1).sigmoid() * of_class.sigmoid() > config.min_thing  # the other things are in no cell
         used[: len(STUFF_CLASSES)] = True
         layers = map_layers(logits[used], of_class[used], config, grid)

@@ -1,6 +1,6 @@
-"""The data of one step: a preprocessed frame, the tensors that enter a network and leave it, and the ground truth."""
+"""The data of one step: a preprocessed frame with its cameras in the model's order, and the tensors of a network."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
@@ -11,12 +11,37 @@ from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame
-from bevcli.geometry.transforms import Pose
-from bevcli.model.camera_assignment import CameraAssignment
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Pose, wrap_angle
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.upload import upload
+
+# Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
+NUSCENES_YAWS_DEG = {
+    "CAM_FRONT": 0.0,
+    "CAM_FRONT_RIGHT": -55.0,
+    "CAM_FRONT_LEFT": 55.0,
+    "CAM_BACK": 180.0,
+    "CAM_BACK_LEFT": 110.0,
+    "CAM_BACK_RIGHT": -110.0,
+}
+
+
+@dataclass(frozen=True)
+class CameraAssignment:
+    """The cameras of a rig, assigned to the cameras that the model was trained with.
+
+    Attributes:
+        cameras: the rig's cameras in the model's order.
+        embeddings: for each of them, the model's camera whose embedding it takes.
+    """
+
+    cameras: tuple[str, ...]
+    embeddings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -72,13 +97,10 @@ class ModelInputs:
         """(height, width) of the network's input, pixels."""
         return self.images.shape[-2], self.images.shape[-1]
 
-    def to(self, device: torch.device, *, keep_geometry: bool = False) -> "ModelInputs":
-        """The same inputs on a device.
-
-        keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where they are read without a wait.
-        """
-        kept = ("image_from_bev", "has_image", "rotation_deg") if keep_geometry else ()
-        tensors = {part.name: getattr(self, part.name) for part in fields(self)}
+    def to(self, device: torch.device) -> "ModelInputs":
+        """The same inputs on a device, but for what is read on the CPU: image_from_bev, has_image and rotation_deg."""
+        kept = ("image_from_bev", "has_image", "rotation_deg")
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
         return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 
 
@@ -107,6 +129,15 @@ class ModelOutputs:
         """The last layers' outputs that only this model has, by their names in an exported file."""
         return {}
 
+    def boxes(self, config: ModelConfig) -> Boxes3D:
+        """The boxes with the best scores of the last decoder layer, by falling score, bev frame; of a batch of one.
+
+        There are at most config.decoder.max_boxes. No box is removed: training matches each object to one query. A
+        query gives one box for each of its classes that is among the best scores.
+        """
+        best = best_boxes(self.class_logits[-1].detach(), self.box_codes[-1].detach(), config.decoder)
+        return best.decoded(config.classes)
+
     def last_layers(self) -> Self:
         """The outputs of the last layers, all that results are decoded from."""
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()
@@ -114,36 +145,21 @@ class ModelOutputs:
         return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
 
 
-def model_inputs(
-    frames: Sequence[PreparedFrame], previous_poses: Sequence[Pose | None], config: ModelConfig
-) -> ModelInputs:
-    """B frames, each of another sequence, as a batch.
-
-    previous_poses: world_from_ego of the frame before in each sequence; None at its start.
-    Raises InputError where the sequences do not have the same number of cameras.
-    """
-    indices = [prepared.camera_index for prepared in frames]
-    for prepared in frames:
-        if len(prepared.camera_index) != len(indices[0]):
-            raise InputError(
-                f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
-                "cannot go into one batch: use sequences with the same number of cameras, or batches of 1"
-            )
-    same = all(torch.equal(index, indices[0]) for index in indices)
-    motions = [
-        ego_motion_inputs(frame.world_from_ego, pose, frame.kinematics, config.bev_grid, config.ego_motion)
-        for frame, pose in zip((prepared.frame for prepared in frames), previous_poses, strict=True)
-    ]
+def model_inputs(prepared: PreparedFrame, previous_pose: Pose | None, config: ModelConfig) -> ModelInputs:
+    """A frame as a batch of one. previous_pose: see `ego_motion_inputs`."""
+    frame = prepared.frame
+    motion = ego_motion_inputs(
+        frame.world_from_ego, previous_pose, frame.kinematics, config.bev_grid, config.ego_motion
+    )
     return ModelInputs(
-        # Copying the images of a single frame would take milliseconds.
-        images=frames[0].images if len(frames) == 1 else _together([prepared.images for prepared in frames]),
+        images=prepared.images,
         # Without the noise of the poses' products (1e-14), so that frames of one rig have equal projections.
-        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).round(decimals=12).float(),
-        camera_index=indices[0] if same else torch.stack(indices),
-        has_image=torch.cat([prepared.has_image for prepared in frames]),
-        can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
-        shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
-        rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),
+        image_from_bev=prepared.image_from_bev.round(decimals=12).float(),
+        camera_index=prepared.camera_index,
+        has_image=prepared.has_image,
+        can_bus=torch.from_numpy(motion.can_bus)[None],
+        shift=torch.from_numpy(motion.shift)[None],
+        rotation_deg=torch.tensor([motion.rotation_deg], dtype=torch.float32),
     )
 
 
@@ -170,10 +186,46 @@ def _together(images: list[Tensor]) -> Tensor:
 
     They are joined channels last, as they lie in memory.
     """
-    height, width = (max(of_batch.shape[axis] for of_batch in images) for axis in (-2, -1))
+    height, width = (max(batch.shape[axis] for batch in images) for axis in (-2, -1))
 
-    def padded(one: Tensor) -> Tensor:
-        missing = (0, width - one.shape[-1], 0, height - one.shape[-2])
-        return (F.pad(one, missing) if any(missing) else one).movedim(2, -1)
+    def padded(batch: Tensor) -> Tensor:
+        missing = (0, width - batch.shape[-1], 0, height - batch.shape[-2])
+        return (F.pad(batch, missing) if any(missing) else batch).movedim(2, -1)
 
-    return torch.cat([padded(one) for one in images]).movedim(-1, 2)
+    return torch.cat([padded(batch) for batch in images]).movedim(-1, 2)
+
+
+def assign_cameras(
+    rig: CameraRig, model_cameras: tuple[str, ...], chosen: Mapping[str, str] | None = None
+) -> CameraAssignment:
+    """Assigns each camera of a rig to a camera of the model: as `chosen`, else by name, else by viewing direction.
+
+    Args:
+        model_cameras: the names of the model's cameras, in the order of their embeddings.
+        chosen: camera of the rig -> camera of the model.
+
+    Raises InputError for an unknown camera in `chosen`, or where the model's cameras have no known viewing direction.
+    """
+    chosen = chosen or {}
+    for name, embedding in chosen.items():
+        if name not in rig.names:
+            raise InputError(f"camera {name}: is not in the rig (it has {', '.join(rig.names)})")
+        if embedding not in model_cameras:
+            raise InputError(
+                f"camera {name}: the model has no camera {embedding} (expected {', '.join(model_cameras)})"
+            )
+    yaws = np.radians([NUSCENES_YAWS_DEG.get(name, np.nan) for name in model_cameras])
+    embeddings = {}
+    for camera in rig.cameras:
+        embedding = chosen.get(camera.name, camera.name if camera.name in model_cameras else "")
+        if not embedding:
+            distances = np.abs(wrap_angle(yaws - camera.yaw))
+            if np.isnan(distances).all():
+                raise InputError(
+                    f"camera {camera.name}: the model has no camera of this name; pass "
+                    f"`cameras={{'{camera.name}': 'NAME'}}`"
+                )
+            embedding = model_cameras[int(np.nanargmin(distances))]
+        embeddings[camera.name] = embedding
+    order = sorted(rig.names, key=lambda name: (model_cameras.index(embeddings[name]), name != embeddings[name], name))
+    return CameraAssignment(tuple(order), tuple(embeddings[name] for name in order))

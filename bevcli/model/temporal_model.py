@@ -4,22 +4,46 @@ A network, the same network prepared for inference, and an exported file are eac
 a model beyond this, such as its exported form, they register by its class: see `bevcli.registry.for_model`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
-from bevcli.model.official_keys import OfficialNames
 from bevcli.model.segmentation import decode_map
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.registry import load
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on
+Renames = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
+
+
+@dataclass(frozen=True)
+class OfficialNames:
+    """The names of tensors in the released files of a model, beside those that all models share.
+
+    Attributes:
+        mark: pattern of a key that only these files have; "" for a model with shared names only.
+        renames: pattern of the official name, and ours, in the order of use.
+        unused: pattern of the keys without effect at inference, which are left out.
+        unused_text: those in words, with their `count` and the `first` of them.
+    """
+
+    mark: str = ""
+    renames: Renames = ()
+    unused: str = ""
+    unused_text: str = "{count} keys, such as {first}"
+
+    def without_unused(self, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+        """The state dict without the unused keys, and these in words."""
+        unused = [key for key in state if self.unused and re.match(self.unused, key)]
+        text = self.unused_text.format(count=len(unused), first=unused[0]) if unused else ""
+        return {key: tensor for key, tensor in state.items() if key not in unused}, text
 
 
 class TemporalModel(nn.Module):
@@ -67,7 +91,7 @@ class TemporalModel(nn.Module):
 
         Nothing but `config` is read of the model, as an exported file has no more.
         """
-        yield decode(outputs, self.config)
+        yield outputs.boxes(self.config)
         if outputs.segmentation is not None:
             yield decode_map(outputs.segmentation, self.config.segmentation, self.config.bev_grid)
 

@@ -86,7 +86,8 @@ def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
         for part in value:
             yield from tensors_in(part, name)
     else:
-        for field in _field_names(value):
+        kind: Any = type(value)
+        for field in _fields_of(kind):
             yield from tensors_in(getattr(value, field), field)
 
 
@@ -96,16 +97,12 @@ def exchanged(value: Any, others: Iterator[Any]) -> Any:
         return next(others)
     if isinstance(value, tuple | list):
         return type(value)(exchanged(part, others) for part in value)
-    names = _field_names(value)
-    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
-
-
-def _field_names(value: object) -> tuple[str, ...]:
-    """Of a dataclass; () for another value. They are kept: asking a dataclass takes longer than copying a tensor."""
     kind: Any = type(value)
-    return _fields_of(kind)
+    names = _fields_of(kind)
+    return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
 
 
 @cache
 def _fields_of(kind: Any) -> tuple[str, ...]:
+    """Of a dataclass; () for another type. They are kept: asking a dataclass takes longer than copying a tensor."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()

@@ -1,16 +1,14 @@
 """Writes frames and predictions into a rerun recording (.rrd).
 
     writer          the class `Recording` and its file; its settings are in `options`
-    entities        the entity paths, shared with the viewer
+    entities        the entity paths and the colours, shared with the viewer
     blueprint       the layout of the views and the order of the cameras
-    frame_log       all that is written about a frame, in order
-    log_static      all that is written once: rig, vehicle, range rings, pillars, legend, the page "About"
+    frame_log       all that is written about a frame, in order; features, segmentation, history, lines on the ground
     log_cameras     one camera's pose, image and overlays; boxes in its image, with labels
     log_boxes       boxes and ground truth in 3D, from above and on the street map; misses, false positives, trails
-    log_bev         BEV features as images, segmentation, history, probed cells, lines on the ground
-    meshes          the vehicle, and meshes of classes; `mesh_file` reads them
+    log_static      all that is written once: rig, vehicle, range rings, pillars, legend, the page "About"
+    meshes          of the vehicle and of classes, read from files
     components      the rows of all these as Arrow arrays
-    colors          the colours of classes and states
 
 `bevcli.viewer` reads and shows recordings; nothing here imports it.
 """

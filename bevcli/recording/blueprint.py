@@ -10,11 +10,16 @@ import rerun.blueprint as rrb
 from bevcli.frame import FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
-from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.log_static import Recorded, legend_entries, legend_size
+from bevcli.recording.log_static import COLUMN_WIDTH, LEGEND_COLUMNS, ROW_HEIGHT, Recorded, legend_entries
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
 HIDDEN = rrb.EntityBehavior(visible=False)
+FROM_START = rrb.VisibleTimeRanges(
+    [
+        rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
+        for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
+    ]
+)
 EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
 VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
 WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
@@ -42,11 +47,10 @@ def rows_of_largest_images(
     """
     rows = rows_by_yaw(yaws)
     one_row = (sum(rows, ()),)
-
-    def image_width(rows: tuple[tuple[str, ...], ...]) -> float:
-        return min(width / max(map(len, rows)), (height / len(rows) - title_height) * aspect)
-
-    return one_row if image_width(one_row) >= image_width(rows) else rows
+    wide, narrow = (
+        min(width / max(map(len, each)), (height / len(each) - title_height) * aspect) for each in (one_row, rows)
+    )
+    return one_row if wide >= narrow else rows
 
 
 def rows_by_yaw(yaws: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
@@ -84,12 +88,16 @@ class Layout(rrb.Blueprint):
 
 def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:
     """The layout of a recording. follows: the viewer first shows the newest frame, else it plays from the first one."""
-    rig, probes = recorded.drive.rig, bool(recorded.options.probes)
+    rig = recorded.drive.rig
     titled = f" ({recorded.note})" if recorded.note else ""
     middle = rrb.Horizontal(_scene(recorded, titled), _bev_tabs(recorded, titled), column_shares=[5, 3])
-    rows = [
-        rrb.Horizontal(*(_camera(rig, name, probes=probes) for name in row), name="cameras") for row in camera_rows(rig)
-    ]
+    hidden = ("pillars",) if recorded.options.probes else ("pillars", "probes")
+    views_of = {}
+    for camera in rig.cameras:
+        name, sides = camera.name, ((0, camera.width), (0, camera.height))
+        overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
+        views_of[name] = flat_view(entities.camera(name), name, *sides, overrides=overrides)
+    rows = [rrb.Horizontal(*map(views_of.__getitem__, row), name="cameras") for row in camera_rows(rig)]
     heights = camera_row_shares(rig)
     shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
     views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares)
@@ -130,48 +138,40 @@ def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
         contents=[f"/{entities.WORLD}/**", *(f"- /{overlay}/**" for overlay in overlays)],
         name=f"3D scene{titled}",
-        background=list(BACKGROUND),
+        background=list(entities.BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0, 0, 1)),
         overrides={
-            entities.TRAJECTORY: [rrb.VisibleTimeRanges(_from_start())],
+            entities.TRAJECTORY: [FROM_START],
             **{entity: [HIDDEN] for entity in hidden},
         },
     )
 
 
-def _from_start() -> list[rr.VisibleTimeRange]:
-    return [
-        rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
-        for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
-    ]
-
-
 def _bev_tabs(recorded: Recorded, titled: str) -> rrb.Tabs:
     margin = min(VIEW_MARGIN_M, recorded.model.config.bev_grid.nearest_side_m)
 
-    def view(name: str, *without: str) -> rrb.Spatial2DView:
-        contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
-        return flat_view(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents)
-
     features, history, segmentation = entities.BEV_FEATURES, entities.BEV_HISTORY, entities.BEV_SEGMENTATION
-    views: list[rrb.View] = [
-        view(f"BEV{titled}", features, history),
-        view("BEV features", history, segmentation),
-        view("History weight", features, segmentation),
-    ]
-    on_earth = recorded.drive.facts.geo_origin is not None
-    return rrb.Tabs(*views, *([_street_map()] if on_earth else []), active_tab=0)
-
-
-def _street_map() -> rrb.MapView:
-    return rrb.MapView(
-        origin=entities.MAP,
-        name="Street map",
-        zoom=MAP_ZOOM,
-        background=rrb.MapProvider.OpenStreetMap,
-        overrides={entities.MAP_ROUTE: [rrb.VisibleTimeRanges(_from_start())]},
-    )
+    hidden = {
+        f"BEV{titled}": (features, history),
+        "BEV features": (history, segmentation),
+        "History weight": (features, segmentation),
+    }
+    tabs: list[rrb.View] = []
+    for name, without in hidden.items():
+        contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
+        tabs.append(flat_view(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents))
+    if recorded.drive.facts.geo_origin is not None:
+        tabs.append(
+            rrb.MapView(
+                origin=entities.MAP,
+                name="Street map",
+                zoom=MAP_ZOOM,
+                background=rrb.MapProvider.OpenStreetMap,
+                overrides={entities.MAP_ROUTE: [FROM_START]},
+            )
+        )
+    return rrb.Tabs(*tabs, active_tab=0)
 
 
 def _texts(recorded: Recorded) -> rrb.Vertical:
@@ -185,17 +185,11 @@ def _texts(recorded: Recorded) -> rrb.Vertical:
     columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
-    width, height = legend_size(len(legend_entries(recorded)))
-    legend = flat_view(entities.LEGEND, "Legend", (0, width), (0, height))
+    legend_rows = -(-len(legend_entries(recorded)) // LEGEND_COLUMNS)
+    sides = (0, LEGEND_COLUMNS * COLUMN_WIDTH), (0, legend_rows * ROW_HEIGHT)
+    legend = flat_view(entities.LEGEND, "Legend", *sides)
     pages = rrb.Tabs(events, about, active_tab=0)
     return rrb.Vertical(rrb.Tabs(*plots, active_tab=0), legend, pages, row_shares=[3, 3, 4])
-
-
-def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
-    hidden = ("pillars",) if probes else ("pillars", "probes")
-    overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
-    shown = rig[name]
-    return flat_view(entities.camera(name), name, (0, shown.width), (0, shown.height), overrides=overrides)
 
 
 def flat_view(
@@ -203,4 +197,6 @@ def flat_view(
 ) -> rrb.Spatial2DView:
     """A 2D view of an entity that first shows these ranges. options: of `rrb.Spatial2DView`."""
     bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(origin=origin, name=name, background=list(BACKGROUND), visual_bounds=bounds, **options)
+    return rrb.Spatial2DView(
+        origin=origin, name=name, background=list(entities.BACKGROUND), visual_bounds=bounds, **options
+    )

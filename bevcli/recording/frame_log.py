@@ -1,27 +1,38 @@
-"""What a recording says about each frame: poses, images, boxes, lines, curves, events, and the model's internals."""
+"""The rows of each frame: poses, images, boxes, curves and events; then features, maps, probes, lines on the ground."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, result_of
+from bevcli.errors import InputError
+from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, Probe, result_of
+from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
-from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
-from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.components import any_values, components
-from bevcli.recording.log_bev import BevColors, BevImages, future_lines, log_ground_lines
-from bevcli.recording.log_boxes import TrackHistory, log_tracks
-from bevcli.recording.log_cameras import CameraImages, PosedCamera, box_labels
-from bevcli.recording.log_static import WARNINGS, Recorded
-from bevcli.recording.meshes import log_class_meshes
+from bevcli.recording import entities, log_boxes, log_cameras, log_static
+from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
+from bevcli.recording.log_cameras import PosedCamera
 
+Features = NDArray[np.float32]
 PosedCameras = tuple[PosedCamera, ...]
+Ranges = tuple[tuple[float, float], tuple[float, float]]  # of x and of y, bev frame, metres
+SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
+FITTED_ON = 2  # frames
+CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
+PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
+GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
+PROBE_COLOR: Color = (255, 80, 220)
+BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
+FUTURES_OPACITY, FUTURES_WIDTH = 230, 1.0  # of 255; points of the user interface
+ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
 
 
 @dataclass
@@ -40,24 +51,24 @@ class FrameLogState:
     scene: str = ""
     world_from_ego: Pose | None = None
     colors: BevColors | None = None
-    tracks: TrackHistory = field(default_factory=TrackHistory)
+    tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
 
 
 class FrameLog:
     """Logs frames into a stream of rerun, in order. resume: the state from which the log goes on."""
 
-    def __init__(self, stream: rr.RecordingStream, recorded: Recorded, resume: FrameLogState | None) -> None:
+    def __init__(self, stream: rr.RecordingStream, recorded: log_static.Recorded, resume: FrameLogState | None) -> None:
         self._stream, self._recorded = stream, recorded
         self._options, self._geo_origin = recorded.options, recorded.drive.facts.geo_origin
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
-        self._object_classes = recorded.model.config.object_classes
-        self._images = CameraImages(stream, as_video=self._options.images == "av1")
+        object_classes = recorded.model.config.object_classes
+        self._with_meshes = [name for name, settings in object_classes.items() if settings.mesh]
+        self._images = log_cameras.CameraImages(stream, self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
-        self._bev_images = BevImages(self._options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
-        if self._bev_images is not None:
-            self._bev_images.colors = self._kept.colors
+        # Its stamps are predictions.
+        self._bev_images = BevImages(self._options.bev, self._kept.colors) if draws_bev else None
 
     def state(self) -> FrameLogState | None:
         """The state from which a later log goes on; None as long as it cannot be resumed.
@@ -71,24 +82,44 @@ class FrameLog:
         return None if self._kept.origin is None else deepcopy(self._kept)
 
     def finish(self) -> None:
-        """Logs what waits for later frames."""
+        """Logs what waits for later frames, and ends the video streams."""
         if self._bev_images is not None:
             self._log_bev_images(self._bev_images.finish())
-        self._images.close()
+        for encoder in self._images.encoders.values():
+            encoder.close()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Logs one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
-        self._log_ego(frame)
-        cameras = self._log_cameras(frame)
-        self._log_boxes(frame, prediction, cameras)
-        self._log_results(prediction, cameras)
-        if self._kept.world_from_ego is None:
-            log_static.log_curve_names(self._stream, prediction.stage_seconds, self._recorded.classes)
+        stream, is_first = self._stream, self._kept.world_from_ego is None
+        if self._kept.origin is None:  # the recording's world frame has its origin at the first frame's ego position
+            self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
+            stream.log(entities.WORLD, rr.AnyValues(origin=self._kept.origin), static=True)
+        self._at(frame.stamp)
+        moved = rigid(-self._kept.origin)  # from the sequence's world into the recording's world
+        self._log_ego(frame, moved)
+        poses = [moved @ frame.world_from_ego_at[c.name].matrix @ c.ego_from_camera for c in frame.rig.cameras]
+        cameras = tuple(
+            PosedCamera(camera, pose, inverse(pose)) for camera, pose in zip(frame.rig.cameras, poses, strict=True)
+        )
+        for posed in cameras:
+            name = posed.camera.name
+            log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
+            self._images.log(name, frame.images.get(name))
+        self._log_boxes(frame, prediction, moved, cameras)
+        if self._recorded.model.config.results:
+            self._log_results(prediction, moved, cameras)
+        if is_first:
+            stages, classes, bright = list(prediction.stage_seconds), self._recorded.classes, entities.STAGE_COLORS
+            colors = [bright[i % len(bright)] for i in range(len(stages))]
+            stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
+            of_classes = rr.SeriesLines(names=list(classes), colors=list(classes.values()))
+            stream.log(entities.BOX_CURVES, of_classes, static=True)
+            stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
         seconds = np.array(list(prediction.stage_seconds.values()))
-        self._stream.log(entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
-        self._log_frame_events(frame, prediction)
+        log(stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
+        self._log_events(frame, prediction)
         if self._options.shows_internals:
-            self._log_internals(frame, prediction, cameras)
+            self._log_internals(frame, prediction, moved, cameras)
         self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
 
     def event(self, text: str, level: str = "INFO") -> None:
@@ -102,103 +133,87 @@ class FrameLog:
         self._stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
         self._stream.set_time(entities.TIME_TIMELINE, timestamp=np.datetime64(stamp.timestamp_ns, "ns"))
 
-    def _log_ego(self, frame: Frame) -> None:
-        """Writes the ego pose. The recording's world frame has its origin at the first frame's ego position."""
-        if self._kept.origin is None:
-            self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
-            self._stream.log(entities.WORLD, rr.AnyValues(origin=self._kept.origin), static=True)
-        self._at(frame.stamp)
-        pose = self._moved_to_origin(frame.world_from_ego.matrix)
-        self._stream.log(
-            entities.EGO,
-            log_cameras.transform(pose),
-            any_values(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
-        )
+    def _log_ego(self, frame: Frame, moved: Array) -> None:
+        """Writes the ego pose, the speed (a curve and a label above the vehicle), the way since the frame before.
+
+        moved: (4, 4) from the sequence's world into the recording's world.
+        """
+        stream, stamp = self._stream, frame.stamp
+        pose = moved @ frame.world_from_ego.matrix
+        facts = any_values(scene=stamp.scene, timestamp_ns=stamp.timestamp_ns, pose=pose.ravel())
+        log(stream, entities.EGO, log_cameras.transform(pose) | facts)
         if self._recorded.drive.has_ego_motion:
-            log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
-        before = self._kept.world_from_ego if self._kept.scene == frame.stamp.scene else None
+            km_h = 3.6 * float(np.linalg.norm(frame.kinematics.velocity[:2]))
+            log(stream, entities.SPEED_CURVE, components(rr.Scalars, scalars=np.array([km_h])))
+            label = components(
+                rr.Points3D,
+                positions=np.array([SPEED_LABEL_M]),
+                labels=[f"{km_h:.0f} km/h"],
+                colors=entities.EGO_COLOR,
+                radii=log_cameras.UNSEEN,
+                show_labels=True,
+            )
+            log(stream, entities.SPEED, label)
+        before = self._kept.world_from_ego if self._kept.scene == stamp.scene else None
         if self._geo_origin is not None:
             last = None if before is None else before.translation
-            log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
+            log_boxes.log_ego_on_map(stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
-            poses = (before, frame.world_from_ego)
-            piece = np.array([[self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]])
-            self._stream.log(
-                entities.TRAJECTORY, components(rr.LineStrips3D, strips=piece, colors=EGO_COLOR, radii=0.06)
-            )
+            way = np.array([[(moved @ before.matrix)[:3, 3], pose[:3, 3]]])
+            line = components(rr.LineStrips3D, strips=way, colors=entities.EGO_COLOR, radii=0.06)
+            log(stream, entities.TRAJECTORY, line)
 
-    def _moved_to_origin(self, world_from_a: Array) -> Array:
-        """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
-        assert self._kept.origin is not None
-        return rigid(-self._kept.origin) @ world_from_a
-
-    def _world_from_bev(self, prediction: Prediction) -> Array:
-        return self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
-
-    def _log_cameras(self, frame: Frame) -> PosedCameras:
-        cameras = tuple(
-            PosedCamera(c, self._moved_to_origin(frame.world_from_ego_at[c.name].matrix) @ c.ego_from_camera)
-            for c in frame.rig.cameras
-        )
-        for posed in cameras:
-            self._stream.log(entities.camera(posed.name), log_cameras.transform(posed.world_from_camera))
-            self._images.log(posed.name, frame.images.get(posed.name))
-        return cameras
-
-    def _log_boxes(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
-        stream, names = self._stream, self._recorded.classes
+    def _log_boxes(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+        stream, classes = self._stream, self._recorded.classes
         shown = prediction.boxes.scored(self._options.score)
-        world_from_bev = self._world_from_bev(prediction)
-        in_world = shown.transformed(world_from_bev)
-        marks = log_boxes.false_and_duplicate(shown, None)
+        moved_from_ego = moved @ prediction.world_from_ego.matrix
+        world_from_bev = moved_from_ego @ prediction.ego_from_bev
+        bev_from_world = inverse(world_from_bev)
+        marks, drawn_truth = log_boxes.false_and_duplicate(shown, None), None
         if frame.ground_truth is not None:
-            in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
-            truth = log_boxes.detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
+            truth = frame.ground_truth.transformed(moved).transformed(bev_from_world)
+            truth = log_boxes.detectable(truth, prediction.grid)
+            other = log_boxes.other_classes(truth, classes)
             found = np.ones(len(truth), dtype=bool)
             if not self._recorded.model.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | log_boxes.other_classes(truth, names)
-            self._log_ground_truth(truth, found, world_from_bev, cameras)
-        ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
-        log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
-        log_class_meshes(stream, in_world, self._object_classes)
-        log_boxes.log_boxes_bev(stream, shown, marks, names)
-        log_tracks(stream, self._kept.tracks, in_world, frame.stamp, inverse(world_from_bev), names)
+                found = marks.found | other
+            in_world, colors = truth.transformed(world_from_bev), log_boxes.ground_truth_colors(found, other)
+            log_boxes.log_ground_truth(stream, in_world, truth.corners(), found, colors)
+            drawn_truth = in_world.corners(), colors
+        in_world, colors = shown.transformed(world_from_bev), log_boxes.box_colors(shown, classes)
+        corners, texts = in_world.corners(), log_cameras.box_labels(shown)
+        away = np.linalg.norm(in_world.centers[:, :2] - moved_from_ego[:2, 3], axis=-1)
+        near = set(np.argsort(away)[: log_boxes.LABELS_IN_SCENE].tolist())
+        labels = [text if i in near else "" for i, text in enumerate(texts)]
+        log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
+        for name in self._with_meshes:
+            log_boxes.log_class_mesh(stream, name, in_world[in_world.classes == name])
+        log_boxes.log_boxes_bev(stream, shown, shown.corners(), marks, colors)
+        log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, frame.stamp, bev_from_world)
         if self._geo_origin is not None:
-            in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
-            log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
-        colors, texts = log_boxes.box_colors(shown, names), box_labels(shown)
-        log_cameras.log_boxes_in_images(stream, cameras, in_world, colors, texts)
-        counts = np.array([(shown.classes == name).sum() for name in names])
-        stream.log(entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
+            centers = apply(prediction.world_from_ego.matrix @ prediction.ego_from_bev, shown.centers)
+            log_boxes.log_boxes_on_map(stream, self._geo_origin, centers, colors if len(shown) else None)
+        log_cameras.log_boxes_in_images(stream, cameras, corners, colors, texts, drawn_truth)
+        counts = np.array([(shown.classes == name).sum() for name in classes])
+        log(stream, entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
 
-    def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
+    def _log_results(self, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
         """Writes the results and futures of a model that has further results."""
-        kinds = self._recorded.model.config.results
-        if not kinds:
-            return
-        world_from_bev, score = self._world_from_bev(prediction), self._options.score
-        moved = Pose.from_matrix(self._moved_to_origin(prediction.world_from_ego.matrix))
-        ground = replace(prediction.ground, world_from_ego=moved)
-        shown = prediction.boxes.scored(score).transformed(world_from_bev)
-        for kind, names in kinds.items():
+        score, moved_from_ego = self._options.score, moved @ prediction.world_from_ego.matrix
+        world_from_bev = moved_from_ego @ prediction.ego_from_bev
+        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(moved_from_ego))
+        for kind, names in self._recorded.model.config.results.items():
             result = result_of(kind, prediction.results)
             lines = GroundLines() if result is None else result.drawn(ground, names, score)
             log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+        shown = prediction.boxes.scored(score).transformed(world_from_bev)
         futures = future_lines(shown, self._recorded.classes)
         log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
-    def _log_ground_truth(
-        self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
-    ) -> None:
-        in_world = truth.transformed(world_from_bev)
-        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self._recorded.classes))
-        log_boxes.log_ground_truth(self._stream, in_world, truth, found, colors)
-        log_cameras.log_ground_truth_in_images(self._stream, cameras, in_world, colors)
-
-    def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
-        if self._kept.world_from_ego is None and self._recorded.note in WARNINGS:
-            self.event(WARNINGS[self._recorded.note], "WARN")
+    def _log_events(self, frame: Frame, prediction: Prediction) -> None:
+        if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
+            self.event(log_static.WARNINGS[self._recorded.note], "WARN")
         where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
@@ -210,34 +225,229 @@ class FrameLog:
         if prediction.failure:
             self.event(f"{where}: {prediction.failure}", "ERROR" if prediction.not_finite else "WARN")
 
-    def _log_internals(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
-        self._log_pillars(frame, prediction, cameras)
-        if prediction.segmentation is not None:
-            log_bev.log_segmentation(self._stream, prediction.segmentation, prediction.ego_from_bev)
+    def _log_internals(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+        """Writes pillars, segmentation, BEV features, history weights and probes."""
+        stream, grid, ego_from_bev = self._stream, prediction.grid, prediction.ego_from_bev
+        ranges = grid.x_range_m, grid.y_range_m
+        if self._pillars is None:
+            all_cells = self._options.level == "full"
+            self._pillars = log_static.log_pillars(stream, grid, ego_from_bev, all_cells=all_cells)
+        pillars, colors = self._pillars
+        points = apply(moved @ prediction.world_from_ego.matrix @ ego_from_bev, pillars)
+        for posed in cameras:
+            if posed.camera.name in frame.images:
+                log_cameras.log_pillar_hits(stream, posed, points, colors)
+        if (ground_map := prediction.segmentation) is not None:
+            painted = ground_map.painted(entities.map_colors(ground_map.classes), entities.BACKGROUND)
+            of_map = ground_map.x_range_m, ground_map.y_range_m
+            log_flat_image(stream, entities.BEV_SEGMENTATION, painted, of_map, -5)
+            log_on_ground(stream, entities.SEGMENTATION_ON_GROUND, painted, of_map, ego_from_bev, 255)
         if self._bev_images is not None and prediction.bev is not None:
-            grid = prediction.grid
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
-            self._log_bev_images(self._bev_images.push((frame.stamp, prediction), features))
+            self._log_bev_images(self._bev_images.push(prediction, features))
             self._at(frame.stamp)
         if (attention := prediction.attention) is None:
             return
-        log_bev.log_history(self._stream, attention.history_weight, prediction.grid)
-        log_bev.log_probes(self._stream, attention.probes, prediction.ego_from_bev, prediction.grid)
-        for posed in cameras if attention.probes else ():
-            samples = [p.cameras[posed.name] for p in attention.probes if posed.name in p.cameras]
-            log_cameras.log_samples(self._stream, posed, samples)
+        if attention.history_weight is None:  # no history was used
+            stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
+        else:
+            log_flat_image(stream, entities.BEV_HISTORY, entities.colormap(attention.history_weight[::-1]), ranges, -8)
+        if attention.probes:
+            log_probes(stream, attention.probes, ego_from_bev, grid)
+            for posed in cameras:
+                name = posed.camera.name
+                samples = [probe.cameras[name] for probe in attention.probes if name in probe.cameras]
+                log_cameras.log_samples(stream, posed, samples)
 
-    def _log_bev_images(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
-        for (stamp, prediction), image in ready:
-            self._at(stamp)
-            log_bev.log_features(self._stream, image, prediction.grid, prediction.ego_from_bev)
+    def _log_bev_images(self, ready: list[tuple[Prediction, NDArray[np.uint8]]]) -> None:
+        for prediction, image in ready:
+            self._at(prediction.stamp)
+            ranges = prediction.grid.x_range_m, prediction.grid.y_range_m
+            log_flat_image(self._stream, entities.BEV_FEATURES, image, ranges, -10)
+            ground = entities.BEV_ON_GROUND
+            log_on_ground(self._stream, ground, image, ranges, prediction.ego_from_bev, GROUND_OPACITY)
 
-    def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
-        if self._pillars is None:
-            grid, all_cells = prediction.grid, self._options.level == "full"
-            self._pillars = log_static.log_pillars(self._stream, grid, prediction.ego_from_bev, all_cells=all_cells)
-        pillars, colors = self._pillars
-        points = apply(self._world_from_bev(prediction), pillars)
-        for posed in cameras:
-            if posed.name in frame.images:
-                log_cameras.log_pillar_hits(self._stream, posed, points, colors)
+
+@dataclass(frozen=True)
+class BevColors:
+    """A fixed mapping from features to colours.
+
+    Attributes:
+        mean: (C,) subtracted from the features.
+        basis: (C, K) projection, K 1 or 3; None takes the norm of the features (K 1).
+        low: (K,) values that become 0.
+        high: (K,) values that become 1.
+    """
+
+    mean: Features
+    basis: Features | None
+    low: Array
+    high: Array
+
+    def paint(self, features: Features) -> NDArray[np.uint8]:
+        """Features (..., C) -> (..., 3) uint8 RGB."""
+        values = _values(features, self.mean, self.basis)
+        shares = np.clip((values - self.low) / np.maximum(self.high - self.low, 1e-9), 0, 1)
+        if shares.shape[-1] == 1:
+            return entities.colormap(shares[..., 0], "inferno")
+        return (shares * 255).astype(np.uint8)
+
+
+def fit_colors(kind: str, features: Features) -> BevColors:
+    """Fits colours to features (cells, C). kind: "norm", "pca" or "channel:K".
+
+    Raises InputError when the features have no channel K.
+    """
+    channels = features.shape[-1]
+    mean: Features = np.zeros(channels, np.float32)
+    basis: Features | None = None
+    if kind == "pca":
+        mean = features.mean(0)
+        centered = features - mean
+        basis = np.linalg.eigh(centered.T @ centered)[1][:, :-4:-1]  # the three largest, largest first
+        signs = np.sign(basis[np.abs(basis).argmax(0), np.arange(basis.shape[1])])
+        # The sign of an eigenvector is arbitrary: make its largest entry positive.
+        basis = basis * np.where(signs == 0, 1, signs).astype(np.float32)
+    elif kind.startswith("channel:"):
+        chosen = int(kind.partition(":")[2])
+        if chosen >= channels:
+            raise InputError(f"`bev={kind}`: the BEV map has channels 0 to {channels - 1}")
+        basis = np.eye(channels, dtype=np.float32)[:, chosen : chosen + 1]
+    low, high = np.percentile(_values(features, mean, basis), PERCENTILES, axis=0)
+    return BevColors(mean, basis, low, high)
+
+
+@dataclass
+class BevImages:
+    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame.
+
+    Attributes:
+        kind: see `fit_colors`.
+        colors: fitted on the first frames, None before. Setting them continues an interrupted recording.
+        waiting: stamps and features of the frames whose images are not returned yet.
+    """
+
+    kind: str
+    colors: BevColors | None = None
+    waiting: list[tuple[Any, Features]] = field(default_factory=list)
+
+    def push(self, stamp: Any, features: Features) -> list[tuple[Any, NDArray[np.uint8]]]:
+        """Adds a frame; returns the images that are ready.
+
+        features: (rows, columns, C); the first row has the smallest y. The images are (rows, columns, 3) uint8 RGB;
+        their first row has the largest y.
+        """
+        self.waiting.append((stamp, features))
+        return [] if self.colors is None and len(self.waiting) < FITTED_ON else self.finish()
+
+    def finish(self) -> list[tuple[Any, NDArray[np.uint8]]]:
+        """The images that are not returned yet: that of the first frame, where there was no second one."""
+        if not self.waiting:
+            return []
+        if self.colors is None:
+            cells = [features.reshape(-1, features.shape[-1]) for _, features in self.waiting]
+            thinned = [of_frame[:: max(1, len(of_frame) // CELLS_FOR_FIT)] for of_frame in cells]
+            self.colors = fit_colors(self.kind, np.concatenate(thinned))
+        colors = self.colors
+        ready = [(stamp, np.ascontiguousarray(colors.paint(features)[::-1])) for stamp, features in self.waiting]
+        self.waiting = []
+        return ready
+
+
+def _values(features: Features, mean: Features, basis: Features | None) -> Features:
+    if basis is None:
+        return np.asarray(np.linalg.norm(features, axis=-1, keepdims=True), dtype=np.float32)
+    return np.asarray((features - mean) @ basis, dtype=np.float32)
+
+
+def log_flat_image(
+    stream: rr.RecordingStream, entity: str, image: NDArray[np.uint8], ranges: Ranges, draw_order: float
+) -> None:
+    """Writes an image of the ground into the BEV view.
+
+    image: (rows, columns, 3) RGB; the first row has the largest y.
+    """
+    (rows, columns, _), ((left, right), (low, high)) = image.shape, ranges
+    cell = ((right - left) / columns, (high - low) / rows, 1.0)
+    placed = components(rr.Transform3D, translation=(left, -high, 0), scale=cell)
+    pixels = components(rr.Image, buffer=image.reshape(-1), format=rgb_format(columns, rows), draw_order=draw_order)
+    log(stream, entity, pixels | placed)
+
+
+def log_on_ground(
+    stream: rr.RecordingStream, entity: str, image: NDArray[np.uint8], ranges: Ranges, ego_from_bev: Array, opacity: int
+) -> None:
+    """Writes an image of the ground, as in `log_flat_image`, as a rectangle in the scene."""
+    corners = apply(ego_from_bev, rectangle(*ranges))
+    corners[:, 2] = -BELOW_GROUND_M
+    quad = components(
+        rr.Mesh3D,
+        vertex_positions=corners,
+        triangle_indices=((0, 1, 2), (0, 2, 3)),
+        vertex_texcoords=((0, 1), (1, 1), (1, 0), (0, 0)),
+        albedo_texture_buffer=image.reshape(-1),
+        albedo_texture_format=rgb_format(image.shape[1], image.shape[0]),
+        albedo_factor=(255, 255, 255, opacity),
+    )
+    log(stream, entity, quad)
+
+
+def log_probes(stream: rr.RecordingStream, probes: Sequence[Probe], ego_from_bev: Array, grid: BevGrid) -> None:
+    """Marks the probed cells: with a dot in the BEV view, and with a pillar in the scene."""
+    centers = np.array([probe.cell_center for probe in probes])
+    dots = components(rr.Points2D, positions=centers * (1, -1), colors=PROBE_COLOR, radii=ui_points(5.0), draw_order=50)
+    log(stream, entities.BEV_PROBES, dots)
+    low, high = grid.pillar_heights()[[0, -1]]
+    ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
+    strips = apply(ego_from_bev, ends).astype(np.float32)
+    stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=PROBE_COLOR, radii=0.05))
+
+
+def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
+    """The futures of boxes in the recording's world: colours by class, opaque by score of the mode, faded in time."""
+    if boxes.futures is None or not len(boxes):
+        return GroundLines()
+    feet = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2
+    places = np.concatenate([np.broadcast_to(boxes.centers[:, None, None, :2], (*boxes.futures.shape[:2], 1, 2)),
+                             boxes.futures[..., 1:]], axis=2)  # (N, M, T + 1, 2)  # fmt: skip
+    heights = np.broadcast_to(feet[:, None, None, None], (*places.shape[:3], 1))
+    steps = np.concatenate([places, heights], axis=-1)
+    modes = np.ones(boxes.futures.shape[:2]) if boxes.future_scores is None else boxes.future_scores
+    share = modes / np.maximum(modes.max(1, keepdims=True), 1e-9)  # (N, M)
+    fading = np.linspace(1, 0.25, boxes.futures.shape[2])
+    strips, colors, of_class = [], [], log_boxes.box_colors(boxes, classes)
+    for box, mode, step in np.ndindex(*boxes.futures.shape[:3]):
+        piece = steps[box, mode, step : step + 2]
+        if np.isfinite(piece).all():
+            strips.append(piece)
+            colors.append((*map(int, of_class[box][:3]), round(FUTURES_OPACITY * fading[step] * share[box, mode])))
+    return GroundLines(strips, colors, FUTURES_WIDTH)
+
+
+def log_ground_lines(
+    stream: rr.RecordingStream, kind: str, lines: GroundLines, world_from_bev: Array, cameras: Sequence[PosedCamera]
+) -> None:
+    """Writes lines in the recording's world; without any, those of the frame before are cleared.
+
+    kind: last part of their entities.
+    """
+    colors = np.array(lines.colors, np.uint8) if len(lines.colors) else None
+    radii = ui_points(lines.width)
+    points, lengths = np.concatenate([np.zeros((0, 3)), *lines.strips]), list(map(len, lines.strips))
+    in_space = line_strips(points + ABOVE_GROUND, lengths)
+    solid = components(rr.LineStrips3D, strips=in_space, colors=colors, radii=radii)
+    log(stream, f"{entities.WORLD}/{kind}", solid)
+    flat = line_strips(apply(inverse(world_from_bev), points)[:, :2] * (1, -1), lengths)
+    from_above = components(rr.LineStrips2D, strips=flat, colors=colors, radii=radii, draw_order=24)
+    log(stream, f"{entities.BEV}/{kind}", from_above)
+    pieces = [np.stack([strip[:-1], strip[1:]], axis=1) for strip in lines.strips]
+    ends = np.concatenate([np.zeros((0, 2, 3)), *pieces])
+    owners = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    of_cameras = np.concatenate([apply(posed.camera_from_world, ends) for posed in cameras])
+    counts = np.full(len(cameras), len(ends))
+    parts = log_cameras.cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, cameras)
+    own_colors = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4)
+    for posed, visible in zip(cameras, parts, strict=True):
+        own = own_colors[visible.owners]
+        strips = components(rr.LineStrips2D, strips=visible.segments, colors=own, radii=radii, draw_order=15)
+        log(stream, entities.overlay(posed.camera.name, kind), strips)

@@ -3,8 +3,8 @@
 It finds misses and duplicates.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,22 +16,13 @@ from bevcli.evaluation.matching import DetectionConfig, ScoredBoxes, descending_
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
-from bevcli.recording.colors import (
-    DUPLICATE_COLOR,
-    EGO_COLOR,
-    FALSE_COLOR,
-    GROUND_TRUTH_COLOR,
-    MISSED_COLOR,
-    OTHER_COLOR,
-    Color,
-    index_color,
-)
-from bevcli.recording.components import Components, any_values, components, line_strips, ui_points
-from bevcli.recording.log_cameras import labels_in_scene
+from bevcli.recording.components import Components, any_values, components, line_strips, log, ui_points
 
 MATCH_DISTANCE_M = DetectionConfig.error_distance_m
+LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = ui_points(0.8), ui_points(1.6)
 PAST_S = 5.0  # length of a trail
@@ -103,43 +94,75 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
 
 def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
     """(N, 3) uint8 RGB: the colour of each box's class."""
-    other = index_color(len(classes))
+    other = entities.index_color(len(classes))
     return np.array([classes.get(name, other) for name in boxes.classes.tolist()], dtype=np.uint8).reshape(-1, 3)
 
 
 def log_boxes_3d(
-    stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color], ego_xy: Array
+    stream: rr.RecordingStream,
+    boxes: Boxes3D,
+    corners: Array,
+    marks: Marks,
+    classes: Mapping[str, Color],
+    labels: list[str],
 ) -> None:
     """Writes predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
 
-    boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
+    boxes: N in the recording's world. corners: (N, 8, 3) of these. labels: of the N boxes, "" for none.
     """
     ids_of_classes = {name: index for index, name in enumerate(classes, 1)}
     ids = np.array([ids_of_classes.get(name, 0) for name in boxes.classes.tolist()])
-    labels = labels_in_scene(boxes, ego_xy)
-    row = components(rr.Boxes3D, **_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
-    scored = boxes if boxes.scores is not None else replace(boxes, scores=np.ones(len(boxes)))
-    columns = {column.recorded: getattr(scored, name) for name, column in OPTIONAL_COLUMNS.items() if column.recorded}
+    row = _solid(boxes, class_ids=ids, labels=labels, show_labels=True, radii=THICK)
+    columns = {column.recorded: getattr(boxes, name) for name, column in OPTIONAL_COLUMNS.items() if column.recorded}
+    if boxes.scores is None:
+        columns[OPTIONAL_COLUMNS["scores"].recorded] = np.ones(len(boxes))
     facts = any_values(
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
-        name=_texts(boxes.classes),
-        **{
-            name: _texts(values) if values.dtype.kind == "U" else values
-            for name, values in columns.items()
-            if values is not None
-        },
+        name=boxes.classes,
+        **{name: values for name, values in columns.items() if values is not None},
     )
-    stream.log(entities.BOXES, row, facts)
-    moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
-    vectors, colors = np.column_stack([moving.velocities, np.zeros(len(moving))]), box_colors(moving, classes)
-    arrows = components(rr.Arrows3D, vectors=vectors, origins=moving.centers, colors=colors, radii=ui_points(1.2))
-    stream.log(entities.VELOCITY, arrows)
-    for entity, strips, color in zip((entities.FALSE_BOXES, entities.DUPLICATES), *_marks(boxes, marks), strict=True):
-        stream.log(entity, components(rr.LineStrips3D, strips=strips, colors=color, radii=THICK))
+    log(stream, entities.BOXES, row | facts)
+    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
+    arrows = components(
+        rr.Arrows3D,
+        vectors=np.pad(boxes.velocities[moving], ((0, 0), (0, 1))),
+        origins=boxes.centers[moving],
+        colors=box_colors(boxes, classes)[moving],
+        radii=ui_points(1.2),
+    )
+    log(stream, entities.VELOCITY, arrows)
+    for entity, (strips, color) in zip(
+        (entities.FALSE_BOXES, entities.DUPLICATES), _marks(corners, marks), strict=True
+    ):
+        log(stream, entity, components(rr.LineStrips3D, strips=strips, colors=color, radii=THICK))
 
 
-def other_classes(truth: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
+def log_boxes_bev(
+    stream: rr.RecordingStream, boxes: Boxes3D, corners: Array, marks: Marks, colors: NDArray[np.uint8]
+) -> None:
+    """Writes predicted boxes into the BEV view. boxes: N in the bev frame. corners: (N, 8, 3). colors: (N, 3)."""
+    doubled = np.concatenate([colors, colors])
+    outlines = components(rr.LineStrips2D, strips=footprints(corners), colors=doubled, radii=THICK, draw_order=30)
+    log(stream, entities.BEV_BOXES, outlines)
+    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
+    arrows = components(
+        rr.Arrows2D,
+        vectors=boxes.velocities[moving] * (1, -1),
+        origins=boxes.centers[moving, :2] * (1, -1),
+        colors=colors[moving],
+        radii=ui_points(1.0),
+        draw_order=31,
+    )
+    log(stream, entities.BEV_VELOCITY, arrows)
+    for entity, (strips, color) in zip(
+        (entities.BEV_FALSE, entities.BEV_DUPLICATES), _marks(corners, marks), strict=True
+    ):
+        flat = (strips[..., :2] * (1, -1)).astype(np.float32)
+        log(stream, entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
+
+
+def other_classes(truth: Boxes3D, classes: Iterable[str]) -> np.ndarray:
     """(M,) bool, ground-truth boxes of classes that the model does not have: they are never missed."""
     return ~np.isin(truth.classes, list(classes))
 
@@ -149,63 +172,52 @@ def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
 
     found: (M,) bool. other: (M,) bool, classes that are not among the model's.
     """
-    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR)
-    return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
-
-
-def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
-    """Writes predicted boxes (in the bev frame) into the BEV view."""
-    colors = box_colors(boxes, classes)
-    doubled = np.concatenate([colors, colors])
-    outlines = components(rr.LineStrips2D, strips=footprints(boxes), colors=doubled, radii=THICK, draw_order=30)
-    stream.log(entities.BEV_BOXES, outlines)
-    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
-    vectors, origins = boxes.velocities[moving] * (1, -1), boxes.centers[moving, :2] * (1, -1)
-    radius = ui_points(1.0)
-    arrows = components(
-        rr.Arrows2D, vectors=vectors, origins=origins, colors=colors[moving], radii=radius, draw_order=31
-    )
-    stream.log(entities.BEV_VELOCITY, arrows)
-    for entity, strips, color in zip((entities.BEV_FALSE, entities.BEV_DUPLICATES), *_marks(boxes, marks), strict=True):
-        flat = (strips[..., :2] * (1, -1)).astype(np.float32)
-        stream.log(entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
+    colors = np.where(found[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
+    return np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
 def log_ground_truth(
-    stream: rr.RecordingStream, in_world: Boxes3D, in_bev: Boxes3D, found: np.ndarray, colors: np.ndarray
+    stream: rr.RecordingStream, in_world: Boxes3D, corners_bev: Array, found: np.ndarray, colors: np.ndarray
 ) -> None:
     """Writes ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
 
-    in_world, in_bev: in the recording's world, and in the bev frame. found: (M,) bool. colors: (M, 3) uint8.
+    in_world: M in the recording's world. corners_bev: (M, 8, 3) in the bev frame. found: (M,) bool. colors: (M, 3)
+    uint8.
     """
-    pale = _with_alpha(colors[found], 150)
-    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
-        row = components(rr.Boxes3D, **_shape(in_world[chosen]), colors=color, radii=THIN)
-        stream.log(entity, row, any_values(name=_texts(in_world.classes[chosen])))
+    pale = np.insert(colors[found], 3, 150, axis=1)
+    for entity, chosen, color in (
+        (entities.GROUND_TRUTH, found, pale),
+        (entities.MISSED, ~found, entities.MISSED_COLOR),
+    ):
+        boxes = in_world[chosen]
+        log(stream, entity, _solid(boxes, colors=color, radii=THIN) | any_values(name=boxes.classes))
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
-        doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = footprints(in_bev[chosen])
-        stream.log(entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
+        doubled = np.tile(np.insert(colors[chosen], 3, 200, axis=1), (2, 1))
+        strips = footprints(corners_bev[chosen])
+        log(stream, entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
-def _with_alpha(colors: np.ndarray, alpha: int) -> np.ndarray:
-    return np.column_stack([colors, np.full(len(colors), alpha, dtype=np.uint8)])
-
-
-def footprints(boxes: Boxes3D) -> pa.Array:
+def footprints(corners: Array) -> pa.Array:
     """Boxes of the bev frame in the flat BEV image (x to the right, -y down, metres).
 
-    N closed outlines, then N lines from the centre to the front.
+    corners: (N, 8, 3). Returns N closed outlines, then N lines from the centre to the front.
     """
-    ground = boxes.corners()[:, :4, :2] * (1, -1)
-    outlines = np.concatenate([ground, ground[:, :1]], axis=1)
-    front = (ground[:, 0] + ground[:, 3]) / 2
-    return line_strips([*outlines, *np.stack([ground.mean(1), front], axis=1)], 2)
+    ground = corners[:, :4, :2] * (1, -1)
+    outlines = ground[:, [0, 1, 2, 3, 0]].reshape(-1, 2)
+    directions = np.stack([ground.mean(1), (ground[:, 0] + ground[:, 3]) / 2], axis=1).reshape(-1, 2)
+    return line_strips(np.concatenate([outlines, directions]), [5] * len(ground) + [2] * len(ground))
 
 
-def _shape(boxes: Boxes3D) -> dict[str, Any]:
-    shape = {"centers": boxes.centers, "half_sizes": boxes.sizes_lwh / 2, "quaternions": quaternions(boxes)}
-    return {**shape, "fill_mode": "majorwireframe"}
+def _solid(boxes: Boxes3D, **fields: Any) -> Components:
+    """Boxes of the scene. fields: further ones of `rr.Boxes3D`."""
+    return components(
+        rr.Boxes3D,
+        centers=boxes.centers,
+        half_sizes=boxes.sizes_lwh / 2,
+        quaternions=quaternions(boxes),
+        fill_mode="majorwireframe",
+        **fields,
+    )
 
 
 def quaternions(boxes: Boxes3D) -> Array:
@@ -214,14 +226,23 @@ def quaternions(boxes: Boxes3D) -> Array:
     return np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)
 
 
-def _texts(values: NDArray[np.str_]) -> pa.Array:
-    return pa.array(values.tolist(), pa.utf8())  # typed, so that an empty list is a value too
+def _marks(corners: Array, marks: Marks) -> list[tuple[NDArray[np.float32], Color]]:
+    """The diagonals (K, 2, 3) of top faces, and their colour: two of each false positive, one of each duplicate."""
+    diagonals = corners[:, 4:][:, [[0, 2], [1, 3]]].astype(np.float32)  # (N, 2, 2, 3)
+    false = diagonals[marks.false].reshape(-1, 2, 3)
+    return [(false, entities.FALSE_COLOR), (diagonals[marks.duplicate, 0], entities.DUPLICATE_COLOR)]
 
 
-def _marks(boxes: Boxes3D, marks: Marks) -> tuple[tuple[NDArray[np.float32], ...], tuple[Color, ...]]:
-    """The diagonals (K, 2, 3) of the top faces, and their colour: two of a false positive, one of a duplicate."""
-    diagonals = boxes.corners()[:, 4:][:, [[0, 2], [1, 3]]].astype(np.float32)  # (N, 2, 2, 3)
-    return (diagonals[marks.false].reshape(-1, 2, 3), diagonals[marks.duplicate, 0]), (FALSE_COLOR, DUPLICATE_COLOR)
+def log_class_mesh(stream: rr.RecordingStream, name: str, boxes: Boxes3D) -> None:
+    """Writes where the mesh of a class stands: one in each box of the class. boxes: in the recording's world."""
+    # The last one has no size: an entity without poses would show its mesh at the origin.
+    poses = components(
+        rr.InstancePoses3D,
+        translations=np.append(boxes.centers, [[0, 0, 0]], axis=0),
+        quaternions=np.append(quaternions(boxes), [[0, 0, 0, 1]], axis=0),
+        scales=np.append(boxes.sizes_lwh, [[0, 0, 0]], axis=0),
+    )
+    log(stream, entities.class_mesh(name), poses)
 
 
 def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, before: Array | None) -> None:
@@ -230,18 +251,18 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
     here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
     """
     place = origin.latitude_longitude(here)
-    stream.log(entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=EGO_COLOR))
+    stream.log(
+        entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
+    )
     if before is not None:
         way = [origin.latitude_longitude(before), place]
-        line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=EGO_COLOR)
+        line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=entities.EGO_COLOR)
         stream.log(entities.MAP_ROUTE, line)
 
 
-def log_boxes_on_map(
-    stream: rr.RecordingStream, origin: GeoOrigin, boxes: Boxes3D, classes: Mapping[str, Color]
-) -> None:
-    """Writes the centres of boxes, in the sequence's world frame, in the colours of their classes."""
-    places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, classes) if len(boxes) else None
+def log_boxes_on_map(stream: rr.RecordingStream, origin: GeoOrigin, centers: Array, colors: np.ndarray | None) -> None:
+    """Writes the centres (N, 3) of boxes in the sequence's world frame. colors: (N, 3) uint8, None for no boxes."""
+    places = origin.latitude_longitude(centers)
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))
 
 
@@ -261,16 +282,14 @@ class TrackHistory:
     positions: dict[str, list[Array]] = field(default_factory=dict)
     shown: list[str] = field(default_factory=list)
 
-    def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
-        """Adds the boxes of a frame, in the recording's world, with instances; forgets what is too old."""
+    def add(self, identities: list[str], feet: Array, stamp: FrameStamp) -> None:
+        """Adds the positions of T tracks, and forgets what is too old. feet: (T, 3), in the recording's world."""
         if stamp.scene != self.scene:
             self.times_ns, self.positions = {}, {}
         self.scene = stamp.scene
-        assert boxes.instances is not None
-        for name, foot in zip(boxes.instances.tolist(), _feet(boxes), strict=True):
-            if name:
-                self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
-                self.positions.setdefault(name, []).append(foot)
+        for name, foot in zip(identities, feet, strict=True):
+            self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
+            self.positions.setdefault(name, []).append(foot)
         for name, times in list(self.times_ns.items()):
             kept = sum(stamp.timestamp_ns - time <= PAST_S * 1e9 for time in times)
             self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
@@ -282,53 +301,55 @@ def log_tracks(
     stream: rr.RecordingStream,
     history: TrackHistory,
     boxes: Boxes3D,
+    corners: Array,
+    colors: NDArray[np.uint8],
     stamp: FrameStamp,
     bev_from_world: Array,
-    classes: Mapping[str, Color],
 ) -> None:
     """Writes the tracks of a frame, and clears the entities of tracks without a box. Without tracks: nothing.
 
-    history: gets the boxes. boxes: in the recording's world. bev_from_world: (4, 4).
+    history: gets the boxes. boxes: N in the recording's world. corners: (N, 8, 3). colors: (N, 3). bev_from_world:
+    (4, 4).
     """
     if boxes.instances is None:
         return
     # Anew in each scene: the times of a scene may lie before those of the one before.
     styled = history.shown if stamp.scene == history.scene else []
-    history.add(boxes, stamp)
-    feet, colors = _feet(boxes), box_colors(boxes, classes)
-    steps = np.column_stack([np.nan_to_num(boxes.velocities), np.zeros(len(boxes))]) * AHEAD_S
-    ahead = np.stack([feet, feet + steps], axis=1)  # (N, 2, 3) to where each will be a second later
-    bottoms = boxes.corners()[:, :4] + [0, 0, ABOVE_GROUND_M]
-    outlines = np.concatenate([bottoms, bottoms[:, :1]], axis=1)  # (N, 5, 3) closed
+    tracked = boxes.instances != ""
+    identities, classes = boxes.instances[tracked].tolist(), boxes.classes[tracked].tolist()
+    centers, velocities = boxes.centers[tracked], np.nan_to_num(boxes.velocities[tracked])
+    feet = np.column_stack([centers[:, :2], centers[:, 2] - boxes.sizes_lwh[tracked, 2] / 2 + ABOVE_GROUND_M])
+    history.add(identities, feet, stamp)
+    feet_later = feet + np.column_stack([velocities, np.zeros(len(feet))]) * AHEAD_S
+    ahead = np.stack([feet, feet_later], axis=1)  # (T, 2, 3)
+    outlines = corners[tracked][:, [0, 1, 2, 3, 0]] + [0, 0, ABOVE_GROUND_M]  # (T, 5, 3) closed
+    pasts = [history.positions[name] for name in identities]
+    trails = [np.array(past if len(past) > 1 else []).reshape(-1, 3) for past in pasts]  # (K, 3) each
+    no_points = np.zeros((0, 3))
+    points = [part for of_track in zip(ahead, outlines, trails, strict=True) for part in of_track]
+    lengths = [length for trail in trails for length in (2, 5, len(trail)) if length]
+    of_tracks, start = line_strips(np.concatenate([no_points, *points]), lengths), 0
     shown: set[str] = set()
-    drawn, flat_colors = [], []
-    for i, name in enumerate(boxes.instances.tolist()):
-        if not name:
-            continue
-        entity = entities.track(str(boxes.classes[i]), name)
-        past = np.array(history.positions[name])  # (K, 3)
-        trail = [past] if len(past) > 1 else []
-        own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
-        style: Components = []
+    flat_colors: list[tuple[int, ...]] = []
+    for name, class_name, color, trail in zip(identities, classes, colors[tracked].tolist(), trails, strict=True):
+        count = 3 if len(trail) else 2
+        entity = entities.track(class_name, name)
+        row = components(rr.LineStrips3D, strips=of_tracks.slice(start, count))
+        own_colors = [(*color, opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
-            of_lines = components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
-            style = of_lines + any_values(track=name)
-        strips = line_strips([ahead[i], outlines[i], *trail], 3)
-        stream.log(entity, components(rr.LineStrips3D, strips=strips) + style)
+            row |= components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
+            row |= any_values(track=name)
+        log(stream, entity, row)
         shown.add(entity)
-        drawn += [ahead[i], *trail]
-        flat_colors += own_colors[:: 2 if trail else 3]
+        start += count
+        flat_colors += own_colors[: count - 1]
+    points = [part for of_track in zip(ahead, trails, strict=True) for part in of_track]
+    flat = apply(bev_from_world, np.concatenate([no_points, *points]))[:, :2] * (1, -1)
+    lengths = [length for trail in trails for length in (2, len(trail)) if length]
     of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
-    flat = apply(bev_from_world, np.concatenate([np.zeros((0, 3)), *drawn]))[:, :2] * (1, -1)
-    strips = line_strips(np.split(flat, np.cumsum([len(strip) for strip in drawn])[:-1]) if drawn else (), 2)
-    trails = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
-    stream.log(entities.BEV_TRACKS, trails)
+    strips = line_strips(flat, lengths)
+    of_bev = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
+    log(stream, entities.BEV_TRACKS, of_bev)
     for entity in set(history.shown) - shown:
         stream.log(entity, rr.Clear(recursive=False))
     history.shown = sorted(shown)
-
-
-def _feet(boxes: Boxes3D) -> Array:
-    """(N, 3) the points on the ground below the centres."""
-    heights = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2 + ABOVE_GROUND_M
-    return np.column_stack([boxes.centers[:, :2], heights])

@@ -2,9 +2,8 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 import cv2
@@ -15,16 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.frame import CameraImage, CameraSamples
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
-from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.colors import colormap
-from bevcli.recording.components import Components, blob, components, ui_points
+from bevcli.recording.components import Components, components, log, ui_points
 
 NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
-LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 # Of the image's width and height, for a view that is a third of the screen wide.
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
@@ -34,6 +31,21 @@ POINT = ui_points(2.0)
 AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
 AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
 KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
+
+
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera with its pose at the time of its image.
+
+    Attributes:
+        camera: name, intrinsics and distortion.
+        world_from_camera: (4, 4) into the recording's world.
+        camera_from_world: (4, 4), its inverse.
+    """
+
+    camera: Camera
+    world_from_camera: Array
+    camera_from_world: Array
 
 
 @dataclass(frozen=True)
@@ -49,21 +61,33 @@ class ImageLines:
     owners: NDArray[np.int64]
 
 
-def lines_in_images(boxes: Boxes3D, cameras: Sequence[Camera], cameras_from_boxes: Sequence[Array]) -> list[ImageLines]:
+def lines_in_images(corners: Array, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
     """The edges and the front diagonals of boxes in the images of C cameras, cut to the parts inside the images.
 
-    cameras_from_boxes: (4, 4) each, from the boxes' frame to the camera frame at the image's time.
+    corners: (N, 8, 3) of the boxes in the recording's world.
     """
-    corners = boxes.corners()
-    of_cameras = np.stack([apply(camera_from_boxes, corners) for camera_from_boxes in cameras_from_boxes])
-    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1))
+    of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])
+    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1) & ~_are_beside(of_cameras, cameras))
     edges = of_cameras[camera, before][:, _EDGES]  # (K, 14, 2, 3)
     counts = np.bincount(camera, minlength=len(cameras)) * len(_EDGES)
     return cut_to_images(edges.reshape(-1, 2, 3), np.repeat(before, len(_EDGES)), counts, cameras)
 
 
+def _are_beside(corners: Array, cameras: Sequence[PosedCamera]) -> NDArray[np.bool_]:
+    """(C, N) bool: boxes that project to one side of the image as a whole, by a pixel at least; never with distortion.
+
+    corners: (C, N, 8, 3) in the frame of each camera. A side of the image is a plane through the camera.
+    """
+    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
+    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
+    pixels, depth = corners @ intrinsics[:, None], corners[..., 2:]  # pixels times depth, (C, N, 8, 2)
+    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
+    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
+    return beside.any(-1) & is_straight[:, None]
+
+
 def cut_to_images(
-    ends: Array, owners: NDArray[np.int64], counts: NDArray[np.int64], cameras: Sequence[Camera]
+    ends: Array, owners: NDArray[np.int64], counts: NDArray[np.int64], cameras: Sequence[PosedCamera]
 ) -> list[ImageLines]:
     """The parts inside the images of lines (M, 2, 3) with their owners (M,).
 
@@ -73,13 +97,14 @@ def cut_to_images(
     own_counts = np.bincount(np.repeat(np.arange(len(cameras)), counts)[kept], minlength=len(cameras))
     ends_of_cameras = np.cumsum(own_counts)[:-1]
     own_ends, own_owners = np.split(ends[kept], ends_of_cameras), np.split(owners[kept], ends_of_cameras)
-    for i, camera in enumerate(cameras):
-        if camera.distortion is not None:
+    for i, posed in enumerate(cameras):
+        if posed.camera.distortion is not None:
             own_ends[i], own_owners[i] = _cut(own_ends[i]), np.repeat(own_owners[i], PIECES_PER_EDGE)
-    pixels = [camera.project(own)[0] for camera, own in zip(cameras, own_ends, strict=True)]
-    sizes = np.repeat([(camera.width, camera.height) for camera in cameras], [len(own) for own in pixels], axis=0)
+    pixels = [posed.camera.project(own)[0] for posed, own in zip(cameras, own_ends, strict=True)]
+    lengths = [len(own) for own in pixels]
+    sizes = np.repeat([(posed.camera.width, posed.camera.height) for posed in cameras], lengths, axis=0)
     segments, inside = clip_to_image(np.concatenate(pixels), *sizes.T)
-    ends_of_cameras = np.cumsum([len(own) for own in pixels])[:-1]
+    ends_of_cameras = np.cumsum(lengths)[:-1]
     parts = zip(*(np.split(whole, ends_of_cameras) for whole in (segments, inside)), own_owners, strict=True)
     return [ImageLines(own[shown], owner[shown]) for own, shown, owner in parts]
 
@@ -100,14 +125,15 @@ def clip_to_image(segments: Array, width: ArrayLike, height: ArrayLike) -> tuple
     A line whose start or end is NaN counts as outside. width, height: of the image, or (M,) of the image of each line.
     """
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
-    slope = np.concatenate([-step, step], axis=-1)  # (M, 4): against left, top, right, bottom
-    room = np.concatenate([start, np.stack([width, height], axis=-1) - start], axis=-1)
+    (x, y), (x_step, y_step) = start.T, step.T
+    slope = np.stack([-x_step, -y_step, x_step, y_step])  # (4, M): against left, top, right, bottom
+    room = np.stack([x, y, width - x, height - y])
     with np.errstate(divide="ignore", invalid="ignore"):
         share = room / slope
-    enter = np.max(np.where(slope < 0, share, 0.0), axis=-1, initial=0.0)
-    leave = np.min(np.where(slope > 0, share, 1.0), axis=-1, initial=1.0)
-    outside = ((slope == 0) & (room < 0)).any(-1)
-    kept = (enter < leave) & ~outside & np.isfinite(segments).all((-1, -2))
+    enter = np.max(np.where(slope < 0, share, 0.0), axis=0, initial=0.0)
+    leave = np.min(np.where(slope > 0, share, 1.0), axis=0, initial=1.0)
+    outside = ((slope == 0) & (room < 0)).any(0)
+    kept = (enter < leave) & ~outside & np.isfinite(slope).all(0) & np.isfinite(room).all(0)
     shares = np.stack([enter, leave], axis=-1)
     return start[:, None] + shares[..., None] * step[:, None], kept
 
@@ -135,13 +161,6 @@ def box_labels(boxes: Boxes3D) -> list[str]:
     return [f"{text} {score:.2f}" for text, score in zip(texts, boxes.scores, strict=True)]
 
 
-def labels_in_scene(boxes: Boxes3D, ego_xy: Array) -> list[str]:
-    """Labels for the boxes nearest to ego_xy (2,), "" for the others. boxes: in the same frame, metres."""
-    away = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=-1)
-    near = set(np.argsort(away)[:LABELS_IN_SCENE].tolist())
-    return [text if i in near else "" for i, text in enumerate(box_labels(boxes))]
-
-
 def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int) -> tuple[Array, NDArray[np.int64]]:
     """Positions of labels above their boxes. The largest boxes are labelled first; no label covers another.
 
@@ -150,8 +169,9 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
     Returns the centres of the labels (L, 2), pixels, and the boxes (L,) that they belong to.
     """
     boxes, first = np.unique(lines.owners, return_index=True)  # the lines of a box follow each other
-    lows = np.minimum.reduceat(lines.segments.min(1), first) if len(first) else ()
-    highs = np.maximum.reduceat(lines.segments.max(1), first) if len(first) else ()
+    ends = lines.segments.reshape(-1, 2)
+    lows = np.minimum.reduceat(ends, 2 * first).tolist() if len(first) else ()
+    highs = np.maximum.reduceat(ends, 2 * first).tolist() if len(first) else ()
     rectangles = zip(boxes.tolist(), lows, highs, strict=True)
     taken: list[tuple[float, float, float, float]] = []
     centers, owners = [], []
@@ -159,36 +179,13 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
         if high[1] - low[1] < LOWEST_LABELLED * height:
             break
         half = len(texts[owner]) * LETTER_WIDTH * width / 2
-        middle = float(np.clip((low[0] + high[0]) / 2, half, width - half))
+        middle = min(max((low[0] + high[0]) / 2, half), width - half)
         left, top, right, bottom = middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1]
         if not any(left < other[2] and other[0] < right and top < other[3] and other[1] < bottom for other in taken):
             taken.append((left, top, right, bottom))
             centers.append((middle, low[1] - LETTER_HEIGHT * height / 2))
             owners.append(owner)
     return np.array(centers).reshape(-1, 2), np.array(owners, dtype=np.int64)
-
-
-@dataclass(frozen=True)
-class PosedCamera:
-    """A camera with its pose at the time of its image.
-
-    Attributes:
-        camera: name, intrinsics and distortion.
-        world_from_camera: (4, 4) into the recording's world.
-    """
-
-    camera: Camera
-    world_from_camera: Array
-
-    @property
-    def name(self) -> str:
-        """The camera's name."""
-        return self.camera.name
-
-    @cached_property
-    def camera_from_world(self) -> Array:
-        """(4, 4) from the recording's world."""
-        return inverse(self.world_from_camera)
 
 
 def transform(parent_from_entity: Array) -> Components:
@@ -235,73 +232,64 @@ class Av1Encoder:
         self._context.encode(None)
 
 
+@dataclass
 class CameraImages:
     """Writes the images of all cameras. as_video: AV1, in place of the bytes of the image files."""
 
-    def __init__(self, stream: rr.RecordingStream, *, as_video: bool) -> None:
-        self._stream, self._as_video = stream, as_video
-        self._encoders: dict[str, Av1Encoder] = {}
+    stream: rr.RecordingStream
+    as_video: bool
+    encoders: dict[str, Av1Encoder] = field(default_factory=dict)
 
     def log(self, camera: str, image: CameraImage | None) -> None:
         """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
-        if image is not None:
-            if not self._as_video:
-                self._stream.log(entities.image(camera), _encoded(image))
-                return
-            if camera not in self._encoders:
+        entity = entities.image(camera)
+        if image is None:
+            self.stream.log(entity, rr.Clear(recursive=False))
+            if camera in self.encoders:
+                self.encoders.pop(camera).close()
+        elif self.as_video:
+            if camera not in self.encoders:
                 height, width = image.pixels_bgr.shape[:2]
-                self._encoders[camera] = Av1Encoder(width, height)
-            data, is_keyframe = self._encoders[camera].encode(image.pixels_bgr)
-            sample = rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe)
-            self._stream.log(entities.image(camera), sample)
-            return
-        self._stream.log(entities.image(camera), rr.Clear(recursive=False))
-        if camera in self._encoders:
-            self._encoders.pop(camera).close()
-
-    def close(self) -> None:
-        """Ends all video streams."""
-        for encoder in self._encoders.values():
-            encoder.close()
-
-
-def _encoded(image: CameraImage) -> Components:
-    contents, media_type = image.encoded, image.media_type
-    if contents is None or media_type is None:
-        _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        contents, media_type = data.tobytes(), "image/jpeg"
-    return components(rr.EncodedImage, blob=blob(contents), media_type=media_type)
+                self.encoders[camera] = Av1Encoder(width, height)
+            data, is_keyframe = self.encoders[camera].encode(image.pixels_bgr)
+            self.stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe))
+        else:
+            contents, media_type = image.encoded, image.media_type
+            if contents is None or media_type is None:
+                _, jpeg = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                contents, media_type = jpeg.tobytes(), "image/jpeg"
+            file = np.frombuffer(contents, np.uint8)
+            log(self.stream, entity, components(rr.EncodedImage, blob=file, media_type=media_type))
 
 
 def log_boxes_in_images(
-    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], boxes: Boxes3D, colors: np.ndarray, texts: list[str]
+    stream: rr.RecordingStream,
+    cameras: Sequence[PosedCamera],
+    corners: Array,
+    colors: NDArray[np.uint8],
+    texts: list[str],
+    truth: tuple[Array, NDArray[np.uint8]] | None,
 ) -> None:
-    """Draws predicted boxes (in the recording's world) into the images: lines and labels.
+    """Draws predicted boxes with labels, and ground-truth boxes, into the images.
 
-    colors: (N, 3) uint8. texts: the label of each box.
+    corners: (N, 8, 3) in the recording's world. colors: (N, 3). texts: N labels. truth: corners (M, 8, 3) and colours
+    (M, 3) of ground-truth boxes; None without ground truth.
     """
-    for posed, lines in zip(cameras, _lines_of(boxes, cameras), strict=True):
-        stream.log(entities.overlay(posed.name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-        positions, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
+    true_corners, true_colors = (corners[:0], colors[:0]) if truth is None else truth
+    all_corners, all_colors = np.concatenate([corners, true_corners]), np.concatenate([colors, true_colors])
+    for posed, lines in zip(cameras, lines_in_images(all_corners, cameras), strict=True):
+        camera, count = posed.camera, int(np.searchsorted(lines.owners, len(corners)))
+        parts = [("boxes", slice(0, count), 1.0, 30)]
+        if truth is not None:
+            parts.append(("ground_truth", slice(count, None), 0.6, 20))
+        for kind, part, width, order in parts:
+            segments, own, radii = lines.segments[part], all_colors[lines.owners[part]], ui_points(width)
+            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=order)
+            log(stream, entities.overlay(camera.name, kind), strips)
+        predicted = ImageLines(lines.segments[:count], lines.owners[:count])
+        positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
         labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-        stream.log(entities.overlay(posed.name, "boxes/labels"), labels)
-
-
-def log_ground_truth_in_images(
-    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], truth: Boxes3D, colors: np.ndarray
-) -> None:
-    """Draws ground-truth boxes (in the recording's world) into the images. colors: (M, 3) uint8."""
-    for posed, lines in zip(cameras, _lines_of(truth, cameras), strict=True):
-        stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
-
-
-def _lines_of(boxes: Boxes3D, cameras: Sequence[PosedCamera]) -> list[ImageLines]:
-    return lines_in_images(boxes, [posed.camera for posed in cameras], [posed.camera_from_world for posed in cameras])
-
-
-def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> Components:
-    own, radii = colors[lines.owners], ui_points(width)
-    return components(rr.LineStrips2D, strips=lines.segments, colors=own, radii=radii, draw_order=draw_order)
+        log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
@@ -309,10 +297,12 @@ def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world
 
     points_world: (K, 3) in the recording's world, metres. colors: (K,) of `packed`.
     """
-    pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
+    points = apply(posed.camera_from_world, points_world)
+    ahead = points[:, 2] > 0
+    pixels, depth = posed.camera.project(points[ahead])
     hits = posed.camera.contains(pixels, depth)
-    points = components(rr.Points2D, positions=pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
-    stream.log(entities.overlay(posed.name, "pillars"), points)
+    row = components(rr.Points2D, positions=pixels[hits], colors=colors[ahead][hits], radii=POINT, draw_order=10)
+    log(stream, entities.overlay(posed.camera.name, "pillars"), row)
 
 
 def log_samples(stream: rr.RecordingStream, posed: PosedCamera, samples: Sequence[CameraSamples]) -> None:
@@ -321,6 +311,6 @@ def log_samples(stream: rr.RecordingStream, posed: PosedCamera, samples: Sequenc
     weights = np.concatenate([np.zeros(0), *(s.weights for s in samples)])
     inside = posed.camera.contains(pixels, np.ones(len(pixels)))
     shares = weights[inside] / max(float(weights.max(initial=0.0)), 1e-9)
-    colors, radii = colormap(0.25 + 0.75 * shares, "plasma"), rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares))
+    colors, radii = entities.colormap(0.25 + 0.75 * shares, "plasma"), rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares))
     points = rr.Points2D(pixels[inside], colors=colors, radii=radii, draw_order=40)
-    stream.log(entities.overlay(posed.name, "probes"), points)
+    stream.log(entities.overlay(posed.camera.name, "probes"), points)

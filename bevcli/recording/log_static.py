@@ -1,11 +1,11 @@
-"""What is recorded, and the static parts: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
+"""The rows that are written once: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import rerun as rr
@@ -15,27 +15,13 @@ from bevcli._version import __version__
 from bevcli.frame import DriveFacts, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.object_classes import hex_of_color
+from bevcli.geometry.object_classes import Color, hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
 from bevcli.recording import entities
-from bevcli.recording.colors import (
-    DUPLICATE_COLOR,
-    EGO_COLOR,
-    GROUND_TRUTH_COLOR,
-    MISSED_COLOR,
-    RING_COLOR,
-    STAGE_COLORS,
-    Color,
-    class_colors,
-    colormap,
-    map_colors,
-)
-from bevcli.recording.components import components, packed
-from bevcli.recording.log_cameras import UNSEEN, labels_2d
-from bevcli.recording.mesh_file import Mesh
-from bevcli.recording.meshes import VehicleMesh, default_vehicle
+from bevcli.recording.components import log, packed
+from bevcli.recording.log_cameras import labels_2d
 from bevcli.recording.options import RecordingOptions
 
 UNTRAINED = "untrained weights"
@@ -47,7 +33,6 @@ WARNINGS = {
 RING_STEP_M = 10
 DEFAULT_RANGE_M = 50.0  # of the range rings without a model
 FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
-SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
 PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
@@ -68,6 +53,43 @@ HOW_TO_READ = """\
 LEGEND_COLUMNS = 2
 COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
 TEXT_COLOR: Color = (225, 228, 235)
+RING_LABEL_COLOR: Color = (150, 156, 170)
+BODY_LWH = (4.6, 1.86, 0.75)
+REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
+WHEELBASE, TRACK = 2.75, 1.64
+GLASS: Color = (32, 40, 52)
+RUBBER: Color = (20, 22, 26)
+OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
+FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
+
+
+class Mesh(NamedTuple):
+    """Triangles with colours.
+
+    Attributes:
+        vertices: (V, 3) metres.
+        normals: (V, 3) unit vectors.
+        faces: (F, 3) vertex indices.
+        colors: (V, 3) uint8 RGB.
+    """
+
+    vertices: Array
+    normals: Array
+    faces: NDArray[np.int64]
+    colors: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class VehicleMesh:
+    """The ego vehicle in the ego frame.
+
+    Attributes:
+        mesh: its triangles.
+        top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
+    """
+
+    mesh: Mesh
+    top_view: tuple[Array, ...]
 
 
 class RecordedModel(Protocol):
@@ -108,11 +130,6 @@ class Recorded:
     options: RecordingOptions
 
     @property
-    def title(self) -> str:
-        """The names of the drive and of the model."""
-        return f"{self.drive.name} · {self.model.config.name}"
-
-    @property
     def note(self) -> str:
         """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
         if self.model.untrained:
@@ -122,7 +139,7 @@ class Recorded:
     @cached_property
     def classes(self) -> Mapping[str, Color]:
         """The model's classes and their colours."""
-        return class_colors(self.model.config.object_classes.values())
+        return entities.class_colors(self.model.config.object_classes.values())
 
     @property
     def map_classes(self) -> tuple[str, ...]:
@@ -151,27 +168,78 @@ def log_scene(
             resolution=[camera.width, camera.height],
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_LENGTH_M,
-            color=[*EGO_COLOR, 160],
+            color=[*entities.EGO_COLOR, 160],
             line_width=0.01,
         )
         stream.log(entities.camera(camera.name), pinhole, static=True)
     vehicle = default_vehicle() if vehicle is None else vehicle
     log_mesh(stream, entities.VEHICLE, vehicle.mesh)
     strips = [bev_image_points(rig, strip) for strip in vehicle.top_view]
-    stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
-    _log_rings(stream, rig, grid)
+    stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=entities.EGO_COLOR, draw_order=40), static=True)
+    distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
+    rings, lines = range_rings(grid), range_lines(rig, grid)
+    in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
+    stream.log(
+        entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*entities.RING_COLOR, 140], radii=width), static=True
+    )
+    flat = [bev_image_points(rig, line) for line in lines]
+    stream.log(
+        entities.BEV_RINGS, rr.LineStrips2D(flat, colors=entities.RING_COLOR, radii=width, draw_order=5), static=True
+    )
+    # The labels are on the circles, ahead to the right, where they cover little.
+    positions = [bev_image_points(rig, ring[[105]])[0] for ring in rings]
+    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=RING_LABEL_COLOR, draw_order=6)
+    log(stream, f"{entities.BEV_RINGS}/labels", labels, static=True)
+
+
+def default_vehicle() -> VehicleMesh:
+    """A plain car with a cabin and four wheels, in flat shading: each corner of each triangle is a vertex of its own.
+
+    It is made with NumPy, because trimesh would take half a second to load at the start of every run.
+    """
+    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    cabin = _prism(square * (2.5, 1.66), 0.6)
+    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
+    turns = np.arange(20) / 20 * 2 * np.pi
+    wheel = _prism(0.34 * np.stack([np.cos(turns), np.sin(turns)], -1), 0.24)[..., [1, 2, 0]]
+    parts = [
+        (_prism(square * BODY_LWH[:2], BODY_LWH[2]) + (REAR_AXLE_TO_MIDDLE, 0, 0.62), entities.EGO_COLOR),
+        (cabin + (1.0, 0, 1.28), GLASS),
+        *((wheel + (x, y, 0.34), RUBBER) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)),
+    ]
+    triangles = np.concatenate([part for part, _ in parts])
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
+    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
+
+
+def _prism(outline: Array, height: float) -> Array:
+    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2.
+
+    Returns triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside.
+    """
+    low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
+    low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
+    sides = [(low, low_next, high_next), (low, high_next, high)]
+    first_low, first_high = (side[:1].repeat(len(side) - 2, 0) for side in (low, high))
+    caps = [(first_low, low[2:], low[1:-1]), (first_high, high[1:-1], high[2:])]  # fans
+    return np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
 
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     """Writes the page "About", and the facts of the run that readers of the file need."""
     cameras, untrained = recorded.drive.rig.names, recorded.model.untrained
+    title = f"{recorded.drive.name} · {recorded.model.config.name}"
     maps, lines = recorded.map_classes, line_entries(recorded.model.config)
     of_map: dict[str, Any] = {"map_classes": list(maps)} if maps else {}
     if lines:
         names, colors = zip(*lines, strict=True)
         of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
     facts = rr.AnyValues(
-        title=recorded.title,
+        title=title,
         untrained=untrained,
         note=recorded.note,
         score=recorded.options.score,
@@ -185,25 +253,8 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
         f"bevcli {__version__}; {counted(len(cameras), 'cameras')}: {', '.join(cameras)}. "
         f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
     )
-    page = rr.TextDocument(f"# {recorded.title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
+    page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
     stream.log(entities.RUN, page, facts, static=True)
-
-
-def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
-    """Writes names and colours of the curves: seconds per stage, boxes per class, speed."""
-    stages = list(stages)
-    colors = [STAGE_COLORS[i % len(STAGE_COLORS)] for i in range(len(stages))]
-    stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
-    stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(classes), colors=list(classes.values())), static=True)
-    stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=EGO_COLOR), static=True)
-
-
-def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
-    """Writes the vehicle's speed: a curve, and a label above the vehicle in the scene."""
-    km_h = 3.6 * speed_m_s
-    stream.log(entities.SPEED_CURVE, components(rr.Scalars, scalars=np.array([km_h])))
-    facts = {"labels": [f"{km_h:.0f} km/h"], "colors": EGO_COLOR, "radii": UNSEEN, "show_labels": True}
-    stream.log(entities.SPEED, components(rr.Points3D, positions=np.array([SPEED_LABEL_M]), **facts))
 
 
 def log_pillars(
@@ -217,7 +268,7 @@ def log_pillars(
     """
     steps = [1 if all_cells else max(1, -(-side // PILLARS_PER_SIDE)) for side in (grid.rows, grid.columns)]
     pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]].reshape(-1, grid.pillar_points, 3)
-    of_pillar = colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo")
+    of_pillar = entities.colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo")
     colors, points = np.tile(of_pillar, (len(pillars), 1)), apply(ego_from_bev, pillars).reshape(-1, 3)
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
     return pillars.reshape(-1, 3), packed(colors)
@@ -254,19 +305,6 @@ def range_lines(rig: CameraRig, grid: BevGrid | None) -> list[Array]:
     return [*rings, apply(rig.ego_from_bev, border)[:, :2]]
 
 
-def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None) -> None:
-    distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
-    rings, lines = range_rings(grid), range_lines(rig, grid)
-    in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
-    stream.log(entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*RING_COLOR, 140], radii=width), static=True)
-    flat = [bev_image_points(rig, line) for line in lines]
-    stream.log(entities.BEV_RINGS, rr.LineStrips2D(flat, colors=RING_COLOR, radii=width, draw_order=5), static=True)
-    # The labels are on the circles, ahead to the right, where they cover little.
-    positions = [bev_image_points(rig, ring[[105]])[0] for ring in rings]
-    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=[150, 156, 170], draw_order=6)
-    stream.log(f"{entities.BEV_RINGS}/labels", labels, static=True)
-
-
 def bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     """Points (K, 2) on the ground in the ego frame -> (K, 2) in the flat BEV image: x to the right, -y down, metres."""
     points = apply(inverse(rig.ego_from_bev), np.column_stack([points_ego, np.zeros(len(points_ego))]))
@@ -276,8 +314,14 @@ def bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
-    states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
-    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(recorded.map_classes).items()]
+    states = [
+        ("ground truth", entities.GROUND_TRUTH_COLOR),
+        ("missed, false", entities.MISSED_COLOR),
+        ("duplicate", entities.DUPLICATE_COLOR),
+    ]
+    maps = [
+        (f"map: {name.replace('_', ' ')}", color) for name, color in entities.map_colors(recorded.map_classes).items()
+    ]
     return [*of_classes, *states, *maps, *line_entries(recorded.model.config)]
 
 
@@ -285,11 +329,6 @@ def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds."""
     of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
     return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
-
-
-def legend_size(entries: int) -> tuple[float, float]:
-    """Width and height of the legend with this number of entries, in the units of its view."""
-    return LEGEND_COLUMNS * COLUMN_WIDTH, -(-entries // LEGEND_COLUMNS) * ROW_HEIGHT
 
 
 def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
@@ -300,4 +339,4 @@ def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]])
     circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))
     stream.log(f"{entities.LEGEND}/colors", circles, static=True)
     labels = labels_2d(places + (5.0, -0.25), texts, colors=TEXT_COLOR)  # a label is drawn below its point
-    stream.log(f"{entities.LEGEND}/texts", labels, static=True)
+    log(stream, f"{entities.LEGEND}/texts", labels, static=True)

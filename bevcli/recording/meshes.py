@@ -1,51 +1,50 @@
-"""The meshes of the ego vehicle and of classes: each box of a class with a mesh has it in the scene, scaled to the box.
+"""Meshes of files: of the ego vehicle, and of classes, each box of which has its mesh in the scene, scaled to the box.
 
-The vehicle is a plain car by default.
+trimesh reads them, in a process of its own with limits of memory and time.
 """
 
+from __future__ import annotations
+
+import io
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+import subprocess
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import rerun as rr
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.object_classes import ObjectClass
+from bevcli.geometry.object_classes import Color, ObjectClass
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import open_regular
-from bevcli.recording import entities
-from bevcli.recording.colors import EGO_COLOR, Color, class_colors
-from bevcli.recording.components import components
-from bevcli.recording.log_boxes import quaternions
-from bevcli.recording.mesh_file import Mesh, read_mesh
+from bevcli.parsing.files import MIB, open_regular, read_bytes, run_python
+from bevcli.printing import reason_of
+from bevcli.recording.entities import EGO_COLOR, class_colors
 
-BODY_LWH = (4.6, 1.86, 0.75)
-REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
-WHEELBASE, TRACK = 2.75, 1.64
-GLASS: Color = (32, 40, 52)
-RUBBER: Color = (20, 22, 26)
-OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
-FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
+if TYPE_CHECKING:
+    from bevcli.recording.log_static import Mesh, VehicleMesh
+
+Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # the fields of a Mesh
+SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
+LARGEST_BYTES = 64 * MIB  # of the file, and of each that it names
+LARGEST_TEXT_BYTES = 16 * MIB  # of a format of text, of which trimesh makes sixty times as much
+TEXT_FORMATS = (".obj", ".off")
+FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
+GLTF_FILES = (".glb", ".gltf")
+EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
+MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process
+READ = """
+import sys, trimesh
+from bevcli.recording.meshes import write_parts
+limit_memory()
+sys.exit(write_parts(*sys.argv[1:]))
+"""
+TOO_LARGE = 3  # exit code
 LONGEST_M = 50.0  # a longer mesh is not in metres
 MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
 FARTHEST = 1e9  # of a vertex from the origin, in the file's units
-
-
-@dataclass(frozen=True)
-class VehicleMesh:
-    """The ego vehicle in the ego frame.
-
-    Attributes:
-        mesh: its triangles.
-        top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
-    """
-
-    mesh: Mesh
-    top_view: tuple[Array, ...]
 
 
 def load_vehicle(path: Path) -> VehicleMesh:
@@ -60,6 +59,8 @@ def load_vehicle(path: Path) -> VehicleMesh:
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
     longer than 50 m.
     """
+    from bevcli.recording.log_static import VehicleMesh
+
     mesh = read_mesh(path)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     if not np.isfinite(mesh.vertices).all() or not (high - low).max() <= LONGEST_M:
@@ -67,62 +68,11 @@ def load_vehicle(path: Path) -> VehicleMesh:
         raise InputError(
             f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
         )
-    return VehicleMesh(mesh, _top_view(low, high))
-
-
-def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
-    """The rectangle around a mesh from above, and an arrow at its front. low, high: (3,) corners in the ego frame."""
     (x0, y0), (x1, y1) = low[:2], high[:2]
     middle, half, length = (y0 + y1) / 2, (y1 - y0) / 2, x1 - x0
     outline = np.array([[x1, y0], [x1, y1], [x0, y1], [x0, y0], [x1, y0]])
     arrow = np.array([[-0.32 * length, -0.86 * half], [-0.08 * length, 0], [-0.32 * length, 0.86 * half]])
-    return outline, arrow + (x1, middle)
-
-
-def default_vehicle() -> VehicleMesh:
-    """A plain car with a cabin and four wheels, in flat shading: each corner of each triangle is a vertex of its own.
-
-    It is made with NumPy, because trimesh would take half a second to load at the start of every run.
-    """
-    cabin = _box(2.5, 1.66, 0.6)
-    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
-    turns = np.arange(20) / 20 * 2 * np.pi
-    wheel = _prism(0.34 * np.stack([np.cos(turns), np.sin(turns)], -1), 0.24)[..., [1, 2, 0]]
-    parts = [
-        (_box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62), EGO_COLOR),
-        (cabin + (1.0, 0, 1.28), GLASS),
-        *((wheel + (x, y, 0.34), RUBBER) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)),
-    ]
-    triangles = np.concatenate([part for part, _ in parts])
-    normals = _normals(triangles)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
-    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
-    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))
-
-
-def _box(length: float, width: float, height: float) -> Array:
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
-    return _prism(corners * (length, width), height)
-
-
-def _prism(outline: Array, height: float) -> Array:
-    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2.
-
-    Returns triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside.
-    """
-    low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
-    low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
-    sides = [(low, low_next, high_next), (low, high_next, high)]
-    caps = [(low[:1].repeat(len(low), 0), low_next, low), (high[:1].repeat(len(high), 0), high, high_next)]
-    triangles = np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
-    # The first and the last triangle of each cap's fan have no area.
-    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]
-
-
-def _normals(triangles: Array) -> Array:
-    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return VehicleMesh(mesh, (outline, arrow + (x1, middle)))  # from above: a rectangle, and an arrow at its front
 
 
 def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
@@ -159,15 +109,100 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
     return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
 
 
-def log_class_meshes(stream: rr.RecordingStream, boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> None:
-    """Writes where the meshes of classes stand: one in each box of the class. boxes: in the recording's world."""
-    for name in (name for name, settings in classes.items() if settings.mesh):
-        own = boxes[boxes.classes == name]
-        # The last one has no size: an entity without poses would show its mesh at the origin.
-        poses = components(
-            rr.InstancePoses3D,
-            translations=np.append(own.centers, [[0, 0, 0]], axis=0),
-            quaternions=np.append(quaternions(own), [[0, 0, 0, 1]], axis=0),
-            scales=np.append(own.sizes_lwh, [[0, 0, 0]], axis=0),
-        )
-        stream.log(entities.class_mesh(name), poses)
+def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
+    """All triangles of a mesh file, with the axes of the ego frame. color: of the parts that have none.
+
+    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.
+    """
+    from bevcli.recording.log_static import Mesh  # not in the process that reads a file: it imports rerun
+
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
+    try:
+        done = run_python(READ, [path, *color], MEMORY, SECONDS)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path}: takes more than {SECONDS:.0f} s to read (expected fewer triangles)") from None
+    if done.returncode == 0:
+        file = io.BytesIO(done.stdout)
+        return Mesh(*(np.load(file, allow_pickle=False) for _ in range(4)))
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    if done.returncode == 1 and lines:
+        raise InputError(lines[-1])
+    what = "takes more than 1 GiB of memory" if done.returncode == TOO_LARGE else "ends trimesh, which reads it"
+    raise InputError(f"{path}: {what} (expected a mesh of fewer triangles)")
+
+
+def write_parts(path: str, *color: str) -> str | int | None:
+    """Write the arrays of a mesh file to stdout, for `read_mesh`. Returns what `sys.exit` takes."""
+    import sys
+
+    try:
+        corners, normals, faces, colors = zip(*read_parts(Path(path), tuple(map(int, color))), strict=True)
+        starts = np.cumsum([0, *map(len, corners[:-1])])
+        shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
+        for array in (np.concatenate(corners), np.concatenate(normals), shifted, np.concatenate(colors)):
+            np.save(sys.stdout.buffer, array)
+    except InputError as error:
+        return str(error)
+    except MemoryError:
+        return TOO_LARGE
+    return None
+
+
+def read_parts(path: Path, color: tuple[int, ...] = EGO_COLOR) -> list[Part]:
+    """The triangle meshes of a file, as `read_mesh`, read in this process. Raises InputError, MemoryError."""
+    import trimesh  # only here: it takes half a second to load
+
+    suffix = path.suffix.lower()
+    content = read_bytes(path, LARGEST_TEXT_BYTES if suffix in TEXT_FORMATS else LARGEST_BYTES)
+    try:
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=_Siblings(path.parent))
+        if suffix in GLTF_FILES:
+            scene.apply_transform(EGO_FROM_GLTF)
+        parts = [_part(mesh, color) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    except MemoryError:
+        raise
+    except Exception as error:  # each of trimesh's many readers raises errors of its own
+        reason = reason_of(error)
+        raise InputError(
+            f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
+        ) from error
+    if not parts:
+        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh)")
+    return parts
+
+
+class _Siblings(Mapping[str, bytes]):
+    """The regular files of a folder by name, as trimesh asks for them: nothing outside of it, and no pipes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    def __getitem__(self, name: str) -> bytes:
+        path = (self.folder / name).resolve()
+        if not path.is_relative_to(self.folder):
+            raise InputError(f"{name}: is outside of the mesh file's folder")
+        return read_bytes(path, LARGEST_BYTES)
+
+    def __iter__(self) -> Iterator[str]:
+        return (path.name for path in self.folder.iterdir())
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+def _part(mesh: Any, color: tuple[int, ...]) -> Part:
+    """Vertices, normals, faces and colours of a trimesh.Trimesh, with sharp edges."""
+    import trimesh
+
+    visual = mesh.visual
+    if visual.kind == "face":
+        mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
+        visual = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
+    colors = visual.vertex_colors if visual.defined else (*color, 255)
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
+    mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
+    colors = np.array(mesh.visual.vertex_colors, dtype=np.uint8)[:, :3]
+    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors

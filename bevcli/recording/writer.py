@@ -20,7 +20,6 @@ from bevcli.recording import entities, log_static
 from bevcli.recording.blueprint import Layout, recording_blueprint
 from bevcli.recording.frame_log import FrameLog, FrameLogState
 from bevcli.recording.log_static import Recorded, RecordedDrive, RecordedModel
-from bevcli.recording.meshes import load_vehicle, read_class_meshes
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.incremental_json import GrowingFile
 
@@ -84,11 +83,19 @@ class RrdFile(GrowingFile):
         Raises OutputError if it could not be written, and WaitError if the disk does not answer.
         """
         deadline = time.monotonic() + TIMEOUT_S
-        while self._error is None and self._thread.is_alive() and not self._is_drained():
+        while self._error is None and self._thread.is_alive():
+            if not self._busy.acquire(timeout=TIMEOUT_S):
+                raise self._no_answer()
+            try:
+                if not select.select([self._pipe], [], [], 0)[0]:
+                    break
+            finally:
+                self._busy.release()
             if time.monotonic() > deadline:
                 raise self._no_answer()
             time.sleep(0.0005)
-        self._raise_error()
+        if self._error is not None:
+            raise self._error
         self.synced = self.size
 
     def leave_out_index(self) -> None:
@@ -109,23 +116,11 @@ class RrdFile(GrowingFile):
             if self._error is not None or self._is_joined:  # there may be a cut message
                 with contextlib.suppress(OSError):
                     self._file.truncate(self.synced)
-        self._raise_error()
-
-    def _raise_error(self) -> None:
         if self._error is not None:
             raise self._error
 
     def _no_answer(self) -> WaitError:
         return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
-
-    def _is_drained(self) -> bool:
-        """True if all that is in the pipe has been written."""
-        if not self._busy.acquire(timeout=TIMEOUT_S):
-            raise self._no_answer()
-        try:
-            return not select.select([self._pipe], [], [], 0)[0]
-        finally:
-            self._busy.release()
 
     def _move_all(self, pipe: int) -> None:
         """Moves a stream into the file, until rerun closes it."""
@@ -136,20 +131,18 @@ class RrdFile(GrowingFile):
                     size = os.readv(pipe, [self._block])
                     if not size:
                         return
-                    if pipe == self._pipe:
-                        self._write(self._block[:size])
+                    if pipe != self._pipe:
+                        continue
+                    rest = self._block[self._to_skip : size]
+                    self._to_skip -= size - len(rest)
+                    # After an error the rest is read and thrown away, so that rerun never waits.
+                    try:
+                        if self._error is None:
+                            self.append(rest)
+                    except OutputError as error:
+                        self._error = error
         finally:
             os.close(pipe)
-
-    def _write(self, block: memoryview) -> None:
-        """Writes a block. After an error the rest is read and thrown away, so that rerun never waits."""
-        rest = block[self._to_skip :]
-        self._to_skip -= len(block) - len(rest)
-        try:
-            if self._error is None:
-                self.append(rest)
-        except OutputError as error:
-            self._error = error
 
 
 class LiveSink(Protocol):
@@ -217,17 +210,21 @@ class Recording:
 
     def __enter__(self) -> Recording:
         recorded, config = self._recorded, self._recorded.model.config
-        mesh = recorded.options.vehicle_mesh
-        vehicle = None if mesh is None else load_vehicle(mesh)
-        meshes = read_class_meshes(config.object_classes)
+        vehicle, of_classes = None, {}
+        path = recorded.options.vehicle_mesh
+        if path is not None or any(settings.mesh for settings in config.object_classes.values()):
+            from bevcli.recording import meshes
+
+            vehicle = None if path is None else meshes.load_vehicle(path)
+            of_classes = meshes.read_class_meshes(config.object_classes)
         self._layout = recording_blueprint(recorded)
         self._file = RrdFile(self.path, self._size)
         self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
         log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, config.bev_grid)
-        for name, of_class in meshes.items():
-            log_static.log_mesh(self._stream, entities.class_mesh(name), of_class)
+        for name, mesh in of_classes.items():
+            log_static.log_mesh(self._stream, entities.class_mesh(name), mesh)
         log_static.log_about(self._stream, recorded)
         log_static.log_legend(self._stream, log_static.legend_entries(recorded))
         return self
@@ -252,7 +249,12 @@ class Recording:
             self._flush()
         finally:
             self._file.leave_out_index()
-            self._disconnect()
+            # rerun itself waits without a limit.
+            closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
+            closing.start()
+            closing.join(FLUSH_TIMEOUT_S)
+            if closing.is_alive():
+                raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
             self._file.close()
             if self._live is not None:
                 self._live.close()
@@ -280,14 +282,6 @@ class Recording:
         level: "INFO", "WARN" or "ERROR".
         """
         self._frame_log.event(text, level)
-
-    def _disconnect(self) -> None:
-        """Closes rerun's sinks, within FLUSH_TIMEOUT_S: rerun itself waits without a limit."""
-        closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
-        closing.start()
-        closing.join(FLUSH_TIMEOUT_S)
-        if closing.is_alive():
-            raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
 
     def _flush(self) -> None:
         try:

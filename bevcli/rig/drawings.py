@@ -24,11 +24,13 @@ from bevcli.errors import OutputError
 from bevcli.findings import Finding
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.parsing.files import plain_name
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
-from bevcli.recording.colors import BACKGROUND, Color, colormap
+from bevcli.recording.components import log
+from bevcli.recording.entities import colormap
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
 from bevcli.writing import whole_file
@@ -426,7 +428,7 @@ def _log_coverage(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage
 
 
 def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Pixels | None) -> None:
-    stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
+    log(stream, entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
     if pixels is not None:
         encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
         image = rr.EncodedImage(contents=encoded, media_type="image/jpeg")
@@ -458,11 +460,11 @@ def _layout(rig: CameraRig) -> Layout:
         origin=entities.EGO,
         contents=[f"/{entities.WORLD}/**", *overlays],
         name="The rig",
-        background=list(BACKGROUND),
+        background=list(entities.BACKGROUND),
         line_grid=False,
         eye_controls=from_behind,
     )
-    seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=list(BACKGROUND))
+    seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=list(entities.BACKGROUND))
     findings = rrb.TextDocumentView(origin=FINDINGS, name="Findings")
     middle = rrb.Horizontal(scene, seen, findings, column_shares=[4, 3, 4])
     rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]

@@ -147,7 +147,8 @@ class RunFiles:
         for kind, writer in self._results.items():
             writer.write(ground, result_of(kind, prediction.results))
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
-        self._check_that_files_exist()
+        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
+            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
 
     def _boxes_of(self, frame: Frame, prediction: Prediction) -> FrameBoxes:
@@ -197,10 +198,6 @@ class RunFiles:
 
         return self._open(SUBMISSION, SubmissionWriter)
 
-    def _check_that_files_exist(self) -> None:
-        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
-            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
-
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
@@ -209,11 +206,11 @@ class RunFiles:
 
 
 def _check_size(path: Path, size: int) -> None:
-    found = path.stat().st_size if path.is_file() else 0
-    if found < size:
+    size_now = path.stat().st_size if path.is_file() else 0
+    if size_now < size:
         raise OutputError(
             f"{path}: `resume`: was cut or removed since the interruption (expected {size} bytes or more, found "
-            f"{found}): pass `force=True` to start anew"
+            f"{size_now}): pass `force=True` to start anew"
         )
 
 

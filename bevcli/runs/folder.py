@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 from bevcli.errors import OutputError
 from bevcli.parsing.files import MIB, read_bytes
@@ -20,7 +19,7 @@ SUMMARY = "summary.json"
 LARGEST_LIST = 64 * MIB  # of the list of written files
 
 
-class RunFolder:
+class RunFolder(contextlib.ExitStack):
     """`with RunFolder(out, force=…, resume=…) as folder:`; the folder is made if it is missing.
 
     Attributes:
@@ -29,9 +28,9 @@ class RunFolder:
     """
 
     def __init__(self, path: Path, *, force: bool = False, resume: bool = False) -> None:
+        super().__init__()
         self.path, self.state_path = path, path / OWN / "state.safetensors"
         self._force, self._resume = force, resume
-        self._stack = contextlib.ExitStack()
         self._written: GrowingFile | None = None
         self._names: set[str] = set()
 
@@ -40,19 +39,22 @@ class RunFolder:
         out = self.path
         if out.exists() and not out.is_dir():
             raise OutputError(f"{out}: is a file (expected a folder to write to)")
-        with self._stack, output_errors(out):  # unlocks the folder if this fails
-            if out.exists() and not (self._force or self._resume or self._has_no_run()):
+        written = out / OWN / "written"
+        with contextlib.ExitStack() as stack, output_errors(out):  # unlocks the folder if this fails
+            is_free = self._force or self._resume or not out.exists()
+            if not is_free and (written.exists() or any(entry.name != OWN for entry in out.iterdir())):
                 raise OutputError(
                     f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
                     "interrupted run, or `out=DIR` for another folder"
                 )
-            self._stack.enter_context(folder_lock(out))
-            self._names = self._read_written()
-            self._stack = self._stack.pop_all()
+            stack.enter_context(folder_lock(out))
+            if written.is_file():  # the files of earlier runs
+                names = read_bytes(written, LARGEST_LIST, error=OutputError).decode(errors="replace").splitlines()
+                # A path with ".." would leave the folder: no run of ours writes one.
+                inside = (not Path(name).is_absolute() and ".." not in Path(name).parts for name in names)
+                self._names = {name for name, is_inside in zip(names, inside, strict=True) if name and is_inside}
+            self.push(stack.pop_all())
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     def add(self, path: Path) -> None:
         """Put a file on the list before it is written, so that `force` may remove it later.
@@ -70,7 +72,7 @@ class RunFolder:
         if self._written is None:
             file = self.path / OWN / "written"
             self._written = GrowingFile(file, file.stat().st_size if file.exists() else None)
-            self._stack.callback(self._written.close)
+            self.callback(self._written.close)
         self._written.append(f"{name}\n".encode())
         self._names.add(name)
 
@@ -92,17 +94,6 @@ class RunFolder:
         """The folder of a file is in this one after all links are followed."""
         return Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(self.path))
 
-    def _has_no_run(self) -> bool:
-        return all(entry.name == OWN for entry in self.path.iterdir()) and not (self.path / OWN / "written").exists()
-
-    def _read_written(self) -> set[str]:
-        """The files of earlier runs. A path with ".." would leave the folder: no run of ours writes one."""
-        file = self.path / OWN / "written"
-        if not file.is_file():
-            return set()
-        names = read_bytes(file, LARGEST_LIST, error=OutputError).decode(errors="replace").splitlines()
-        return {name for name in names if name and not Path(name).is_absolute() and ".." not in Path(name).parts}
-
 
 @contextlib.contextmanager
 def folder_lock(out: Path) -> Iterator[None]:
@@ -115,8 +106,19 @@ def folder_lock(out: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with output_errors(out):
             (out / OWN).mkdir(parents=True, exist_ok=True)
-            held = stack.enter_context(_locked(out / OWN / "lock", out))
-            stack.callback(_remove, held.name)
+            path, is_ours = out / OWN / "lock", False
+            while not is_ours:  # else the run before has just ended and removed its lock file
+                file = stack.enter_context(path.open("a+", errors="replace"))
+                if not lock(file.fileno()):
+                    file.seek(0)
+                    holder = file.read(500).strip() or "an unknown process"
+                    raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
+                with contextlib.suppress(FileNotFoundError):
+                    is_ours = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            file.truncate(0)
+            file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
+            file.flush()
+            stack.callback(_remove, file.name)
             if sys.platform != "win32":
                 folder = os.open(out, os.O_RDONLY)
                 stack.callback(os.close, folder)
@@ -128,22 +130,3 @@ def folder_lock(out: Path) -> Iterator[None]:
 def _remove(path: str) -> None:
     with contextlib.suppress(OSError):
         os.unlink(path)
-
-
-def _locked(path: Path, out: Path) -> IO[str]:
-    """The open lock file, which holds the number and the command of this process. Raises OutputError."""
-    while True:
-        file = path.open("a+", errors="replace")
-        if not lock(file.fileno()):
-            file.seek(0)
-            holder = file.read(500).strip() or "an unknown process"
-            file.close()
-            raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
-        file.close()  # the run before has just ended and removed its lock file
-    file.truncate(0)
-    file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
-    file.flush()
-    return file

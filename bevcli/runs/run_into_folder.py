@@ -7,9 +7,9 @@ from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.inference.background import WriteBehind
 from bevcli.inference.load import Model
-from bevcli.inference.runner import Commands, Runner, RunnerState, read_commands
+from bevcli.inference.pipeline import WriteBehind
+from bevcli.inference.runner import RunnerState, read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.sequence_checks import CheckedDrive
@@ -68,31 +68,31 @@ def run_into_folder(
     with RunFolder(out, force=force, resume=resume) as folder:
         facts = run_facts(model, sequence, options) | {"commands": str(commands)}
         state = _state_to_start_from(folder, facts, model, resume)
+        done = state.counts.whole.count
         if state.files is not None:
-            resumed(state.frames)
+            resumed(done)
         checked = sequence if isinstance(sequence, CheckedDrive) else CheckedDrive(sequence)
         summary = RunSummary(model, checked, options, state.counts)
         folder.add(out / SUMMARY)
-        done = state.frames
         files = RunFiles(folder, sequence, model, options, live, state.files, done=done)
         writer = RunWriter(folder.state_path, facts, files, summary)
 
         def write(step: Step) -> bool:
-            frame, prediction, after = step
-            writer.write(frame, prediction, after)
-            after_frame(frame, prediction)
+            writer.write(*step)
+            after_frame(*step[:2])
             return not should_stop()
 
         try:
             with files, writer, WriteBehind(write) as background:
-                runner = _runner(model, options, commands)
+                asked = {"ask_attention": options.recording.shows_internals, "probes": tuple(options.recording.probes)}
+                runner = model.runner(track=options.track, temporal=options.temporal, commands=commands, **asked)
                 after, indices = state.runner, range(done, len(sequence.stamps))
                 for prepared, upcoming in runner.frames(sequence, indices, runner.preprocessor(options.cameras)):
                     after, prediction = runner.step(after, prepared, upcoming)
                     if not background.put((prepared.frame, prediction, after)):
                         break
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:
-                raise no_image_error(sequence.name, (each[1:] for each in summary.counts.dropped))
+                raise no_image_error(sequence.name, (image[1:] for image in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())
@@ -116,13 +116,3 @@ def _state_to_start_from(folder: RunFolder, facts: dict[str, str], model: Model,
         state = RunState(facts, None, Counts())
         save_state(folder.state_path, state)
     return state
-
-
-def _runner(model: Model, options: RunOptions, commands: Commands) -> Runner:
-    return model.runner(
-        track=options.track,
-        temporal=options.temporal,
-        ask_attention=options.recording.shows_internals,
-        probes=tuple(options.recording.probes),
-        commands=commands,
-    )

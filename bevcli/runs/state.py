@@ -5,12 +5,13 @@ are tensors of the file. Everything else is one more tensor, MessagePack that ms
 the type that it expects, so that nothing in a file decides what is made of it.
 """
 
+import contextlib
 import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, Self, TypeVar, get_origin
+from typing import Any, Generic, Protocol, TypeVar, get_origin
 
 import msgspec
 import numpy as np
@@ -36,6 +37,7 @@ LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may stat
 SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
 HASHED_BYTES = 1 << 24  # files up to this size are hashed; of larger ones size and modification time count
+DIGITS = 12  # of a hash in a text
 START_ANEW = "pass `force=True` to start anew"
 _TREE = "tree"
 
@@ -65,11 +67,6 @@ class RunState(Generic[Memory]):
     counts: Counts
     runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
-    @property
-    def frames(self) -> int:
-        """Number of finished frames."""
-        return self.counts.whole.count
-
 
 def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, str]:
     """Name -> hash or value of all that the results of a run depend on.
@@ -78,14 +75,14 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
     """
     return {
         "version of bevcli": __version__,
-        "model": f"{model.name}, {short_hash(model.config_hash)}",
-        "weights": f"{model.weights or 'random'}, {short_hash(model.weights_hash)}",
+        "model": f"{model.name}, {model.config_hash[:DIGITS]}",
+        "weights": f"{model.weights or 'random'}, {model.weights_hash[:DIGITS]}",
         "device": model.device.type,
         "precision": f"{model.precision}, {model.engine}" if model.is_exported else model.precision,
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
-        "frames of the input": f"{len(sequence.stamps)}, {short_hash(digest(sequence.stamps))}",
-        "calibration": short_hash(digest(sequence.rig)),
-        "files of the input": short_hash(digest(tuple(map(_file_facts, sequence.input_files)))),
+        "frames of the input": f"{len(sequence.stamps)}, {digest(sequence.stamps)[:DIGITS]}",
+        "calibration": digest(sequence.rig)[:DIGITS],
+        "files of the input": digest(tuple(map(_file_facts, sequence.input_files)))[:DIGITS],
         "images of the input": _image_facts(sequence),
     }
 
@@ -111,7 +108,7 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
     return state
 
 
-class RunWriter:
+class RunWriter(contextlib.AbstractContextManager["RunWriter"]):
     """`with RunWriter(…) as writer: writer.write(frame, prediction, after)`.
 
     Writes frames to the files of a run, counts them, and saves the state as often as SHARE of its time allows. The end
@@ -126,9 +123,6 @@ class RunWriter:
         self._longest_s: float | None = None
         self._after: RunnerState[Any] | None = None  # the state after a frame that is not saved yet
         self._is_whole = True
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_error: object) -> None:
         if self._is_whole and self._after is not None:
@@ -178,22 +172,17 @@ def _file_facts(path: Path) -> tuple[str, int, str]:
 
 def _image_facts(sequence: Sequence) -> str:
     """Number, and hash of names, sizes and times of change, of the image files and videos of all frames."""
-    paths = dict.fromkeys(path for place in range(len(sequence.stamps)) for path in sequence.image_files(place))
-    found = hashlib.sha256()
+    paths = dict.fromkeys(path for index in range(len(sequence.stamps)) for path in sequence.image_files(index))
+    facts_hash = hashlib.sha256()
     for path in paths:
         try:
             facts = path.stat()
-            found.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
+            facts_hash.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
         except OSError as error:
-            found.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
+            facts_hash.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
         except ValueError:  # a null byte in the name
-            found.update(b"no name\n")
-    return f"{len(paths)}, {short_hash(found.hexdigest())}"
-
-
-def short_hash(hexdigest: str) -> str:
-    """The first digits of a hash, for texts."""
-    return hexdigest[:12]
+            facts_hash.update(b"no name\n")
+    return f"{len(paths)}, {facts_hash.hexdigest()[:DIGITS]}"
 
 
 def save_state(path: Path, state: object) -> None:
@@ -217,11 +206,11 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
     if _TREE not in tensors or metadata.get("sha256") != hash_of(sorted(tensors.items())):
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
 
-    def decoded(expected: type, found: Any) -> Any:
+    def decoded(expected: type, packed: Any) -> Any:
         if expected is Tensor:
-            return tensors[found]
+            return tensors[packed]
         assert get_origin(expected) is np.ndarray, expected
-        return tensors[found].numpy() if isinstance(found, str) else _strings(*found)
+        return tensors[packed].numpy() if isinstance(packed, str) else _strings(*packed)
 
     try:
         return msgspec.msgpack.decode(tensors[_TREE].numpy().tobytes(), type=kind, dec_hook=decoded)

@@ -29,7 +29,7 @@ class RunningMedian:
     Attributes:
         count: number of values.
         total_s: their sum, seconds.
-        bins: place of a bin -> number of values in it; a bin is at RATIO ** place seconds.
+        bins: index of a bin -> number of values in it; a bin is at RATIO ** index seconds.
 
     Raises ValueError where these do not fit together, as in a state that was written by hand.
     """
@@ -39,24 +39,24 @@ class RunningMedian:
     bins: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        is_sound = all(abs(place) <= LAST_BIN and number > 0 for place, number in self.bins.items())
+        is_sound = all(abs(index) <= LAST_BIN and number > 0 for index, number in self.bins.items())
         if not is_sound or self.count != sum(self.bins.values()) or not 0 <= self.total_s < math.inf:
             raise ValueError("impossible times")
 
     def add(self, seconds: float) -> None:
         """Add a value. Values below 1 µs count as 1 µs."""
-        place = round(math.log(max(seconds, 1e-6), RATIO))
+        index = round(math.log(max(seconds, 1e-6), RATIO))
         self.count += 1
         self.total_s += seconds
-        self.bins[place] = self.bins.get(place, 0) + 1
+        self.bins[index] = self.bins.get(index, 0) + 1
 
     def value(self) -> float:
         """The median in seconds; of an even number of values the lower of the two in the middle. 0 without values."""
         before = 0
-        for place in sorted(self.bins):
-            before += self.bins[place]
+        for index in sorted(self.bins):
+            before += self.bins[index]
             if 2 * before >= self.count:
-                return float(RATIO**place)
+                return float(RATIO**index)
         return 0.0
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, result_within
 from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
@@ -21,7 +21,6 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, decode_image, media_type_of, read_bytes, size_of_image
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.options import SequenceOptions
-from bevcli.waiting import result_within
 
 if TYPE_CHECKING:
     from bevcli.sequences.videos import VideoReader

@@ -10,13 +10,13 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.recording.colors import EGO_COLOR, RING_COLOR, Color, class_colors, map_colors
-from bevcli.recording.log_bev import map_image
+from bevcli.recording import entities
+from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_colors
 from bevcli.recording.log_boxes import MOVING_M_S, box_colors
-from bevcli.recording.log_cameras import box_labels, labels_in_image, lines_in_images
-from bevcli.recording.log_static import bev_image_points, range_lines
-from bevcli.recording.meshes import default_vehicle
+from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
+from bevcli.recording.log_static import bev_image_points, default_vehicle, range_lines
 from bevcli.viewer.video import (
     BACKGROUND,
     BEV_MARGIN,
@@ -85,8 +85,9 @@ def _camera_image(
     if image is not None:
         canvas[:] = cv2.resize(image.pixels_bgr, (width, height), interpolation=cv2.INTER_AREA)
     world_from_camera = frame.world_from_ego_at[camera.name].matrix @ camera.ego_from_camera
-    camera_from_bev = inverse(world_from_camera) @ prediction.world_from_ego.matrix @ prediction.ego_from_bev
-    [lines] = lines_in_images(boxes, [scaled], [camera_from_bev])
+    posed = PosedCamera(scaled, world_from_camera, inverse(world_from_camera))
+    world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
+    [lines] = lines_in_images(boxes.transformed(world_from_bev).corners(), [posed])
     own, texts = box_colors(boxes, colors), box_labels(boxes)
     for box in np.unique(lines.owners):
         _draw_lines(canvas, lines.segments[lines.owners == box], own[box], 1 + width // 800)
@@ -110,7 +111,8 @@ def _draw_from_above(
     if prediction.segmentation is not None:
         (left, right), (low, high) = prediction.segmentation.x_range_m, prediction.segmentation.y_range_m
         (x0, y0), (x1, y1) = to_canvas(np.array([[left, -high], [right, -low]])).round().astype(int)
-        area = map_image(prediction.segmentation)[..., ::-1]
+        palette = map_colors(prediction.segmentation.classes)
+        area = prediction.segmentation.painted(palette, entities.BACKGROUND)[..., ::-1]
         canvas[y0:y1, x0:x1] = cv2.resize(area, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
     for ring in rings:
         _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, ring))[None], RING_COLOR)

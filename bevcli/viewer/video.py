@@ -23,7 +23,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import decode_image, plain_name
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
-from bevcli.recording.colors import Color, class_colors, map_colors
+from bevcli.recording.entities import Color, class_colors, map_colors
 from bevcli.recording.options import has_av, require_av
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file

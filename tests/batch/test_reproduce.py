@@ -14,8 +14,8 @@ from bevcli.config import load_config
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.temporal_model import build_model
 from bevcli.published import own_table
+from bevcli.workshop.batch import ray_is_installed
 from bevcli.workshop.batch.commands import compare_with_published, table_of
-from bevcli.workshop.batch.options import ray_is_installed
 
 ERRORS = {"trans_err": 0.7, "scale_err": 0.3, "orient_err": 0.4, "vel_err": 0.5, "attr_err": None}
 METRICS = {

@@ -34,9 +34,9 @@ from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import choose_device
 from bevcli.inference.machine import describe_machine
+from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
-from bevcli.inference.transfer import image_uploader
 from bevcli.model.network import Network
 from bevcli.model.prepare import Precision, methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
@@ -265,7 +265,7 @@ def measure_model(name: str, device: torch.device, turn: Path | None = None) -> 
     later = [preprocess(drive.load(config.past_frames + place)) for place in range(TIMED_STEPS)]
     on_cpu = plain_results(model, torch.device("cpu"), frames) if name in COMPARED_ON_CPU else None
     with taking_turns(turn):
-        timed = list(map(image_uploader(device), later))
+        timed = list(map(image_uploader(device), later)) if device.type == "cuda" else later
         plain = plain_results(model, device, frames)
         if on_cpu is not None:
             yield {"model": name, "precision": "plain, CPU"} | differences(plain, on_cpu)

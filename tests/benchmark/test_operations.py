@@ -8,7 +8,7 @@ from functools import cache
 import pytest
 
 from bevcli.config import load_config
-from bevcli.workshop.benchmark.operations import count_operations
+from bevcli.workshop.benchmark.measure import count_operations
 
 HITS = (400,) * 6
 RESNET50_OPERATIONS = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights

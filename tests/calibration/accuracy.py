@@ -18,11 +18,9 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.calibration.calibrate import CalibrationResult, judge
-from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, delay_text
-from bevcli.workshop.calibration.measure import match_points, measure
-from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.views import Views, read_views
+from bevcli.workshop.calibration import CalibrateOptions
+from bevcli.workshop.calibration.calibrate import CalibrationResult, CameraEstimate, Verdict, delay_text, judge, measure
+from bevcli.workshop.calibration.views import Views, match_points, read_views
 from bevcli.workshop.robustness.conditions import CalibrationNoise, Draws
 
 LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured

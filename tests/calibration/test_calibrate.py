@@ -18,9 +18,8 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 from bevcli.workshop.calibration import calibrate as calibrating
-from bevcli.workshop.calibration.calibrate import CorrectedDrive
-from bevcli.workshop.calibration.estimates import Verdict, either_text
-from bevcli.workshop.calibration.measure import match_points
+from bevcli.workshop.calibration.calibrate import CorrectedDrive, Verdict, either_text
+from bevcli.workshop.calibration.views import match_points
 
 STREET = Path(__file__).parents[2] / "samples/street"
 TURNED, LOW = "CAM_FRONT", "CAM_BACK"

@@ -6,7 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.adjustment import (
+    DELAYS_S,
     HEIGHT,
     OF_CAMERA,
     EpipolarResiduals,
@@ -18,9 +20,8 @@ from bevcli.workshop.calibration.adjustment import (
     spread,
     values,
 )
-from bevcli.workshop.calibration.options import CalibrateOptions
 from bevcli.workshop.calibration.road import beside_way, level_corrections, sees_road
-from bevcli.workshop.calibration.views import DELAYS_S, View, Views
+from bevcli.workshop.calibration.views import View, Views, unknowns_of
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 BLANK = np.zeros((2, 2), dtype=np.uint8)
@@ -45,7 +46,7 @@ def drive():
     )
     rig = CameraRig(cameras, default_ego_from_bev())
     views = Views(rig, rig, ((0, 1),), {(place, camera): view(place / 2) for place in (0, 1) for camera in (0, 1)})
-    return views, Unknowns.of(views, CalibrateOptions())
+    return views, unknowns_of(views, CalibrateOptions())
 
 
 def rays_in(views: Views, group: tuple[int, int, int], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,8 +5,7 @@ from command_line import MINI_TOML, command
 from small_fleet import make_job, write_fleet
 
 from bevcli.errors import BevcliError
-from bevcli.workshop.batch import worker
-from bevcli.workshop.batch.options import Workers
+from bevcli.workshop.batch import Workers, worker
 from bevcli.workshop.batch.worker import run_on_ray
 
 

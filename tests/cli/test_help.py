@@ -19,7 +19,7 @@ def help_of(*arguments: str) -> str:
 
 
 def test_help_of_the_program_groups_all_commands_unbuilt(monkeypatch):
-    monkeypatch.setattr(main, "click_command", lambda *_: pytest.fail("a command was built"))
+    monkeypatch.setattr(main, "command", lambda *_: pytest.fail("a command was built"))
     text = help_of()
     places = [text.index(f"\n{panel}:\n") for panel in ("Start", "Run", "Look", "Score", "Train", "Deploy")]
     assert places == sorted(places)

@@ -11,7 +11,7 @@ import pytest
 from command_line import command
 
 import bevcli
-from bevcli.cli.main import app, run_app
+from bevcli.cli.main import app, program
 from bevcli.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -130,7 +130,7 @@ def test_an_interrupt_exits_130(tmp_path):
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job begins with it ignored\n"
         "@main.app.command()\n"
         "def wait(): os.kill(os.getpid(), signal.SIGINT)\n"
-        "main.run_app()\n"
+        "with main.program(): main.app()\n"
     )
     done = subprocess.run([sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False)
     assert done.returncode == 130
@@ -150,7 +150,7 @@ def test_an_interrupt_of_an_import_exits_130_in_silence(tmp_path, other):
     code = (
         "import signal, bevcli.cli.main as cli, bevcli.__main__ as program\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "cli.run_app = lambda: __import__('slow_package')\n"
+        "cli.app = lambda: __import__('slow_package')\n"
         "program.main()\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
@@ -215,8 +215,13 @@ def test_an_output_name_that_the_system_refuses_is_one_line(arguments, tmp_path)
 @pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("weights", "inspect", "--model", "demo")])
 def test_a_full_output_device_is_one_line(arguments, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["bevcli", *arguments])
-    with open("/dev/full", "w") as full, contextlib.redirect_stdout(full), pytest.raises(SystemExit, match="1"):
-        run_app()
+    with (
+        open("/dev/full", "w") as full,
+        contextlib.redirect_stdout(full),
+        pytest.raises(SystemExit, match="1"),
+        program(),
+    ):
+        app()
     assert capsys.readouterr().err == "error: No space left on device\n"
 
 

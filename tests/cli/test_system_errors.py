@@ -95,7 +95,7 @@ def test_weights_on_a_full_disk_are_one_line(tmp_path):
 
 
 def test_numba_without_its_compiler_is_one_line():
-    code = "import bevcli.model.kernels.bilinear"
+    code = "import bevcli.model.kernels.loops"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1].startswith("bevcli.errors.BevcliError: NUMBA_DISABLE_JIT is set")

@@ -28,14 +28,14 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run
-from bevcli.inference.runner import Runner
+from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
+from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from small_model import model_for_engines, small_inputs, step_of_file
@@ -86,7 +86,7 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     frame = drive.load(0)
     pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
     frame = replace(frame, images={"FRONT": replace(frame.images["FRONT"], pixels_bgr=pixels)})
-    runner, feeds = Runner(exported, torch.device("cpu")), []
+    runner, feeds = Runner(exported, torch.device("cpu"), StepOptions(takes_pixels=True)), []
     run_file = exported.outputs_by_name
     monkeypatch.setattr(exported, "outputs_by_name", lambda feed: feeds.append(feed) or run_file(feed))
     runner.step(None, (runner.preprocessor() if in_a_run else Preprocessor(exported.config))(frame))
@@ -305,7 +305,7 @@ def watch(event, arguments):
         print("CONNECTION", event, arguments, file=sys.stderr)
 sys.addaudithook(watch)
 from pathlib import Path
-from bevcli.workshop.engines.engine import load_exported
+from bevcli.workshop.engines.exported import load_exported
 load_exported(Path({str(small_file)!r}), "openvino")
 """
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)

@@ -18,17 +18,15 @@ from bevcli.errors import BevcliError, WeightsError
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import decode
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries, load
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.engines.differences import check_exported
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx, read_metadata
 from bevcli.workshop.engines.export_step import replace_parts
+from bevcli.workshop.engines.exported import check_exported, load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original
@@ -132,7 +130,7 @@ def test_decoded_boxes_equal_the_decoder_of_the_library(model_and_file):
     found: dict[str, np.ndarray] = {}
     exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
-        expected = decode(step_of_file(exported, small_inputs()), model.config)
+        expected = step_of_file(exported, small_inputs()).boxes(model.config)
     boxes, scores, classes = (found[name] for name in ("boxes", "scores", "classes"))
     np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
     np.testing.assert_allclose(boxes[0, :, :3], expected.centers, atol=1e-5)

@@ -23,8 +23,8 @@ from bevcli.model.temporal_model import build_model
 from bevcli.registry import entries
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.engines.differences import FrameDifference, check_exported
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
+from bevcli.workshop.engines.exported import FrameDifference, check_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original

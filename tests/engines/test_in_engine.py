@@ -19,9 +19,9 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.load import Model, installed_engines, load_model
 from bevcli.inference.run import Session, run
 from bevcli.sequences.open import select_range
-from bevcli.workshop.engines import export_cache as module
-from bevcli.workshop.engines.engine import OnnxRuntimeEngine, OpenVinoEngine, load_exported
-from bevcli.workshop.engines.export_cache import CachedFile, cache_folder
+from bevcli.workshop.engines import engine as module
+from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine
+from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from memory_drive import MemorySequence, make_rig
@@ -128,7 +128,7 @@ def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
         made = [pool.submit(CachedFile("same").get, OnnxRuntimeEngine.open, write) for _ in range(2)]
         assert {task.result()[1] for task in made} == {"drive"}
     assert CachedFile("same").load(OnnxRuntimeEngine.open) is not None
-    assert not list(cache_folder().glob(".unfinished*"))
+    assert not list(CachedFile("same").path.parent.glob(".unfinished*"))
 
 
 def test_probes_need_torch(drive, network):

@@ -19,8 +19,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, apply, rigid
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.workshop.formats.map_lines import LinesWriter, MapLines
 from bevcli.workshop.vad.driving_metrics import PlannedFrame, evaluate_lines, evaluate_plans
-from bevcli.workshop.vad.map_lines import LinesWriter, MapLines
 from bevcli.workshop.vad.plan import Plan, PlanWriter
 
 FRAMES, TIMES = 10, 0.5 * np.arange(1, 7)

@@ -12,7 +12,7 @@ from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.runs.state import load_state, save_state
-from bevcli.workshop.batch.joint_scores import DriveMatches, score_jointly
+from bevcli.workshop.batch.report import DriveMatches, score_jointly
 
 CONFIG = DetectionConfig().cut_at(25)
 

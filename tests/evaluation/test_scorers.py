@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from bevcli import registry
 from bevcli.cli.bridge import command
 from bevcli.cli.commands import evaluate as eval_command
+from bevcli.cli.main import PlainCommand
 from bevcli.evaluation import Scorer
 from bevcli.evaluation.evaluate import evaluate
 from bevcli.geometry.transforms import Pose
@@ -59,7 +60,7 @@ def files(tmp_path, monkeypatch):
 
 def test_its_option_table_and_json_are_those_of_eval(files):
     app = typer.Typer()
-    app.command()(command(eval_command))
+    app.command(cls=PlainCommand)(command(eval_command))
     assert "Also count the boxes." in CliRunner().invoke(app, ["--help"]).stdout
     shown = CliRunner().invoke(app, [*files, "--counts"], catch_exceptions=False)
     assert shown.stdout.endswith("\n\n6 boxes too many\n")

@@ -11,6 +11,7 @@ import pytest
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.vad.driving_metrics import (
     MIN_SCORE,
     PlannedFrame,
@@ -25,7 +26,6 @@ from bevcli.workshop.vad.driving_metrics import (
     occupancy,
     similarity,
 )
-from bevcli.workshop.vad.map_lines import MapLines
 
 VEHICLES = range(14, 24)
 HUMANS = range(2, 9)

@@ -12,7 +12,7 @@ import torch
 
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.nuscenes_writer import TABLES
-from bevcli.workshop.training.files import load_checkpoint
+from bevcli.workshop.training.trainer import load_checkpoint
 
 VALUES = (-6, 0, 2**70, float("nan"), float("inf"), "2", None, [], {})
 

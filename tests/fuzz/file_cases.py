@@ -26,8 +26,8 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch.job import read_record
 from bevcli.workshop.batch.report import to_csv, to_parquet, write_report
 from bevcli.workshop.batch.run_batch import BatchSummary
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.exported import load_exported
 
 onnx = pytest.importorskip("onnx")
 for package in ("onnxruntime", "openvino"):

@@ -116,7 +116,8 @@ def _older_run(folder: Path) -> None:
 def _checkpoint(folder: Path) -> None:
     import torch
 
-    from bevcli.workshop.training.files import LearningCurve, load_checkpoint
+    from bevcli.workshop.training.trainer import load_checkpoint
+    from bevcli.workshop.training.validation import LearningCurve
 
     model = torch.nn.Linear(2, 1)
     load_checkpoint(folder / "checkpoint.pt", model, torch.optim.AdamW(model.parameters()))

@@ -30,7 +30,7 @@ from bevcli.runs.state import RunState, save_state
 from bevcli.runs.summary import Counts
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.training.files import save_checkpoint
+from bevcli.workshop.training.trainer import save_checkpoint
 
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 SIZE = (64, 36)

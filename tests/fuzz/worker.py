@@ -85,10 +85,10 @@ def _serve(connection: Connection, seeds: Path, folder: Path, group: str | None,
     from readers import READERS
     from warm_python import WarmPython
 
-    from bevcli.recording import mesh_file
+    from bevcli.recording import meshes
     from bevcli.viewer import recording_file
 
-    recording_file.run_python = mesh_file.run_python = WarmPython()  # ends with this process, as its input does
+    recording_file.run_python = meshes.run_python = WarmPython()  # ends with this process, as its input does
     warnings.simplefilter("ignore")
     logging.disable()
     own, case = folder / "files", folder / "case"

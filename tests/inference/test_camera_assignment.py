@@ -2,7 +2,7 @@ import pytest
 from memory_drive import make_rig
 
 from bevcli.errors import InputError
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG, assign_cameras
+from bevcli.model.step import NUSCENES_YAWS_DEG, assign_cameras
 
 MODEL = tuple(NUSCENES_YAWS_DEG)
 

@@ -137,7 +137,7 @@ def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
         fast = prepare_for_inference(model, device.device)
         prepared = [replace(frame, images=device.tensor(frame.images)) for frame in prepared]  # were uploaded ahead
-        for name in ("bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"):
+        for name in ("bevcli.model.upload.pinned", "bevcli.inference.pipeline.pinned_place"):
             function = pinned if name.endswith("pinned") else lambda x: pinned(torch.empty(x.shape, dtype=x.dtype))
             monkeypatch.setattr(name, lambda x, name=name, function=function: copied.append(name) or function(x))
         runner = Runner(fast, device.device)
@@ -145,7 +145,7 @@ def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
         for frame in (*prepared, *prepared):
             copied.clear()
             state, _ = runner.step(state, frame)
-    assert copied == ["bevcli.model.upload.pinned", "bevcli.inference.transfer.pinned_place"]
+    assert copied == ["bevcli.model.upload.pinned", "bevcli.inference.pipeline.pinned_place"]
 
 
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):

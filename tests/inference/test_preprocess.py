@@ -14,7 +14,7 @@ from memory_drive import MemorySequence, WithoutImages, make_camera, make_rig
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.inference.preprocess import Preprocessor, image_for_rig
-from bevcli.model.step import model_inputs
+from bevcli.model.step import joined_inputs, model_inputs
 
 TASKS = Path("/proc/self/task")
 
@@ -174,7 +174,7 @@ def test_images_of_long_focal_lengths_keep_the_models_size(mini_config):
 def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
     config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
     prepared = [Preprocessor(config)(MemorySequence(rig=wide_rig(wide)).load(0)) for wide in (2.0, 1.0)]
-    batch = model_inputs(prepared, [None, None], config)
+    batch = joined_inputs([model_inputs(frame, None, config) for frame in prepared])
     assert batch.images.shape == (2, 3, 3, 288, 480)
     height, width = prepared[1].images.shape[-2:]
     torch.testing.assert_close(batch.images[1, ..., :height, :width], prepared[1].images[0])

@@ -3,7 +3,7 @@ import threading
 import pytest
 
 from bevcli.config import load_config
-from bevcli.inference.background import read_ahead
+from bevcli.inference.pipeline import read_ahead
 from bevcli.inference.runner import AHEAD_BYTES, frames_ahead
 
 

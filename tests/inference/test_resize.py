@@ -55,7 +55,7 @@ def test_channels_are_reversed_and_any_memory_layout_is_read():
 
 def test_a_part_of_the_rows_and_columns_is_a_crop():
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    rows, columns = pixel_weights(40, 20, "linear"), pixel_weights(60, 30, "linear")
+    rows, columns = pixel_weights(40, 20, "linear", 5, 15), pixel_weights(60, 30, "linear", 8, 20)
     out = np.zeros((3, 10, 12), np.float32)
-    resize_and_normalize(pixels, rows[5:15], columns[8:20], MEAN, STD, out, reverse_channels=False)
+    resize_and_normalize(pixels, rows, columns, MEAN, STD, out, reverse_channels=False)
     np.testing.assert_allclose(out, by_opencv(pixels, 30, 20, "linear")[:, 5:15, 8:20], atol=5e-6)

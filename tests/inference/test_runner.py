@@ -11,9 +11,9 @@ from bevcli.geometry.transforms import apply
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.step import NUSCENES_YAWS_DEG
 
 
 def assert_same(one, other):

@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from bevcli.inference.background import QUEUE, WriteBehind
+from bevcli.inference.pipeline import QUEUE, WriteBehind
 
 
 def write_behind(work, items, depth=QUEUE):

@@ -17,7 +17,7 @@ from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
-from bevcli.model.kernels.by_hits import Hits
+from bevcli.model.kernels.compiled import Hits
 from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
@@ -153,7 +153,7 @@ def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: 
 def compare_stems() -> None:
     """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
     from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
-    from bevcli.model.kernels.triton_stem import FusedStem
+    from bevcli.model.kernels.triton_convolution import FusedStem
 
     torch.manual_seed(0)
     backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)

@@ -11,8 +11,8 @@ from small_model import small_config
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
-from bevcli.model.box_coding import decode, encode
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import encode
 from bevcli.model.step import ModelOutputs
 
 CONFIG = small_config()
@@ -41,7 +41,7 @@ def test_decoding_undoes_encoding() -> None:
     boxes = some_boxes(6)
     logits = np.full((6, 3), -9.0)
     logits[:, 0] = np.arange(6, 0, -1)  # so that the order by score is this one
-    decoded = decode(outputs(logits, encode(boxes)), CONFIG)[:6]
+    decoded = outputs(logits, encode(boxes)).boxes(CONFIG)[:6]
     for name in ("centers", "sizes_lwh", "velocities"):
         np.testing.assert_allclose(getattr(decoded, name), getattr(boxes, name), atol=1e-4)
     np.testing.assert_allclose(wrap_angle(decoded.yaws - boxes.yaws), 0, atol=1e-5)
@@ -70,7 +70,7 @@ def test_unknown_velocities_are_nan_in_the_code() -> None:
 def test_best_scores_are_decoded_a_query_may_have_two_classes() -> None:
     logits = np.array([[3.0, 2.0, -5.0], [-4.0, 1.0, -6.0]])
     codes = encode(some_boxes(2))
-    boxes = decode(outputs(logits, codes), CONFIG)
+    boxes = outputs(logits, codes).boxes(CONFIG)
     assert boxes.classes[:3].tolist() == ["car", "pedestrian", "pedestrian"]
     assert boxes.scores is not None
     np.testing.assert_allclose(boxes.scores[:3], 1 / (1 + np.exp([-3.0, -2, -1])), rtol=1e-5)
@@ -80,7 +80,7 @@ def test_best_scores_are_decoded_a_query_may_have_two_classes() -> None:
 @pytest.mark.parametrize(("queries", "expected"), [(2, 6), (50, 10)])
 def test_there_are_at_most_max_boxes_boxes(queries: int, expected: int) -> None:
     random = np.random.default_rng(0)
-    boxes = decode(outputs(random.normal(size=(queries, 3)), random.normal(size=(queries, 10))), CONFIG)
+    boxes = outputs(random.normal(size=(queries, 3)), random.normal(size=(queries, 10))).boxes(CONFIG)
     assert len(boxes) == expected
 
 
@@ -93,7 +93,7 @@ def scores_in_a_row(config: ModelConfig, x: list[float], logits: list[list[float
         np.zeros((len(x), 2)),
         np.full(len(x), "car"),
     )
-    decoded = decode(outputs(np.array(logits), encode(boxes)), config)
+    decoded = outputs(np.array(logits), encode(boxes)).boxes(config)
     assert decoded.scores is not None
     assert (np.diff(decoded.scores) <= 0).all()
     best = decoded[decoded.scores > 0.01]
@@ -131,7 +131,7 @@ def merged_boxes(centers: list[tuple[float, float]], logits: list[list[float]]) 
     """The decoded boxes with scores above 0.01, of queries with boxes 2 m wide and long, duplicates merged."""
     count = len(centers)
     boxes = replace(some_boxes(count), sizes_lwh=np.full((count, 3), 2.0), centers=np.insert(centers, 2, 0.5, axis=1))
-    decoded = decode(outputs(np.array(logits), encode(boxes)), MERGING)
+    decoded = outputs(np.array(logits), encode(boxes)).boxes(MERGING)
     assert decoded.scores is not None
     assert (np.diff(decoded.scores) <= 0).all()
     return decoded[decoded.scores > 0.01]
@@ -161,7 +161,7 @@ def test_scores_of_merged_boxes_stay_below_1() -> None:
 
 
 def test_boxes_of_tiny_scores_keep_their_numbers_finite() -> None:
-    boxes = decode(outputs(np.full((3, 3), -300.0), encode(some_boxes(3))), MERGING)
+    boxes = outputs(np.full((3, 3), -300.0), encode(some_boxes(3))).boxes(MERGING)
     assert np.isfinite(boxes.centers).all()
 
 

@@ -16,11 +16,9 @@ from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.calibration_embedding import CalibrationEmbedding, ray_features
 from bevcli.model.deformable_attention import FeatureMaps
-from bevcli.model.image_tokens import ImageTokensConfig
-from bevcli.model.kernels.choose import in_place_of
-from bevcli.model.kernels.last_call import KeptCalibrationEmbedding
+from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokensConfig, ray_features
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, in_place_of
 from bevcli.workshop.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)

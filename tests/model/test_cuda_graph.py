@@ -10,7 +10,7 @@ import torch
 from simulated_device import SimulatedDevice, pinned, simulated
 from torch import Tensor, nn
 
-from bevcli.model.cuda_graph import KEPT_GRAPHS, Captured
+from bevcli.model.kernels.gpu import KEPT_GRAPHS, Captured
 from bevcli.model.upload import packed, unpacked, upload_together
 
 NAME = "cuda:0"

@@ -66,7 +66,7 @@ def test_offsets_are_cells_of_their_own_level() -> None:
 def test_untrained_heads_sample_in_a_ring_with_equal_weights(heads: int) -> None:
     attention = DeformableAttention(16, 16, heads, points=3, levels=2)
     offsets, logits = attention.predict(torch.randn(5, 16))
-    weights = attention.weights(logits)
+    weights = attention.sampling.weights(logits)
     torch.testing.assert_close(weights, torch.full_like(weights, 1 / 6))
     for head in range(heads):
         angle = 2 * math.pi * head / heads

@@ -12,7 +12,6 @@ import torch
 
 from bevcli.geometry.transforms import wrap_angle
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import decode
 from bevcli.model.step import ModelOutputs
 
 Outputs = Callable[[str], ModelOutputs]
@@ -52,7 +51,7 @@ def test_bev_map_and_head_outputs_equal_the_originals(outputs_of: Outputs, step:
 
 @pytest.mark.parametrize("step", STEPS)
 def test_decoded_boxes_equal_the_originals(model: BEVFormer, outputs_of: Outputs, step: str) -> None:
-    boxes = decode(outputs_of(step), model.config)
+    boxes = outputs_of(step).boxes(model.config)
     expected, scores, labels = (KEPT[f"{step}_{name}"] for name in ("boxes", "scores", "labels"))
     np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
     row = original.match_boxes(boxes, expected, labels, model.config.classes)

@@ -17,7 +17,6 @@ import pytest
 import torch
 
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import decode
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.step import ModelInputs, ModelOutputs
 
@@ -123,7 +122,7 @@ def check_outputs(outputs: ModelOutputs, model: BEVFormer, golden: Golden, frame
     assert (off > 1e-3).mean() <= LOGITS_OFF[name]
     assert off.max() <= LARGEST_LOGIT_OFF[name]
     np.testing.assert_allclose(outputs.box_codes[-len(codes) :, 0], codes, atol=LARGEST_CODE_OFF[name])
-    boxes = decode(outputs, model.config)
+    boxes = outputs.boxes(model.config)
     expected_boxes, labels = golden(frame, "coder_bboxes"), golden(frame, "labels_3d")
     np.testing.assert_allclose(boxes.scores, golden(frame, "scores_3d"), atol=LARGEST_SCORE_OFF[name])
     rows = original.match_boxes(boxes, expected_boxes, labels, model.config.classes)

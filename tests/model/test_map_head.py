@@ -9,8 +9,15 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.workshop.uniad.map_encoder import FlatListAttention, sine_position
-from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map, thing_scores
+from bevcli.workshop.uniad.map_head import (
+    FlatListAttention,
+    MapHead,
+    MapHeadConfig,
+    MapOutputs,
+    merge_map,
+    sine_position,
+    thing_scores,
+)
 
 SMALL = MapHeadConfig(
     thing_queries=7,

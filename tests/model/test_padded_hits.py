@@ -10,7 +10,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.choose import in_place_of
 from bevcli.model.kernels.compiled import CompiledSampling
-from bevcli.model.kernels.gpu_layers import PaddedPillars, hits_on_cpu
+from bevcli.model.kernels.gpu import PaddedPillars, hits_on_cpu
 from bevcli.model.pillar_projection import PillarHits, Pillars
 
 GRID = BevGrid(rows=10, columns=12)

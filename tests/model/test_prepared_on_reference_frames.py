@@ -10,7 +10,6 @@ import torch
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model import prepare
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import decode
 from bevcli.model.kernels.onednn import has_matrix_unit
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs
@@ -65,5 +64,5 @@ def test_rounded_products_move_a_quarter_of_the_boxes(model, prepared_fp32):
 def share_within_a_tenth_metre(model: BEVFormer, prepared_fp32: list[ModelOutputs]) -> float:
     half = four_frames(prepare_for_inference(model, CPU, "bf16"))
     pairs = zip(prepared_fp32, half, strict=True)
-    distances = [nearest(decode(one, model.config), decode(other, model.config)) for one, other in pairs]
+    distances = [nearest(one.boxes(model.config), other.boxes(model.config)) for one, other in pairs]
     return float((np.concatenate(distances) < 0.1).mean())

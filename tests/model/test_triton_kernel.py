@@ -66,7 +66,7 @@ def compile_attention(generation: int, heads: int, depth: int, levels: int, poin
 
 def compile_stem(generation: int, dtype: str) -> list[bytes]:
     """The machine code of the pooling of a ResNet's stem."""
-    from bevcli.model.kernels.triton_stem import ELEMENTS_PER_PROGRAM, _pool
+    from bevcli.model.kernels.triton_convolution import ELEMENTS_PER_PROGRAM, _pool
 
     types = dict.fromkeys(("values", "bias", "out"), dtype)
     return [compile_kernel(_pool, generation, types, {"CHANNELS": 64, "BLOCK": ELEMENTS_PER_PROGRAM})]

@@ -19,7 +19,6 @@ import torch
 
 from bevcli.config import load_config
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.model.box_coding import decode
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.prepare import prepare_for_inference
 
@@ -120,7 +119,7 @@ def check_neck(levels: list[torch.Tensor], arrays: Any, prefix: str) -> None:
 
 
 def check_boxes(model: BEVFormerV2, outputs: Any, expected: np.ndarray, scores: np.ndarray, labels: np.ndarray) -> None:
-    boxes = decode(outputs, model.config)
+    boxes = outputs.boxes(model.config)
     np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
     rows = original.match_boxes(boxes, expected, labels, model.config.classes)
     np.testing.assert_allclose(boxes.centers[rows], expected[:, :3], atol=1e-2)

@@ -26,7 +26,7 @@ from bevcli.model.ego_motion import rotate_history
 from bevcli.model.official_keys import from_official
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs
-from bevcli.workshop.vad.motion_head import line_positions
+from bevcli.workshop.vad.heads import line_positions
 from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, decode_plan
 
 KEPT = np.load(original.DATA / "golden_vad.npz")

@@ -10,9 +10,8 @@ from memory_drive import MemorySequence
 
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
-from bevcli.workshop.engines.differences import FrameDifference, check_exported, difference_lines
-from bevcli.workshop.engines.engine import load_exported
 from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.exported import FrameDifference, check_exported, difference_lines, load_exported
 from bevcli.workshop.vad.vad import VAD
 
 pytest.importorskip("onnxruntime")

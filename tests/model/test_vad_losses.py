@@ -10,10 +10,10 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.workshop.vad.config import LossWeights
-from bevcli.workshop.vad.frame_truth import FrameTruth
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
+from bevcli.workshop.formats.map_lines import MapLines
+from bevcli.workshop.vad.heads import LineDecoderConfig, LineOutputs, MotionOutputs
 from bevcli.workshop.vad.losses import (
+    FrameTruth,
     LineTargets,
     boundary_loss,
     collision_loss,
@@ -24,8 +24,7 @@ from bevcli.workshop.vad.losses import (
     motion_losses,
     path_losses,
 )
-from bevcli.workshop.vad.map_lines import MapLines
-from bevcli.workshop.vad.motion_head import MotionOutputs
+from bevcli.workshop.vad.vad import LossWeights
 
 GRID = BevGrid(4, 4, (-10, 10), (-20, 20), (-2, 2))
 EXTENT_M = torch.tensor([20.0, 40.0])

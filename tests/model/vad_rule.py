@@ -16,8 +16,7 @@ from stated_rule import rule_tensor
 
 from bevcli.config import load_config
 from bevcli.model.official_keys import from_official
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.vad import VAD
+from bevcli.workshop.vad.vad import VAD, VADConfig
 
 STEM_GAIN = 1 / 57
 HEAD = r"pts_bbox_head\."

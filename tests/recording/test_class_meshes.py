@@ -12,7 +12,7 @@ from bevcli.config import as_table, config_of_table
 from bevcli.errors import InputError
 from bevcli.geometry.object_classes import ClassSettings, are_nuscenes
 from bevcli.recording import entities, meshes
-from bevcli.recording.colors import class_colors
+from bevcli.recording.entities import class_colors
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 

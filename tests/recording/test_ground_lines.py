@@ -13,11 +13,11 @@ from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
 from bevcli.config import load_config
 from bevcli.geometry.transforms import apply
 from bevcli.recording import entities
-from bevcli.recording.log_bev import future_lines
+from bevcli.recording.frame_log import future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video import CameraImages, draw_frame, tiles
-from bevcli.workshop.vad.map_lines import MapLines, line_colors
+from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
 
 TIMES = np.array([0.5, 1.0])

@@ -5,7 +5,7 @@ import pytest
 from memory_drive import make_camera, make_rig
 
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.recording.blueprint import (
     TEXTS_SHARE,
     TITLE_HEIGHT,

@@ -13,6 +13,8 @@ from bevcli.recording.components import line_strips
 def test_they_equal_rerun_s_own(lengths):
     random = np.random.default_rng(0)
     flat, solid = ([random.normal(size=(length, size)) for length in lengths] for size in (2, 3))
-    assert line_strips(flat, 2).equals(rr.components.LineStrip2DBatch(flat).as_arrow_array())
-    assert line_strips(solid, 3).equals(rr.components.LineStrip3DBatch(solid).as_arrow_array())
-    assert rr.LineStrips2D(line_strips(flat, 2)).strips.as_arrow_array().equals(line_strips(flat, 2))
+    of_flat = line_strips(np.concatenate([np.zeros((0, 2)), *flat]), lengths)
+    of_solid = line_strips(np.concatenate([np.zeros((0, 3)), *solid]), lengths)
+    assert of_flat.equals(rr.components.LineStrip2DBatch(flat).as_arrow_array())
+    assert of_solid.equals(rr.components.LineStrip3DBatch(solid).as_arrow_array())
+    assert rr.LineStrips2D(of_flat).strips.as_arrow_array().equals(of_flat)

@@ -13,10 +13,10 @@ from recorded_drive import record
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import read_bytes
-from bevcli.recording import entities, mesh_file
-from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.mesh_file import read_parts
-from bevcli.recording.meshes import default_vehicle, load_vehicle
+from bevcli.recording import entities, meshes
+from bevcli.recording.entities import EGO_COLOR
+from bevcli.recording.log_static import default_vehicle
+from bevcli.recording.meshes import load_vehicle, read_parts
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -134,7 +134,7 @@ def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, na
         path.write_text("newmtl paint\nKd 1 0 0\n")
     os.mkfifo(folder / "pipe.mtl")
     (folder / "car.obj").write_text(TRIANGLE.format(name))
-    monkeypatch.setattr(mesh_file, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
+    monkeypatch.setattr(meshes, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
     ((_, _, faces, _),) = read_parts(folder / "car.obj")  # a part that is missing has no colour
     assert faces.tolist() == [[0, 1, 2]]
     assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")
@@ -155,7 +155,7 @@ def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path, in_this_process):
 def test_a_mesh_that_takes_too_much_is_an_error_of_one_line(tmp_path, monkeypatch, limit, value, message):
     path = tmp_path / "sphere.ply"
     trimesh.creation.icosphere(subdivisions=7).export(path)  # 300,000 triangles
-    monkeypatch.setattr(mesh_file, limit, value)
+    monkeypatch.setattr(meshes, limit, value)
     with pytest.raises(InputError, match=message) as caught:
         load_vehicle(path)
     assert str(caught.value).startswith(str(path))
@@ -185,7 +185,7 @@ def test_a_mesh_in_millimetres_is_an_error(tmp_path, in_this_process):
 def test_the_default_car_is_drawn_without_trimesh(tmp_path):
     code = (
         "import sys, bevcli.recording.writer\n"
-        "from bevcli.recording.meshes import default_vehicle\n"
+        "from bevcli.recording.log_static import default_vehicle\n"
         "default_vehicle(); print('trimesh' in sys.modules)"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"

@@ -16,7 +16,7 @@ from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, frame_rate_hz
-from bevcli.recording.colors import (
+from bevcli.recording.entities import (
     BACKGROUND,
     GROUND_TRUTH_COLOR,
     MAP_COLORS,

@@ -18,12 +18,12 @@ from bevcli.workshop.robustness.conditions import (
     Draws,
     EgoMotionLost,
     FrameLost,
-    KeptFrames,
     TimeOffsets,
     at_lower_rate,
     motion_during,
 )
 from bevcli.workshop.robustness.stress import split_scenes
+from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
 
 DRAWS = Draws(0, "test")
 
@@ -176,7 +176,7 @@ def test_kept_frames_are_read_once_while_the_memory_lasts():
     drive = WithTruth(3)
     frame_bytes = sum(image.pixels_bgr.nbytes for image in drive.load(0).images.values())
     drive.loads = 0
-    kept = KeptFrames(drive, 2 * frame_bytes)
+    kept = KeptFrames(drive, FrameMemory(2 * frame_bytes), 0)
     for _ in range(3):
         for place in range(3):
             kept.load(place)

@@ -6,7 +6,7 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.workshop.robustness.conditions import NAMES, choose_conditions
-from bevcli.workshop.robustness.results import ConditionScores, StressResults, read_results, stress_table
+from bevcli.workshop.robustness.stress import ConditionScores, StressResults, read_results, stress_table
 
 # NDS as published, each the mean over three severities: clean, then camera crash, frame lost, colour quantisation,
 # motion blur, brightness, low light, fog, snow.

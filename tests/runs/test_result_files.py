@@ -23,12 +23,10 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig
-from bevcli.workshop.vad.map_lines import LinesWriter, MapLines, read_lines
-from bevcli.workshop.vad.motion_head import MotionConfig
+from bevcli.workshop.formats.map_lines import LinesWriter, MapLines, read_lines
+from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
 from bevcli.workshop.vad.plan import Plan, read_plans
-from bevcli.workshop.vad.vad import VAD
+from bevcli.workshop.vad.vad import VAD, VADConfig
 
 FRAMES = 3
 MOTION = MotionConfig(modes=2, steps=3, step_s=0.5, attention_heads=4, feed_forward_width=32)

@@ -14,7 +14,6 @@ from memory_drive import make_camera
 from bevcli import registry
 from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.options import option_of
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.format import GROUP, format_of, formats, option_classes
 from bevcli.sequences.open import open_sequence
@@ -102,7 +101,7 @@ def test_each_option_is_stated_once():
     for number, names in enumerate(own):
         for others in own[number + 1 :]:
             assert names & others <= shared
-    assert all(option_of(field).help for kind in (SequenceOptions, *option_classes()) for field in fields(kind))
+    assert all(field.metadata["option"].help for kind in (SequenceOptions, *option_classes()) for field in fields(kind))
 
 
 def test_an_option_of_another_format_is_refused_by_name(drive):

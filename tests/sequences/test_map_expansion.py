@@ -23,7 +23,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.vad.map_lines import LinesWriter, MapLines
+from bevcli.workshop.formats.map_lines import LinesWriter, MapLines
 from bevcli.workshop.vad.plan import Plan, PlanWriter
 
 TIMES = 0.5 * np.arange(1, 7)

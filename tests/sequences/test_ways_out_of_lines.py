@@ -9,8 +9,8 @@ from memory_drive import MemorySequence
 from bevcli.registry import load
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import WriteOptions
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import GROUP, open_writer
-from bevcli.workshop.vad.map_lines import MapLines
 
 LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
 

@@ -12,12 +12,12 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, TRUE_LINES, read_lines
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive, render as render_sequence
 from bevcli.workshop.synth.looks import WEATHER_NAMES
 from bevcli.workshop.synth.options import Weather, parse_resolution
 from bevcli.workshop.synth.rig import nuscenes_like_rig
-from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, read_lines
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import pytest
 
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.city import STOP_LINE_M, CityPlan
-from bevcli.workshop.synth.roadside import Roadside, StandingActor
+from bevcli.workshop.synth.simulation import Roadside, StandingActor
 
 WORKS = ("barrier-", "cone-", "machine-", "worker-")
 

@@ -6,13 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from bevcli.workshop.training.detection_loss import DetectionTargets, padded
-from bevcli.workshop.training.perspective_loss import (
-    FeatureLocations,
-    ImageObjects,
-    perspective_targets,
-    project_objects,
-)
+from bevcli.workshop.training.frame_losses import FeatureLocations, ImageObjects, perspective_targets, project_objects
+from bevcli.workshop.training.targets import DetectionTargets, padded
 
 
 @dataclass(frozen=True)

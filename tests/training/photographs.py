@@ -31,10 +31,9 @@ from bevcli.inference.load import choose_device
 from bevcli.printing import say
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
-from bevcli.workshop.training import files
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
 from bevcli.workshop.training.options import TrainOptions
-from bevcli.workshop.training.trainer import Trainer
+from bevcli.workshop.training.trainer import Trainer, save_weights
 
 CHANGES = {
     "image": {"mean": [127.0] * 3, "std": [128.0] * 3},
@@ -151,7 +150,7 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
         due = [next(saves)]
 
         def save(name: str) -> None:
-            files.save_weights(asked.out / name, trainer.averaged_model(), torch.float16)
+            save_weights(asked.out / name, trainer.averaged_model(), torch.float16)
 
         def after_update(loss: float) -> None:
             updates[0] += 1

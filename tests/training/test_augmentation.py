@@ -13,7 +13,9 @@ from bevcli.workshop.training.augmentation import (
     CalibrationVariation,
     ImageVariation,
     distort,
-    distort_images,
+    distorted,
+    distorted_images,
+    draw_color_change,
     mask_images,
 )
 
@@ -22,7 +24,7 @@ NONE = AugmentationConfig(photometric=0, grid_mask=0)
 
 def test_probability_zero_leaves_images_unchanged() -> None:
     frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
-    assert distort_images(frame, 0.0, random) is frame
+    assert distorted(frame, {}) is frame
     images = torch.ones(1, 2, 3, 8, 8)
     mask_images(images, 0.0, random)
     assert (images == 1).all()
@@ -30,10 +32,25 @@ def test_probability_zero_leaves_images_unchanged() -> None:
 
 def test_distortion_changes_the_image_and_is_reproducible() -> None:
     pixels = np.full((4, 4, 3), (40, 90, 160), dtype=np.uint8)
-    changed = distort(pixels, 1.0, np.random.default_rng(1))
+    changed = distort(pixels, draw_color_change(1.0, np.random.default_rng(1)))
     assert changed.dtype == np.uint8
     assert not np.array_equal(changed, pixels)
-    assert np.array_equal(changed, distort(pixels, 1.0, np.random.default_rng(1)))
+    assert np.array_equal(changed, distort(pixels, draw_color_change(1.0, np.random.default_rng(1))))
+
+
+@pytest.mark.parametrize("color_order", ["rgb", "bgr"])
+def test_a_device_distorts_images_as_opencv_does(color_order: str) -> None:
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 256, (16, 24, 32, 3), dtype=np.uint8)
+    pixels[:, :4] = pixels[:, :4, :, :1]  # grey, which has no hue
+    drawn = [draw_color_change(0.5, random) for _ in pixels]
+    by_opencv = np.stack([distort(image, one) for image, one in zip(pixels, drawn, strict=True)]).astype(np.float32)
+    ordered = [x[..., ::-1] if color_order == "rgb" else x for x in (pixels, by_opencv)]
+    images, expected = (torch.from_numpy(x.copy()).movedim(-1, 1) for x in ordered)
+    errors = distorted_images(images.float(), torch.tensor(drawn), color_order) - expected
+    assert errors.min() > -0.01
+    assert errors.max() < 1.01  # the other ones are rounded down
+    assert (expected - images).abs().max() > 60
 
 
 def test_the_grid_mask_covers_about_a_quarter() -> None:

@@ -10,14 +10,16 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.segmentation import SegmentationOutputs
-from bevcli.workshop.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss, padded
-from bevcli.workshop.training.frame_losses import DenseHead, DenseLossConfig, dense_loss
-from bevcli.workshop.training.segmentation_loss import (
+from bevcli.workshop.training.losses import (
+    DenseHead,
+    DenseLossConfig,
+    DetectionLossConfig,
     SegmentationLossConfig,
-    SegmentationTargets,
-    padded_masks,
+    dense_loss,
+    detection_loss,
     segmentation_loss,
 )
+from bevcli.workshop.training.targets import DetectionTargets, SegmentationTargets, padded, padded_masks
 
 COUNTS = (1, 5, 2)  # objects of the frames; a batch is padded to 5
 RANDOM = torch.Generator().manual_seed(0)

@@ -18,11 +18,12 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.clip_steps import forward_clip
+from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_training
 from bevcli.workshop.training.options import TrainOptions
-from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
-from bevcli.workshop.training.trainer import Trainer, forward_clip
+from bevcli.workshop.training.trainer import Trainer
 
 V1 = replace(CONFIG, heads=("detection",))
 WINDOW = BEVFormerV2Config(

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.workshop.training.detection_loss import DetectionLossConfig, DetectionTargets
-from bevcli.workshop.training.frame_losses import DenseHead, DenseLossConfig, dense_loss
+from bevcli.workshop.training.losses import DenseHead, DenseLossConfig, DetectionLossConfig, dense_loss
+from bevcli.workshop.training.targets import DetectionTargets
 
 GRID = BevGrid(4, 4, (-4, 4), (-4, 4), (-3, 3), 4)  # cells of 2 m, centres at ±1 and ±3
 

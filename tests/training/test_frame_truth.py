@@ -16,17 +16,16 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.clip_steps import forward_clip
 from bevcli.workshop.training.frame_losses import FrameLosses, LossConfigs
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
 from bevcli.workshop.training.samples import Clip, ClipConfig, load_batch
-from bevcli.workshop.training.trainer import Trainer, forward_clip
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.frame_truth import frame_truth
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig
-from bevcli.workshop.vad.map_lines import MapLines
-from bevcli.workshop.vad.motion_head import MotionConfig
-from bevcli.workshop.vad.vad import VAD
+from bevcli.workshop.training.trainer import Trainer
+from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
+from bevcli.workshop.vad.losses import frame_truth
+from bevcli.workshop.vad.vad import VAD, VADConfig
 
 VAD_CONFIG = VADConfig(
     **{field.name: getattr(CONFIG, field.name) for field in fields(CONFIG)} | {"heads": ("detection",)},

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bevcli.model.resnet import ResNet, ResNetConfig
+from bevcli.workshop.training.clip_steps import FrozenStages
 from bevcli.workshop.training.job import ProcessGroup
-from bevcli.workshop.training.trainer import FrozenStages
 
 
 def made_backbone() -> ResNet:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from painted_drives import CONFIG, PaintedDrives
+from painted_drives import CONFIG, PaintedDrive, PaintedDrives
+from simulated_device import simulated
 from torch import Tensor
 
 from bevcli.inference.preprocess import write_network_image
 from bevcli.model.config import ImageConfig
+from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
 from bevcli.workshop.training.augmentation import AugmentationConfig, noisy
-from bevcli.workshop.training.loading import BatchMaker, loaded_batches
-from bevcli.workshop.training.samples import ClipConfig, images_from_bytes, write_bytes
+from bevcli.workshop.training.job import free_memory
+from bevcli.workshop.training.samples import BatchMaker, ClipConfig, images_from_bytes, loaded_batches, write_bytes
 
 NOTHING, NOISE = AugmentationConfig(0, 0), AugmentationConfig(0.5, 0.5, exposure=1.0, noise=6.0, calibration_share=0.5)
 LITE = ImageConfig((64, 48), mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), color_order="rgb")
@@ -65,6 +69,75 @@ def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:
             assert torch.equal(alone.image_from_bev[0], together.image_from_bev[place])
         for own, of_batch in zip(clip.targets, batch.targets, strict=True):
             assert torch.equal(own.detection[0].labels, of_batch.detection[place].labels)
+
+
+@pytest.mark.parametrize("in_bytes", [False, True])
+def test_batches_of_kept_images_are_those_of_images_read_anew(in_bytes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    worst = replace(NOISE, corrupted_share=0.6, lost_cameras_share=0.5, drop_image=0.2, white_balance=0.2)
+    plain, turns, reads, load = maker(worst, in_bytes=in_bytes), [(0, 0), (1, 0), (2, 0)], [], PaintedDrive.load
+    frame_bytes = sum(image.pixels_bgr.nbytes for image in plain.drives.open(0).load(0).images.values())
+    monkeypatch.setattr(PaintedDrive, "load", lambda drive, place: reads.append(place) or load(drive, place))
+    expected, counts = [plain(*turn) for turn in turns], []
+    for kept_frames in (0, 3, 100):
+        made = replace(plain, drives=KeptDrives(plain.drives, FrameMemory(kept_frames * frame_bytes)))
+        reads.clear()
+        for turn, batch in zip(turns, expected, strict=True):
+            assert_equal(made(*turn), batch)
+        counts.append(len(reads))
+    assert counts[0] == len(turns) * CLIPS.batch * CLIPS.frames
+    assert counts[0] > counts[1] > counts[2] == 6  # three drives of two frames
+
+
+def test_kept_frames_stay_in_their_process() -> None:
+    drives = PaintedDrives(1, all_labelled=True)
+    kept = KeptDrives(drives, FrameMemory(10**9))
+    first = kept.open(0).load(0)
+    assert kept.open(0).load(0) is first
+    copied = pickle.loads(pickle.dumps(kept))
+    assert len(pickle.dumps(kept)) < 10**5
+    assert np.array_equal(copied.open(0).load(0).images["CAM_FRONT"].pixels_bgr, first.images["CAM_FRONT"].pixels_bgr)
+
+
+def test_free_memory_is_within_the_limit_of_a_container(tmp_path: Path) -> None:
+    groups = tmp_path / "sys/fs/cgroup"
+    for folder in (tmp_path / "proc", groups / "memory"):
+        folder.mkdir(parents=True)
+    assert free_memory(tmp_path) == 0
+    (tmp_path / "proc/meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    8000 kB\n")
+    assert free_memory(tmp_path) == 8_192_000
+    (groups / "memory.max").write_text("max\n")
+    assert free_memory(tmp_path) == 8_192_000
+    (groups / "memory.max").write_text("5000000\n")
+    (groups / "memory.current").write_text("4000000\n")
+    (groups / "memory.stat").write_text("anon 1000000\ninactive_file 2500000\nactive_file 500000\n")
+    assert free_memory(tmp_path) == 3_500_000
+    (groups / "memory.current").write_text("9000000\n")
+    assert free_memory(tmp_path) == 0
+
+
+def test_images_in_bytes_are_distorted_where_they_are_normalised() -> None:
+    """The same draws, so that only the rounding differs; what is masked stays grey."""
+    changes = AugmentationConfig(0.7, 0.7, exposure=0.5)
+    floats, in_bytes = maker(changes)(0, 0), maker(changes, in_bytes=True)(0, 0)
+    normalised = in_bytes.normalised(CONFIG.image)
+    undistorted = replace(in_bytes, distortions=()).normalised(CONFIG.image)
+    std = torch.tensor(CONFIG.image.std).view(3, 1, 1)
+    for own, other, before in zip(floats.inputs, normalised.inputs, undistorted.inputs, strict=True):
+        errors = (own.images - other.images).abs() * std
+        assert errors.quantile(0.99) <= 1.01
+        assert ((own.images == 0) == (other.images == 0)).float().mean() > 0.99
+        assert ((own.images - before.images).abs() * std).mean() > 5
+
+
+def test_a_gpu_distorts_and_normalises_without_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = maker(AugmentationConfig(1.0, 0.5), in_bytes=True)(0, 0)
+    expected = batch.normalised(CONFIG.image)
+    with simulated("cuda:0", monkeypatch, lambda *_, **__: None) as device:
+        found = batch.to(device.device).normalised(CONFIG.image)
+        assert device.waits == []
+        for own, other in zip(expected.inputs, found.inputs, strict=True):
+            torch.testing.assert_close(other.images.held, own.images)
+            assert own.image_from_bev is other.image_from_bev
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.workshop.training.detection_loss import (
+from bevcli.workshop.training.losses import (
     DetectionLossConfig,
-    DetectionTargets,
     detection_loss,
+    dice_costs,
+    dice_loss,
     focal_cost,
     focal_loss,
     hungarian_matching,
 )
-from bevcli.workshop.training.segmentation_loss import dice_costs, dice_loss
+from bevcli.workshop.training.targets import DetectionTargets
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])

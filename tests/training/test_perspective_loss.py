@@ -18,16 +18,16 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.detection_loss import DetectionTargets
-from bevcli.workshop.training.frame_losses import FrameLosses
-from bevcli.workshop.training.job import TrainingConfig
-from bevcli.workshop.training.perspective_loss import (
+from bevcli.workshop.training.frame_losses import (
+    FrameLosses,
     PerspectiveHead,
     PerspectiveLossConfig,
     feature_locations,
     perspective_loss,
 )
+from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.samples import Batch, Clip, load_batch
+from bevcli.workshop.training.targets import DetectionTargets
 
 WEIGHTS = PerspectiveLossConfig(weight=1.0)
 NOTHING = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))

@@ -11,12 +11,9 @@ import torch
 from one_image import ImageTargets, objects_of_image, targets_of_image
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import encode
-from bevcli.workshop.training.detection_loss import DetectionTargets
-from bevcli.workshop.training.perspective_loss import (
-    OUTLINE_DEPTH_M,
-    feature_locations,
-)
+from bevcli.model.decoder import encode
+from bevcli.workshop.training.frame_losses import OUTLINE_DEPTH_M, feature_locations
+from bevcli.workshop.training.targets import DetectionTargets
 
 SIZE = (224, 384)  # height, width
 SHAPES = [(28, 48), (14, 24), (7, 12)]  # strides 8, 16, 32

@@ -9,11 +9,8 @@ import torch
 from torch import Tensor
 
 from bevcli.model.segmentation import SegmentationOutputs
-from bevcli.workshop.training.segmentation_loss import (
-    SegmentationLossConfig,
-    SegmentationTargets,
-    segmentation_loss,
-)
+from bevcli.workshop.training.losses import SegmentationLossConfig, segmentation_loss
+from bevcli.workshop.training.targets import SegmentationTargets
 
 CONFIG = SegmentationLossConfig(class_weight=1.0, location_weight=2.0, dice_weight=3.0, pixel_weight=4.0)
 LEFT, RIGHT, NOTHING = [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0] * 4

@@ -12,8 +12,7 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.workshop.training.detection_loss import detection_targets
-from bevcli.workshop.training.segmentation_loss import segmentation_targets
+from bevcli.workshop.training.targets import detection_targets, segmentation_targets
 
 GRID = BevGrid(4, 8, x_range_m=(-8, 8), y_range_m=(-4, 4))  # cells of 2 m
 

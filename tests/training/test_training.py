@@ -20,17 +20,24 @@ from bevcli.cli.stop_signals import StopSignals
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
+from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, scored_drives, training_drives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.commands import _run
-from bevcli.workshop.training.files import LearningCurve, load_checkpoint, save_checkpoint
-from bevcli.workshop.training.frame_losses import DenseLossConfig
+from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
+from bevcli.workshop.training.losses import DenseLossConfig
 from bevcli.workshop.training.options import TrainOptions
-from bevcli.workshop.training.perspective_loss import PerspectiveLossConfig
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
+from bevcli.workshop.training.trainer import (
+    Trainer,
+    alternated,
+    load_checkpoint,
+    make_optimizer,
+    save_checkpoint,
+    set_learning_rate,
+)
+from bevcli.workshop.training.validation import LearningCurve
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)
@@ -368,36 +375,28 @@ def test_the_training_table_is_read_apart_from_the_model_config(tmp_path: Path) 
 
 
 def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
-    for folders, seeds in (([], None), ([tmp_path], [0, 1])):
+    for folders, seeds in (((), None), ((tmp_path,), (0, 1))):
         with pytest.raises(InputError, match="give either `data=DIR`"):
-            open_drives(folders, seeds, tmp_path, CONFIG)
-    assert len(open_drives([tmp_path], None, tmp_path, CONFIG)) == 1
-    assert len(open_drives([], [3, 9], tmp_path, CONFIG)) == 2
-
-
-class NumberedDrives:
-    """Five drives, of which each is only a number."""
-
-    input_shapes = None
-
-    def __len__(self) -> int:
-        return 5
-
-    def open(self, index: int) -> int:
-        return range(5)[index]
+            scored_drives(DriveOptions(data=folders, rendered=seeds), CONFIG)
+    assert len(scored_drives(DriveOptions(data=(tmp_path,)), CONFIG)) == 1
+    assert len(scored_drives(DriveOptions(rendered=(3, 9)), CONFIG)) == 2
 
 
 @pytest.mark.parametrize(
     ("held_out", "trained_on", "evaluated_on"), [(2, [0, 1, 2], [3, 4]), (0, [0, 1, 2, 3, 4], [0, 1, 2, 3, 4])]
 )
-def test_the_last_drives_are_held_out(held_out: int, trained_on: list[int], evaluated_on: list[int]) -> None:
-    parts = split_drives(NumberedDrives(), held_out)
-    assert [[part.open(index) for index in range(len(part))] for part in parts] == [trained_on, evaluated_on]
+def test_the_last_drives_are_held_out(
+    held_out: int, trained_on: list[int], evaluated_on: list[int], tmp_path: Path
+) -> None:
+    folders = tuple(Path(f"{number}") for number in range(5))
+    for data in (DriveOptions(data=folders), DriveOptions(rendered=tuple(range(5)))):
+        parts = training_drives(data, held_out, tmp_path, CONFIG, None)
+        assert [[int(folder.name) for folder in part.folders] for part in parts] == [trained_on, evaluated_on]
 
 
-def test_holding_out_all_drives_is_rejected() -> None:
+def test_holding_out_all_drives_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="5 drives are too few with 5 of them held out"):
-        split_drives(NumberedDrives(), 5)
+        training_drives(DriveOptions(rendered=tuple(range(5))), 5, tmp_path, CONFIG, None)
 
 
 def test_seeds_are_a_range_or_a_list() -> None:

@@ -19,7 +19,7 @@ from bevcli.geometry.object_classes import ClassSettings
 from bevcli.inference.load import weights_file
 from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.workshop.training.files import save_weights
+from bevcli.workshop.training.trainer import save_weights
 from bevcli.workshop.training.warm_start import WarmStart, warm_start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))

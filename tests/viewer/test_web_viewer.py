@@ -230,7 +230,7 @@ def test_a_browser_shows_the_recording(tmp_path):
     if CHROMIUM is None:
         pytest.skip("no chromium here: apt-get install chromium")
     record(tmp_path / "recording.rrd", MemorySequence(3))
-    command = [sys.executable, "-c", "from bevcli.cli.main import run_app; run_app()", "viz"]
+    command = [sys.executable, "-m", "bevcli", "viz"]
     server = subprocess.Popen(
         [*command, str(tmp_path / "recording.rrd"), "--web"], stdout=subprocess.PIPE, text=True, bufsize=1
     )

@@ -57,7 +57,7 @@ class BEVFormer(Network):
     def step(
         self, prepared: PreparedFrame, memory: BevHistory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, BevHistory]:
-        inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
+        inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
         inputs = replace(inputs, images=upload(inputs.images, self.device))
         outputs = self(inputs, None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)

@@ -72,5 +72,7 @@ class OwnQueriesAttention(nn.Module):
 
     def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
         """As `TemporalSelfAttention.forward`; the position is not read."""
-        sums = (self.both(query) + self.constant).split(self.sizes, dim=-1)
-        return self.plain.sample(bev_maps, reference_points, *self.plain.attention.as_samples(*sums))
+        offsets, logits = (self.both(query) + self.constant).split(self.sizes, dim=-1)
+        shape = self.plain.attention.shape
+        offsets, logits = offsets.float().unflatten(-1, (*shape, 2)), logits.unflatten(-1, shape)
+        return self.plain.sample(bev_maps, reference_points, offsets, logits)

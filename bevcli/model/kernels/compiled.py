@@ -6,16 +6,18 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.model.deformable_attention import GridSampling, LevelShapes
-from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
-from bevcli.model.kernels.by_hits import Hits
+
+if TYPE_CHECKING:  # not every backbone has one
+    from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 # More ranges than threads: where another process delays one thread, the others take over its ranges.
 RANGES_PER_THREAD = 8
@@ -23,6 +25,24 @@ RANGES_PER_THREAD = 8
 SAMPLES_PER_RANGE = 1 << 15
 # Sampled taps of one tile: large enough for a fast matrix product, small enough to stay in the cache.
 TILE_BYTES = 8 << 20
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The M pairs of a value map and a query that samples it, ordered by map.
+
+    Attributes:
+        query: (M,) int64, index of the query in B·Q.
+        reference_points: (M, Z, 2) float32, x and y, 0 to 1 over the map; sample p lies around point p mod Z.
+        hits_per_map: G counts, of sum M.
+        prediction: (M,) int64, which of the predictions of its query belongs to the map: an index in the axis "maps" of
+            `DeformableAttention.predict`.
+    """
+
+    query: Tensor
+    reference_points: Tensor
+    hits_per_map: Sequence[int]
+    prediction: Tensor
 
 
 class CompiledSampling(GridSampling):
@@ -38,8 +58,17 @@ class CompiledSampling(GridSampling):
     ) -> Tensor:
         """As `GridSampling.forward`; the gradients are computed in float32."""
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
-            values = values.float()
-        return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
+            learned = values.float(), locations.float(), weights.float()
+            return _WeightedSums.apply(*learned, level_shapes, queries_per_map)
+        from bevcli.model.kernels.loops import sample_maps  # loads the compiler, which not every run needs
+
+        map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
+        out = torch.empty(len(locations), *values.shape[2:])
+        shapes = np.asarray(level_shapes, dtype=np.int64)
+        arrays = (as_array(values), shapes, as_array(locations.float()), as_array(weights.float()), map_of_query)
+        smallest = max(64, SAMPLES_PER_RANGE // max(math.prod(weights.shape[1:]), 1))
+        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), smallest)
+        return out.flatten(1)
 
 
 def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: Tensor, logits: Tensor) -> Tensor:
@@ -52,19 +81,15 @@ def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: 
         offsets: (B·Q, heads, maps, L, P, 2) float32, in cells of a level, from the reference points.
         logits: (B·Q, heads, maps, L, P), of the weights.
     """
-    from bevcli.model.kernels.bilinear import sample_hits as compiled  # loads the compiler
+    from bevcli.model.kernels.loops import sample_hits as compiled  # loads the compiler
 
     map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_map)
     out = torch.empty(len(hits.query), *values.shape[2:])
     read = (as_array(values), np.asarray(level_shapes, dtype=np.int64))
     of_hits = (*map(as_array, (hits.reference_points, offsets, logits)), hits.query.numpy(), hits.prediction.numpy())
-    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), _range_of(logits[:, :, 0]))
+    smallest = max(64, SAMPLES_PER_RANGE // max(logits.shape[1] * math.prod(logits.shape[3:]), 1))
+    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), smallest)
     return out.flatten(1)
-
-
-def _range_of(weights: Tensor) -> int:
-    """The smallest number of queries for which a thread is worth its while. weights: (M, heads, L, P)."""
-    return max(64, SAMPLES_PER_RANGE // max(math.prod(weights.shape[1:]), 1))
 
 
 class _WeightedSums(torch.autograd.Function):
@@ -79,20 +104,13 @@ class _WeightedSums(torch.autograd.Function):
         level_shapes: Sequence[tuple[int, int]],
         queries_per_map: Sequence[int],
     ) -> Tensor:
-        from bevcli.model.kernels.bilinear import sample_maps  # loads the compiler, which not every run needs
-
         context.save_for_backward(values, locations, weights)
         context.level_shapes, context.queries_per_map = level_shapes, queries_per_map
-        shapes = np.asarray(level_shapes, dtype=np.int64)
-        map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
-        out = torch.empty(len(locations), *values.shape[2:])
-        arrays = (as_array(values), shapes, as_array(locations), as_array(weights), map_of_query)
-        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), _range_of(weights))
-        return out.flatten(1)
+        return CompiledSampling()(values, level_shapes, locations, weights, queries_per_map)  # without gradients
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        from bevcli.model.kernels.bilinear import sample_maps_backward
+        from bevcli.model.kernels.loops import sample_maps_backward
 
         values, locations, weights = context.saved_tensors
         results = torch.zeros(values.shape), torch.empty(locations.shape), torch.empty(weights.shape)
@@ -113,7 +131,7 @@ class CompiledDeformableConvolution(nn.Module):
     product with the weight of all nine taps gives the result.
     """
 
-    def __init__(self, convolution: ModulatedDeformableConvolution) -> None:
+    def __init__(self, convolution: "ModulatedDeformableConvolution") -> None:
         """The convolution has a bias, the rest of a batch norm that was folded into it."""
         super().__init__()
         self.stride, self.out_channels = convolution.stride, len(convolution.weight)
@@ -126,7 +144,8 @@ class CompiledDeformableConvolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, O, H', W'), channels last."""
-        from bevcli.model.kernels.bilinear import sample_taps  # loads the compiler, which not every run needs
+        from bevcli.model.deformable_convolution import split_offsets_and_mask
+        from bevcli.model.kernels.loops import sample_taps  # loads the compiler, which not every run needs
 
         offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
         batch, channels = x.shape[:2]
@@ -148,25 +167,22 @@ class CompiledDeformableConvolution(nn.Module):
         return out.view(batch, height, width, -1).permute(0, 3, 1, 2)
 
 
-class CompiledPool(nn.Module):
+class CompiledPool(nn.MaxPool2d):
     """Takes the place of the max-pooling of a backbone's stem, which a ReLU follows: it gives 0 for negative maxima.
 
     Numbers that are not negative have the order of their bits, so that the loop compares integers.
+
+    Attributes:
+        loaded: set when the compiled loops are loaded. Until then the plain pooling runs, which need not wait.
     """
 
-    def __init__(self, pool: nn.MaxPool2d, loaded: threading.Event) -> None:
-        """loaded: set when the compiled loops are loaded. Until then the plain pooling runs, which need not wait."""
-        super().__init__()
-        assert (pool.kernel_size, pool.stride, pool.padding, pool.dilation) == (3, 2, 1, 1)
-        self.pool, self.loaded = pool, loaded
+    loaded: threading.Event
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
-        return self.pooled(x) if self.loaded.is_set() else self.pool(x)
-
-    def pooled(self, x: Tensor) -> Tensor:
-        """As `forward`, by the compiled loop."""
-        from bevcli.model.kernels.bilinear import max_of_windows
+        if not self.loaded.is_set():
+            return super().forward(x)
+        from bevcli.model.kernels.loops import max_of_windows
 
         x = x.permute(0, 2, 3, 1).contiguous()  # (B, H, W, C)
         bits = torch.int32 if x.dtype == torch.float32 else torch.int16
@@ -182,13 +198,15 @@ def load_compiled(dtype: torch.dtype, loaded: threading.Event) -> None:
     Raises nothing: the first frame meets the same error, in a thread that tells it. Then `loaded` is not set.
     """
     with contextlib.suppress(Exception):
-        sampling, pool = CompiledSampling(), CompiledPool(nn.MaxPool2d(3, stride=2, padding=1), loaded)
-        place = torch.zeros(1, 1, 1, 1, 2)
-        hit = Hits(torch.zeros(1, dtype=torch.int64), place[0, 0], (1,), torch.zeros(1, dtype=torch.int64))
+        sampling, pool = CompiledSampling(), CompiledPool(3, stride=2, padding=1)
+        pool.loaded = threading.Event()
+        pool.loaded.set()
+        location = torch.zeros(1, 1, 1, 1, 2)
+        hit = Hits(torch.zeros(1, dtype=torch.int64), location[0, 0], (1,), torch.zeros(1, dtype=torch.int64))
         for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
-            sampling(values, [(1, 1)], place, place[..., 0], [1])
-            sample_hits(values, ((1, 1),), hit, place[None], place[None, ..., 0])
-        pool.pooled(torch.zeros(1, 1, 1, 1, dtype=dtype))
+            sampling(values, [(1, 1)], location, location[..., 0], [1])
+            sample_hits(values, ((1, 1),), hit, location[None], location[None, ..., 0])
+        pool(torch.zeros(1, 1, 1, 1, dtype=dtype))
         loaded.set()
 
 
@@ -222,7 +240,8 @@ def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64)
     pool = _pool(os.getpid(), threads - 1)
     helpers = [pool.submit(take_ranges) for _ in range(min(threads, len(starts)) - 1)]
     try:
-        take_ranges()
+        for start in left:  # as the helpers
+            work(start, min(start + step, rows))
     finally:
         wait(helpers)
     for helper in helpers:

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
-from bevcli.model.feed_forward import FeedForward
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution
+from bevcli.model.encoder import FeedForward
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
 Activation = Literal["none", "relu", "relu6"]
@@ -92,21 +91,19 @@ class PackedConvolution(nn.Module):
         self.geometry = (*map(list, geometry), convolution.groups)
         self.packed_for: torch.Size | None = None
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x: (B, in, H, W) -> (B, out, H', W'), channels last."""
-        arguments = x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise(*arguments, *self.activation, "")
+    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H', W'), channels last.
 
-    def add_to(self, shortcut: Tensor, x: Tensor) -> Tensor:
-        """activation(convolution(x) + shortcut), (B, out, H', W'), in the memory of the shortcut."""
-        arguments = shortcut, x, self._packed(x.shape), self.bias, *self.geometry
-        return torch.ops.mkldnn._convolution_pointwise_.binary(*arguments, "add", 1.0, self.after_sum, [], "")
-
-    def _packed(self, input_size: torch.Size) -> Tensor:
-        if self.packed_for != input_size:
+        With a shortcut: activation(convolution(x) + shortcut), in the memory of the shortcut.
+        """
+        if self.packed_for != x.shape:
             pack = torch.ops.mkldnn._reorder_convolution_weight
-            self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(input_size)), input_size
-        return self.packed
+            self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(x.shape)), x.shape
+        arguments = x, self.packed, self.bias, *self.geometry
+        if shortcut is None:
+            return torch.ops.mkldnn._convolution_pointwise(*arguments, *self.activation, "")
+        add = torch.ops.mkldnn._convolution_pointwise_.binary
+        return add(shortcut, *arguments, "add", 1.0, self.after_sum, [], "")
 
 
 class PackedSameConvolution(PackedConvolution):
@@ -116,8 +113,8 @@ class PackedSameConvolution(PackedConvolution):
         super().__init__(convolution, activation)
         self.padding_for = convolution.padding_for
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x: (B, in, H, W) -> (B, out, H / 2, W / 2), rounded up, channels last."""
+    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H / 2, W / 2), rounded up, channels last. There is no shortcut."""
         padding, rows, columns = self.padding_for(x)
         self.geometry = (padding, *self.geometry[1:])
         return super().forward(x)[..., rows:, columns:]
@@ -129,13 +126,18 @@ class FusedInvertedResidual(nn.Module):
     def __init__(self, block: InvertedResidual) -> None:
         super().__init__()
         wide = [layer for layer in (block.expand, block.depthwise) if layer is not None]
-        self.wide = nn.Sequential(*(_packed(layer, "relu6") for layer in wide))
+        self.wide = nn.Sequential()
+        for layer in wide:
+            if isinstance(layer, SameConvolution):
+                self.wide.append(PackedSameConvolution(layer, "relu6"))
+            else:
+                self.wide.append(PackedConvolution(layer, "relu6"))
         self.project, self.adds = PackedConvolution(block.project), block.adds
 
     def forward(self, x: Tensor) -> Tensor:
         """As the block's own `forward`. Where it adds x, the result is written over x."""
         y = self.wide(x)
-        return self.project.add_to(x, y) if self.adds else self.project(y)
+        return self.project(y, x if self.adds else None)
 
 
 class FusedBlock(nn.Module):
@@ -144,28 +146,22 @@ class FusedBlock(nn.Module):
     def __init__(self, block: Bottleneck | BasicBlock) -> None:
         super().__init__()
         *first, last = [child for name, child in block.named_children() if name.startswith("conv")]
-        self.first = nn.Sequential(*(_with_relu(convolution) for convolution in first))
+        self.first = nn.Sequential()
+        for convolution in first:
+            if isinstance(convolution, nn.Conv2d):
+                self.first.append(PackedConvolution(convolution, "relu"))
+            else:  # a `CompiledDeformableConvolution`, whose result is a linear layer's
+                product = convolution.get_submodule("product")
+                assert isinstance(product, nn.Linear)
+                convolution.set_submodule("product", PackedLinear(product, "relu"))
+                self.first.append(convolution)
         assert isinstance(last, nn.Conv2d)
         self.last, self.downsample = PackedConvolution(last, "relu"), block.downsample
 
     def forward(self, x: Tensor) -> Tensor:
         """As the block's own `forward`. Without a `downsample` the result is written over x."""
         y = self.first(x)
-        return self.last.add_to(self.downsample(x), y)
-
-
-def _packed(convolution: nn.Conv2d, activation: Activation = "none") -> PackedConvolution:
-    if isinstance(convolution, SameConvolution):
-        return PackedSameConvolution(convolution, activation)
-    return PackedConvolution(convolution, activation)
-
-
-def _with_relu(convolution: nn.Module) -> nn.Module:
-    if isinstance(convolution, nn.Conv2d):
-        return PackedConvolution(convolution, "relu")
-    assert isinstance(convolution, CompiledDeformableConvolution)
-    convolution.set_submodule("product", PackedLinear(convolution.product, "relu"))
-    return convolution
+        return self.last(y, self.downsample(x))
 
 
 def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
@@ -174,26 +170,28 @@ def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
     Batch norms must be folded already. rounds: linear layers of float32 compute in `rounded_products`, except for those
     that predict positions: boxes would move.
     """
-    for name, child in part.named_children():
-        rounds_child = rounds and name != "reference_points" and not isinstance(child, RegressionBranch)
-        fast = _fast(child, rounds_child)
-        setattr(part, name, fast)
-        use_onednn(fast, rounds=rounds_child)
-
-
-def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
-    """The replacement of a layer; the layer itself where oneDNN has nothing for it, or not in this dtype."""
-    parameter = next(layer.parameters(), None)
-    if parameter is None or not has_onednn(parameter.dtype):
-        return layer
-    if isinstance(layer, Bottleneck | BasicBlock):
-        return FusedBlock(layer)
-    if isinstance(layer, InvertedResidual):
-        return FusedInvertedResidual(layer)
-    if isinstance(layer, FeedForward):  # dropout has no effect in inference
-        expand = PackedLinear(layer.expand, layer.activation, rounds=rounds)
-        return nn.Sequential(expand, PackedLinear(layer.reduce, rounds=rounds))
-    # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
-    if type(layer) is nn.Linear:
-        return PackedLinear(layer, rounds=rounds)
-    return _packed(layer) if isinstance(layer, nn.Conv2d) else layer
+    left = [(part, rounds)]
+    while left:
+        parent, rounds_parent = left.pop()
+        for name, child in parent.named_children():
+            rounds_child = rounds_parent and name != "reference_points" and not isinstance(child, RegressionBranch)
+            fast = child
+            parameter = next(child.parameters(), None)
+            if parameter is None or not has_onednn(parameter.dtype):
+                pass
+            elif isinstance(child, Bottleneck | BasicBlock):
+                fast = FusedBlock(child)
+            elif isinstance(child, InvertedResidual):
+                fast = FusedInvertedResidual(child)
+            elif isinstance(child, FeedForward):  # dropout has no effect in inference
+                expand = PackedLinear(child.expand, child.activation, rounds=rounds_child)
+                fast = nn.Sequential(expand, PackedLinear(child.reduce, rounds=rounds_child))
+            elif isinstance(child, SameConvolution):
+                fast = PackedSameConvolution(child)
+            elif isinstance(child, nn.Conv2d):
+                fast = PackedConvolution(child)
+            # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
+            elif type(child) is nn.Linear:
+                fast = PackedLinear(child, rounds=rounds_child)
+            setattr(parent, name, fast)
+            left.append((fast, rounds_child))

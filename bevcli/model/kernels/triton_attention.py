@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from bevcli.model.deformable_attention import GridSampling, LevelShapes
-from bevcli.model.kernels.by_hits import Hits
+from bevcli.model.kernels.compiled import Hits
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32
@@ -226,12 +226,12 @@ def _sample_hits(  # type: ignore[no-untyped-def]
         height = tl.load(shapes + 2 * level)
         width = tl.load(shapes + 2 * level + 1)
         for point in range(POINTS):
-            place = first_sample + level * POINTS + point
+            element = first_sample + level * POINTS + point
             reference = reference_points + 2 * (hit * PILLAR_POINTS + point % PILLAR_POINTS)
-            x = tl.load(reference, exists, -1.0) + tl.load(offsets + 2 * place, exists, 0.0) / width
-            y = tl.load(reference + 1, exists, -1.0) + tl.load(offsets + 2 * place + 1, exists, 0.0) / height
+            x = tl.load(reference, exists, -1.0) + tl.load(offsets + 2 * element, exists, 0.0) / width
+            y = tl.load(reference + 1, exists, -1.0) + tl.load(offsets + 2 * element + 1, exists, 0.0) / height
             y, x = _cells(y, x, height, width)
-            weight = tl.exp(tl.load(logits + place, exists, 0.0) - largest) / sum_of_weights
+            weight = tl.exp(tl.load(logits + element, exists, 0.0) - largest) / sum_of_weights
             for corner in tl.static_range(4):
                 cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
                 address = values + (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
@@ -284,11 +284,11 @@ def _sample_backward(  # type: ignore[no-untyped-def]
             of_weight = tl.zeros((BLOCK,), tl.float32)
             for corner in tl.static_range(4):
                 cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
-                place = (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
+                element = (cell[:, None] * HEADS + head) * DEPTH + channel[None, :]
                 read = inside[:, None] & has_channel[None, :]
                 share = of_columns * of_rows
-                tl.atomic_add(values_gradient + place, (share * weight)[:, None] * gradient, read, "relaxed")
-                product = tl.sum(tl.load(values + place, read, 0.0).to(tl.float32) * gradient, 1)
+                tl.atomic_add(values_gradient + element, (share * weight)[:, None] * gradient, read, "relaxed")
+                product = tl.sum(tl.load(values + element, read, 0.0).to(tl.float32) * gradient, 1)
                 of_weight += share * product
                 of_y += (corner // 2 * 2 - 1) * of_columns * product
                 of_x += (corner % 2 * 2 - 1) * of_rows * product

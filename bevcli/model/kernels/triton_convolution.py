@@ -1,7 +1,7 @@
-"""Modulated deformable convolution on a GPU in Triton. Import it only where Triton is installed.
+"""Parts of a backbone on a GPU in Triton: modulated deformable convolution, and the stem of a ResNet.
 
-Positions, offsets, masks and sums are float32; the values and the weight keep the data type of the images. Everything
-is laid out channels last, so that a sample reads successive channels.
+Import it only where Triton is installed. Positions, offsets, masks and sums are float32; the values and the weight keep
+the data type of the images. Everything is laid out channels last, so that a sample reads successive channels.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.kernels.triton_attention import corner_of
+from bevcli.model.resnet import ResNet
 
 # Positions, channels and taps that a program takes at a time.
 COLUMN_TILES = {"BLOCK": 8, "BLOCK_CHANNELS": 128, "TAPS": 9}
@@ -73,7 +75,7 @@ class _Convolution(torch.autograd.Function):
         bias_gradient = gradient.sum((0, 1, 2), dtype=torch.float32)
         learned = (x_gradient, predicted_gradient, weight_gradient, bias_gradient)
         dtypes = (x.dtype, predicted.dtype, weight.dtype, weight.dtype)
-        return *(each.to(dtype) for each, dtype in zip(learned, dtypes, strict=True)), None
+        return *(gradient.to(dtype) for gradient, dtype in zip(learned, dtypes, strict=True)), None
 
 
 def _channels_last(x: Tensor) -> Tensor:
@@ -224,11 +226,11 @@ def _add_gradients(  # type: ignore[no-untyped-def]
             gradient = tl.load(source + channel[None, :], exists[:, None] & has_channel[None, :], 0.0).to(tl.float32)
             for corner in tl.static_range(4):
                 cell, of_rows, of_columns, inside = corner_of(first_cell, y, x, exists, height, width, corner)
-                place = cell[:, None] * CHANNELS + channel[None, :]
+                element = cell[:, None] * CHANNELS + channel[None, :]
                 read = inside[:, None] & has_channel[None, :]
-                value = tl.load(values + place, read, 0.0).to(tl.float32)
+                value = tl.load(values + element, read, 0.0).to(tl.float32)
                 tl.atomic_add(
-                    values_gradient + place, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed"
+                    values_gradient + element, (of_rows * of_columns * mask)[:, None] * gradient, read, "relaxed"
                 )
                 product = tl.sum(value * gradient, 1)
                 of_mask += of_rows * of_columns * product
@@ -238,3 +240,60 @@ def _add_gradients(  # type: ignore[no-untyped-def]
         tl.store(address + 2 * tap, of_y * mask, exists)
         tl.store(address + 2 * tap + 1, of_x * mask, exists)
         tl.store(address + 18 + tap, of_mask * mask * (1.0 - mask), exists)
+
+
+ELEMENTS_PER_PROGRAM = 1024
+
+
+class FusedStem(ResNet):
+    """A `ResNet` whose batch norms are folded into their convolutions. No gradients."""
+
+    def stem(self, images: Tensor) -> Tensor:
+        """As `ResNet.stem`."""
+        convolution = self.conv1
+        x = F.conv2d(images, convolution.weight, None, convolution.stride, convolution.padding)
+        x = x.contiguous(memory_format=torch.channels_last)
+        height, width = ((length + 1) // 2 for length in x.shape[2:])
+        out = x.new_empty(len(x), height, width, x.shape[1]).permute(0, 3, 1, 2)
+        if len(x):
+            elements = out[0].numel()
+            # Triton launches on the current GPU, which need not be that of the tensors.
+            with torch.cuda.device(x.device):
+                _pool[(triton.cdiv(elements, ELEMENTS_PER_PROGRAM), len(x))](
+                    x,
+                    convolution.bias,
+                    out,
+                    elements,
+                    *x.shape[2:],
+                    height,
+                    width,
+                    CHANNELS=x.shape[1],
+                    BLOCK=ELEMENTS_PER_PROGRAM,
+                )
+        return out
+
+
+@triton.jit
+def _pool(  # type: ignore[no-untyped-def]
+    values, bias, out, elements, height, width, out_height, out_width, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """ReLU of bias plus the maximum over 3x3 cells, with stride 2 and padding 1; NaN stays NaN.
+
+    One program takes BLOCK elements of one image. values (B, H, W, C), bias (C,), out (B, H', W', C).
+    """
+    element = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    image = tl.program_id(1).to(tl.int64)
+    exists = element < elements
+    channel = element % CHANNELS
+    column = element // CHANNELS % out_width
+    row = element // CHANNELS // out_width
+    source = values + image * height * width * CHANNELS
+    largest = tl.full((BLOCK,), float("-inf"), tl.float32)
+    for tap in tl.static_range(9):
+        y = 2 * row + tap // 3 - 1
+        x = 2 * column + tap % 3 - 1
+        inside = exists & (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        value = tl.load(source + (y * width + x) * CHANNELS + channel, inside, float("-inf")).to(tl.float32)
+        largest = tl.maximum(largest, value, propagate_nan=tl.PropagateNan.ALL)
+    largest += tl.load(bias + channel, exists, 0.0).to(tl.float32)
+    tl.store(out + image * elements + element, tl.where(largest < 0, 0.0, largest), exists)

@@ -15,19 +15,13 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
-from bevcli.sequences.files.json_fields import (
-    LONGEST_VALUE,
-    Report,
-    parse_numbers,
-    parse_transform,
-    require,
-    transform_to_json,
-)
+from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
+LONGEST_NAME = 60  # characters of a wrong name in a message
 LARGEST_SIZE = 16384  # pixels of a side
 FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme fisheye to extreme telephoto
 ORIGIN_LIMITS = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}  # in the order of GeoOrigin's fields
@@ -165,7 +159,7 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     """A camera of a calibration. All fields are read, so that all mistakes are reported."""
     if not is_file_name(name):
         expected = "up to 100 letters, digits and signs, no slash"
-        name = one_line(name, LONGEST_VALUE)
+        name = one_line(name, LONGEST_NAME)
         report.error("camera-name", name, "is not the name of a camera", expected=expected)
         return None
     if not isinstance(value, dict):

@@ -37,7 +37,7 @@ from bevcli.sequences.nuscenes.index import (
     Scenes,
     Sensors,
 )
-from bevcli.user_folders import user_cache
+from bevcli.writing import user_cache
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20

@@ -17,7 +17,7 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.batch.options import BatchOptions, ReproduceOptions, Workers
+from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model

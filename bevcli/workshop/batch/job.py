@@ -35,8 +35,8 @@ from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyfr
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
-from bevcli.user_folders import user_cache
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
+from bevcli.writing import user_cache
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
 LONGEST_NAME = 80
@@ -195,10 +195,7 @@ def fetch_scene(url: str, options: NuScenesOptions, name: str, local: Path) -> N
     RemoteFolder(url).fetch(local, sorted(images | {f"can_bus/{name}_pose.json"}))
 
 
-RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"  # folders of a batch
 SCORE_BINS = 20  # of the histogram of a drive's scores, from 0 to 1
-READING_THREADS = 16  # small files of a batch
-RECORD = "drive.json"  # in the folder of a drive's results: its record. A folder with it is whole.
 Record = dict[str, Any]  # of a drive after it was run; a row of batch.parquet
 _Count = Annotated[int, Meta(ge=0, le=1 << 62)]
 _Number = Annotated[float, Meta(ge=-1e12, le=1e12)]

@@ -9,7 +9,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any
 
@@ -18,20 +18,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevcli._version import __version__
-from bevcli.evaluation.evaluate import OWN_CLASSES
-from bevcli.evaluation.matching import ERRORS, DetectionConfig
+from bevcli.evaluation.detection import ClassMatches, DetectionScores, with_all_columns
+from bevcli.evaluation.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
+from bevcli.evaluation.matching import ERRORS, DetectionConfig, ScoredBoxes
 from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import cell_of
 from bevcli.printing import counted, duration
 from bevcli.runs.state import load_state
-from bevcli.workshop.batch.job import READING_THREADS, RESULTS, Record
-from bevcli.workshop.batch.joint_scores import DriveMatches, score_jointly
-from bevcli.workshop.batch.storage import Storage
-from bevcli.workshop.batch.worker import MATCHES
+from bevcli.workshop.batch.job import Record
+from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage
 
+MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 _COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
 WORST = 10  # drives in the table of the worst ones
@@ -113,6 +114,23 @@ def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
     return text.getvalue().encode()
 
 
+@dataclass(frozen=True)
+class DriveMatches:
+    """The part of one drive's scores that the joint scores need.
+
+    Attributes:
+        frame_count: number of frames that were scored.
+        matches: by class, the matching of its boxes.
+        unmeasured: names of errors whose quantity no ground truth of the drive has.
+        segmentation: the scores of its maps, None without maps.
+    """
+
+    frame_count: int
+    matches: tuple[ClassMatches, ...]
+    unmeasured: tuple[str, ...]
+    segmentation: SegmentationScores | None
+
+
 def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
     """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
 
@@ -122,8 +140,13 @@ def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -
     scored = [record for record in records if record.get("scores")]
     if not scored:
         return None
+
+    def read(record: Record) -> DriveMatches:
+        with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+            return load_state(path, DriveMatches)
+
     with ThreadPoolExecutor(READING_THREADS) as pool:
-        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+        matches = list(pool.map(read, scored))
     range_m = model.bev_grid.nearest_side_m
     config = DetectionConfig.of(model.object_classes).cut_at(range_m)
     notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
@@ -132,9 +155,51 @@ def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -
     return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
 
 
-def _read_matches(out: Storage, record: Record) -> DriveMatches:
-    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
-        return load_state(path, DriveMatches)
+def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> FrameScores:
+    """The scores over all frames of the drives: AP of all boxes together, not a mean of the drives' scores.
+
+    drives: at least one. config: the parameters with which every drive was matched.
+    """
+    matches = tuple(_merged([drive.matches[i] for drive in drives]) for i in range(len(config.class_ranges_m)))
+    measured = [set(drive.unmeasured) for drive in drives if any(len(part.ground_truth) for part in drive.matches)]
+    unmeasured = set.intersection(*measured) if measured else set()
+    names = tuple(name for name in ("vel_err", "attr_err") if name in unmeasured)
+    detection = DetectionScores(sum(drive.frame_count for drive in drives), matches, names, config)
+    maps = [drive.segmentation for drive in drives if drive.segmentation is not None]
+    return FrameScores(detection, _merged_maps(maps) if maps else None)
+
+
+def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
+    """The matching of one class in all drives. Equal scores stay in the order of a joint matching."""
+    starts = np.cumsum([0, *(len(part.ground_truth) for part in parts)])
+    moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
+    # Of equal scores the later one is first, as in `descending_scores`: the last drive comes first.
+    predictions = _concatenated([part.predictions for part in parts[::-1]])
+    order = np.argsort(-predictions.column("scores"), kind="stable")
+    return ClassMatches(
+        parts[0].name,
+        _concatenated([part.ground_truth for part in parts]),
+        predictions[order],
+        np.concatenate(moved[::-1], axis=1)[:, order],
+        np.concatenate([part.truth_counts for part in parts]),
+        np.concatenate([part.counts for part in parts[::-1]], axis=1)[:, order],
+    )
+
+
+def _concatenated(parts: Sequence[ScoredBoxes]) -> ScoredBoxes:
+    """The boxes of all drives; their frames are not numbered anew."""
+    boxes = with_all_columns(Boxes3D.concatenate(part.boxes for part in parts))
+    frames = np.concatenate([part.frames for part in parts])
+    return ScoredBoxes(boxes, frames, np.concatenate([part.ranges_m for part in parts]))
+
+
+def _merged_maps(parts: Sequence[SegmentationScores]) -> SegmentationScores:
+    names = dict.fromkeys(name for part in parts for name in part.union)
+    return SegmentationScores(
+        {name: sum(part.intersection.get(name, 0.0) for part in parts) for name in names},
+        {name: sum(part.union.get(name, 0.0) for part in parts) for name in names},
+        sum(part.frame_count for part in parts),
+    )
 
 
 def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:

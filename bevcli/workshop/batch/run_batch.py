@@ -11,20 +11,19 @@ from bevcli.errors import OutputError
 from bevcli.inference.load import Model
 from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
-from bevcli.workshop.batch.job import (
+from bevcli.workshop.batch import Workers
+from bevcli.workshop.batch.job import Drive, Job, Record, read_record
+from bevcli.workshop.batch.report import write_results
+from bevcli.workshop.batch.storage import (
     ATTEMPTS,
     FAILED,
     READING_THREADS,
     RECORD,
     RESULTS,
-    Drive,
-    Job,
-    Record,
-    read_record,
+    LocalFolder,
+    Storage,
+    open_storage,
 )
-from bevcli.workshop.batch.options import Workers
-from bevcli.workshop.batch.report import write_results
-from bevcli.workshop.batch.storage import LocalFolder, Storage, open_storage
 from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray
 
 DESCRIPTION = "batch.json"  # says that a folder is a batch

@@ -22,6 +22,9 @@ from bevcli.writing import output_errors, remove_parts, write_whole
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
 # The packages that fsspec needs for a protocol.
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
+RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"  # folders of a batch
+RECORD = "drive.json"  # in the folder of a drive's results: its record. A folder with it is whole.
+READING_THREADS = 16  # small files of a batch
 FETCHING_THREADS = 16  # copying small files from an object store is waiting
 LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
 

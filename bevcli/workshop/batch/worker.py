@@ -26,8 +26,8 @@ import torch
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.inference.load import Model
+from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.parsing.files import is_there
 from bevcli.printing import reason_of, valid_text
 from bevcli.rig.sequence_checks import CheckedDrive
@@ -37,23 +37,20 @@ from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.workshop.batch.job import (
+from bevcli.workshop.batch import Workers, ray_is_installed
+from bevcli.workshop.batch.job import SCORE_BINS, Drive, Job, Record, fetch_scene, read_record
+from bevcli.workshop.batch.report import MATCHES, DriveMatches
+from bevcli.workshop.batch.storage import (
     ATTEMPTS,
     FAILED,
     RECORD,
     RESULTS,
-    SCORE_BINS,
-    Drive,
-    Job,
-    Record,
-    fetch_scene,
-    read_record,
+    LocalFolder,
+    RemoteFolder,
+    is_url,
+    open_storage,
 )
-from bevcli.workshop.batch.joint_scores import DriveMatches
-from bevcli.workshop.batch.options import Workers, ray_is_installed
-from bevcli.workshop.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
 
-MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 _SCRATCH = "bevcli-batch-"
 
 

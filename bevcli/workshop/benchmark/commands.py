@@ -58,8 +58,8 @@ def bench(
     should run on the machine at the same time.
     """
     from bevcli.config import load_config
-    from bevcli.workshop.benchmark.engines import compare_engines
     from bevcli.workshop.benchmark.measure import run_benchmark
+    from bevcli.workshop.benchmark.versions import compare_engines
 
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
@@ -77,7 +77,7 @@ def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
     from bevcli.config import load_config
     from bevcli.inference.load import Model, choose_engine, load_model
     from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-    from bevcli.workshop.engines.export_cache import CALIBRATION_FRAMES
+    from bevcli.workshop.engines.engine import CALIBRATION_FRAMES
 
     if options.model.endswith(EXPORTED_SUFFIX):
         model = load_model(options.model, options=model_options)

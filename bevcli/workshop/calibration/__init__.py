@@ -1,10 +1,65 @@
 """A calibration that is measured from the drive itself.
 
 In the order of the work:
-    views                the frame pairs that are used, and their grey images
     adjustment           what is estimated, the geometry that follows from it, residuals, robust least squares
+    views                the frame pairs that are used, their grey images, matched points
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
-    measure              matched points, and all of it in rounds
-    estimates            what is said about each camera and the whole rig, with the text for the terminal
-    calibrate            the entry point: reads a drive, measures, judges; the result is printed, written, or used
+    calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
 """
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bevcli.options import option, options
+
+
+@options("Calibration")
+class CalibrateOptions:
+    """The assumptions of `calibrate`: standard deviations of what is stated, and how many frame pairs are used."""
+
+    rotation_deg: float = option(
+        default=2.0, help="How far off a stated rotation of a camera may be: standard deviation an axis, degrees.",
+        minimum=0.01, maximum=10,
+    )  # fmt: skip
+    position_m: float = option(
+        default=0.2, help="How far off a stated position of a camera may be: standard deviation an axis, metres.",
+        minimum=0.001, maximum=2,
+    )  # fmt: skip
+    turn_deg: float = option(
+        default=0.1, help="Error of the vehicle's stated rotation between two frames: standard deviation, degrees.",
+        minimum=0.001, maximum=5,
+    )  # fmt: skip
+    scale: float = option(
+        default=0.003, help="Error of the scale of the ego-motion: standard deviation, as a share.",
+        minimum=0.0001, maximum=0.2,
+    )  # fmt: skip
+    pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
+
+
+@options("Input")
+class CalibrateFirstOptions:
+    """Whether a drive is calibrated before it is used."""
+
+    calibrate: bool = option(
+        default=False,
+        help="Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.",
+    )
+
+
+@options()
+class CheckMotionOptions:
+    """Whether a check of a calibration measures it too."""
+
+    motion: bool = option(
+        default=True,
+        help="With a sequence, also measure the calibration from its motion, in the short form of `bevcli calibrate`.",
+        flag="--motion/--no-motion",
+    )
+
+
+@options("Output")
+class CalibrateOutputOptions:
+    """The output folder of `bevcli calibrate`."""
+
+    out: Path | None = option(default=None, help="Output folder. Default: runs/SEQUENCE-calibrate.", metavar="DIR")

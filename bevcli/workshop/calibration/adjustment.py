@@ -6,7 +6,7 @@ group by group. They are the information matrix, which says what is observed.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence as Items
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Self
@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.views import DELAYS_S, Views
 
 Indices = NDArray[np.int64]
 OF_CAMERA = 7  # unknowns: rotation, position, delay
-HEIGHT = 5  # place of a camera's height among them
+HEIGHT = 5  # index of a camera's height among them
 OF_PAIR = 3  # the error of the vehicle's rotation
 OF_RIG = 3  # scale of the ego-motion, slope of the road along x and y
-DELAY_S, TILT = 0.1, np.radians(0.2)  # standard deviations of capture times and of the ego frame's tilt over the road
+DELAYS_S = np.linspace(-0.3, 0.3, 25)  # of a camera's capture times, where the motion of a pair is tabulated
 
 
 @dataclass(frozen=True)
@@ -43,18 +41,6 @@ class Unknowns:
     pairs: int
     deviations: Array  # (P,) the standard deviation of each unknown before anything is measured
 
-    @staticmethod
-    def of(views: Views, options: CalibrateOptions) -> "Unknowns":
-        """The unknowns of what a drive shows."""
-        groups = views.groups()
-        poses = np.stack([[_quaternions(view.poses) for view in views.sides(group)] for group in groups])
-        poses[..., 4:] -= poses[:, :1, :1, 4:]
-        stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
-        of_camera = [np.radians(options.rotation_deg)] * 3 + [options.position_m] * 3 + [DELAY_S]
-        of_pairs = np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg))
-        deviations = np.concatenate([np.tile(of_camera, len(stated)), of_pairs, [options.scale, TILT, TILT]])
-        return Unknowns(stated, poses, np.array(groups), len(views.pairs), deviations)
-
     @property
     def cameras(self) -> int:
         """Number of cameras."""
@@ -67,11 +53,11 @@ class Unknowns:
 
     @cached_property
     def columns(self) -> Indices:
-        """(G, 20) the places in x of the unknowns that a group depends on: two cameras, the pair, and the rig."""
+        """(G, 20) the indices in x of the unknowns that a group depends on: two cameras, the pair, and the rig."""
         pair, first, second = self.groups.T[..., None]
         start, rig = OF_CAMERA * self.cameras, OF_CAMERA * self.cameras + OF_PAIR * self.pairs
         of_rig = np.broadcast_to(rig + np.arange(OF_RIG), (len(self.groups), OF_RIG))
-        cameras = [OF_CAMERA * each + np.arange(OF_CAMERA) for each in (first, second)]
+        cameras = [OF_CAMERA * index + np.arange(OF_CAMERA) for index in (first, second)]
         return np.concatenate([*cameras, start + OF_PAIR * pair + np.arange(OF_PAIR), of_rig], axis=-1)
 
     def of_camera(self, x: Array) -> Array:
@@ -85,13 +71,6 @@ def moved(ego_from_camera: Array, change: Array) -> Array:
     result[:, :3, :3] = ego_from_camera[:, :3, :3] @ Rotation.from_rotvec(change[:, :3]).as_matrix()
     result[:, :3, 3] += change[:, 3:6]
     return result
-
-
-def _quaternions(poses: Array) -> Array:
-    """Poses (25, 4, 4) as quaternions of one sign and translations, (25, 7)."""
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    turns *= np.sign((turns * turns[:1]).sum(-1, keepdims=True))
-    return np.concatenate([turns, poses[:, :3, 3]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -118,7 +97,7 @@ def geometry(unknowns: Unknowns, local: Array) -> GroupGeometry:
     """The geometry of all groups. local: (G, 20), the values of `Unknowns.columns`."""
     of_a, of_b, pair, rig = np.split(local, np.cumsum([OF_CAMERA, OF_CAMERA, OF_PAIR]), axis=-1)
     (_, first, second), stated = unknowns.groups.T, unknowns.stated
-    before, after = (_pose_at(unknowns.poses[:, side], each[:, 6]) for side, each in enumerate((of_a, of_b)))
+    before, after = (_pose_at(unknowns.poses[:, side], camera[:, 6]) for side, camera in enumerate((of_a, of_b)))
     motion = inverse(after) @ before
     motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(pair).as_matrix()
     motion[:, :3, 3] *= 1 + rig[:, :1]
@@ -247,7 +226,7 @@ class Solution:
     """The unknowns that fit best."""
 
     x: Array  # (P,) their values
-    columns: Indices  # (G, 20) the places in x that each group depends on
+    columns: Indices  # (G, 20) the indices in x that each group depends on
     blocks: Array  # (G, 20, 20) the information of each group about them
     gradients: Array  # (G, 20) of each group; they sum up to little, and their scatter tells how well the groups agree
 
@@ -294,8 +273,8 @@ def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
     """
     sizes, camera = np.abs(values(unknowns, residuals, x)), unknowns.groups[residuals.group, 1]
     result = np.full(len(sizes), DEVIATION * np.median(sizes) if sizes.size else 1.0)
-    for each in np.unique(camera):
-        mine = camera == each
+    for index in np.unique(camera):
+        mine = camera == index
         if mine.sum() >= FEWEST:
             result[mine] = DEVIATION * np.median(sizes[mine])
     return np.maximum(result, SMALLEST_PX)
@@ -343,3 +322,41 @@ def _curvature(squares: Array) -> float:
     if not len(squares):
         return 1.0
     return max(float(np.sum((1 - squares) / (1 + squares) ** 2) / np.sum(1 / (1 + squares))), LEAST_CURVATURE)
+
+
+SMALLEST_TURN = np.radians(0.005)  # of it
+LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
+
+
+def with_estimated_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
+    """The unknowns with the deviation of the vehicle's stated rotation that its pairs show, at most the present one.
+
+    It is estimated an axis, as the scatter of the solution over what the pairs determine (MacKay's rule).
+    """
+    deviations = unknowns.deviations.copy()
+    start = OF_CAMERA * unknowns.cameras
+    turns = slice(start, start + OF_PAIR * unknowns.pairs)
+    covariance = np.linalg.inv(solution.information + np.diag(1 / deviations**2))
+    determined = (1 - np.diag(covariance)[turns] / deviations[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
+    squares = (solution.x[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
+    estimated = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
+    deviations[turns] = np.minimum(deviations[turns], np.tile(estimated, unknowns.pairs))
+    return replace(unknowns, deviations=deviations)
+
+
+def honest_covariance(unknowns: Unknowns, solution: Solution) -> Array:
+    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
+
+    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
+    however small its residuals are.
+    """
+    prior = np.diag(1 / unknowns.deviations**2)
+    matrix = solution.information + prior
+    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    pulls = []
+    for pair in range(unknowns.pairs):
+        groups = unknowns.groups[:, 0] == pair
+        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
+    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
+    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
+    return covariance * np.outer(factor, factor)

@@ -1,11 +1,14 @@
 """`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames.
 
-`motion_findings`: the same in short, as findings for `bevcli project-debug`.
+In this order: what is said of each camera and the whole rig, with its texts; the rounds of the measurement, rotations
+from matched points and heights from the road; the verdicts. `motion_findings` is the same in short, as findings for
+`bevcli project-debug`.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence as Items
 from dataclasses import asdict, dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +20,256 @@ from bevcli.frame import DerivedSequence, DriveFacts, Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
+from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.workshop.calibration.adjustment import HEIGHT, OF_CAMERA, OF_RIG, Solution, Unknowns, moved, values
-from bevcli.workshop.calibration.estimates import (
-    CameraEstimate,
-    RigEstimate,
-    Verdict,
-    change_text,
-    delay_text,
-    either_text,
-    rig_text,
-    table,
+from bevcli.workshop.calibration import CalibrateOptions, adjustment
+from bevcli.workshop.calibration.road import level_corrections, road_residuals, search_heights, sees_road
+from bevcli.workshop.calibration.views import (
+    FEWEST_PAIRS,
+    READING_STEPS,
+    WIDTH,
+    PointMatches,
+    Views,
+    match_points,
+    read_views,
+    unknowns_of,
 )
-from bevcli.workshop.calibration.measure import PARTS, Measurement, match_points, measure
-from bevcli.workshop.calibration.options import CalibrateOptions
-from bevcli.workshop.calibration.views import FEWEST_PAIRS, READING_STEPS, WIDTH, read_views
 from bevcli.writing import write_whole
+
+Triple = tuple[float, float, float]
+HEADER = (
+    "camera", "yaw off by", "pitch", "roll", "x off by", "y", "z", "matches", "residual px", "verdict",
+)  # fmt: skip
+CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
+TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
+MOST_DELAY_MS = 300.0  # a larger one is a rotation
+
+
+class Verdict(Enum):
+    """What is done with a camera's calibration."""
+
+    FINE = "fine"
+    CORRECTED = "corrected"
+    NOT_MEASURABLE = "not measurable"
+
+
+@dataclass(frozen=True)
+class CameraEstimate:
+    """What a drive says about one camera.
+
+    Attributes:
+        camera: its name.
+        verdict: what is done with its calibration.
+        reason: why it is not measurable; "" else.
+        rotation_deg: yaw, pitch and roll of the stated rotation minus the measured one, degrees, as in `Mounting`.
+        rotation_deviation_deg: standard deviations.
+        position_m: x, y, z of the stated position minus the measured one, metres, ego frame.
+        position_deviation_m: standard deviations; that of the stated position where nothing is measured.
+        delay_ms: how much later than stated its images were taken.
+        delay_deviation_ms: standard deviation.
+        matches: matched points.
+        road_points: points of the road.
+        before_px: median residual of the matched points with the stated calibration, pixels of the original image.
+        after_px: the same with the measured one.
+        change: (7,) rotation in the camera frame, radians; position in the ego frame, metres; delay, seconds.
+        covariance: (7, 7) of it.
+    """
+
+    camera: str
+    verdict: Verdict
+    reason: str
+    rotation_deg: Triple
+    rotation_deviation_deg: Triple
+    position_m: Triple
+    position_deviation_m: Triple
+    delay_ms: float
+    delay_deviation_ms: float
+    matches: int
+    road_points: int
+    before_px: float
+    after_px: float
+    change: Array
+    covariance: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the report."""
+        entry = asdict(self) | {"verdict": self.verdict.value}
+        return entry | {"change": self.change.tolist(), "covariance": self.covariance.tolist()}
+
+
+@dataclass(frozen=True)
+class RigEstimate:
+    """What a drive says about the whole rig.
+
+    Attributes:
+        scale: of the ego-motion minus 1: 0.01 if the vehicle drove 1 % farther than stated.
+        scale_deviation: standard deviation.
+        height_m: mean height of the cameras above the road, stated minus measured, metres.
+        height_deviation_m: standard deviation.
+        tilt_deg: pitch and roll of the ego frame over the road, degrees: positive if its front, its left points down.
+        tilt_deviation_deg: standard deviations.
+    """
+
+    scale: float
+    scale_deviation: float
+    height_m: float
+    height_deviation_m: float
+    tilt_deg: tuple[float, float]
+    tilt_deviation_deg: tuple[float, float]
+
+
+def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
+    """Lines about the whole rig, and about the capture times of its cameras."""
+    pitch, roll = (f"{a:+.2f}° ± {d:.2f}°" for a, d in zip(whole.tilt_deg, whole.tilt_deviation_deg, strict=True))
+    lines = [
+        f"height of the rig over the road off by {_metres(whole.height_m, whole.height_deviation_m)}; "
+        f"tilt of the ego frame: pitch {pitch}, roll {roll}",
+        f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
+    ]
+    for estimate in cameras:
+        lines += [f"time offset: {text}" for text in (delay_text(estimate), either_text(estimate)) if text]
+    return "\n".join(lines)
+
+
+def delay_text(estimate: CameraEstimate) -> str:
+    """A time offset that is certain, in words; "" where there is none."""
+    deviations, least = CERTAIN_DELAY
+    size, deviation = abs(estimate.delay_ms), estimate.delay_deviation_ms
+    if deviation > TOLD_DELAY_MS or size < max(deviations * deviation, least):
+        return ""
+    word = _word(estimate.delay_ms)
+    return f"the images of {estimate.camera} were taken {size:.0f} ± {deviation:.0f} ms {word} than stated"
+
+
+def either_text(estimate: CameraEstimate) -> str:
+    """A time offset or a rotation, in words, where the motion does not tell which of both; "" where it does.
+
+    A vehicle that turns evenly moves a late camera as if it were turned.
+    """
+    rotation, covariance = estimate.change[:3], estimate.covariance
+    if estimate.verdict is Verdict.FINE or estimate.delay_deviation_ms <= TOLD_DELAY_MS:
+        return ""
+    gain = np.linalg.solve(covariance[:3, :3], covariance[:3, 6])
+    delay_ms = 1000 * float(estimate.change[6] - gain @ rotation)  # if the stated rotation is right
+    deviation_ms = 1000 * float(np.sqrt(max(covariance[6, 6] - gain @ covariance[:3, 6], 0)))
+    certain = max(CERTAIN_DELAY[0] * deviation_ms, CERTAIN_DELAY[1])
+    if deviation_ms > TOLD_DELAY_MS or not certain <= abs(delay_ms) <= MOST_DELAY_MS:
+        return ""
+    turned = rotation - covariance[:3, 6] / covariance[6, 6] * estimate.change[6]  # if the stated times are right
+    return (
+        f"the images of {estimate.camera} were taken {abs(delay_ms):.0f} ms {_word(delay_ms)} than stated, or it is "
+        f"turned by {np.degrees(np.linalg.norm(turned)):.1f}°: the drive does not tell which of both"
+    )
+
+
+def _word(delay_ms: float) -> str:
+    return "later" if delay_ms > 0 else "earlier"
+
+
+def change_text(estimate: CameraEstimate) -> str:
+    """How far a camera is off, in words: "off by yaw +1.98° ± 0.05°, z +0.150 m ± 0.005 m", and so on."""
+    rotation = zip(("yaw", "pitch", "roll"), estimate.rotation_deg, estimate.rotation_deviation_deg, strict=True)
+    position = zip("xyz", estimate.position_m, estimate.position_deviation_m, strict=True)
+    parts = [f"{name} {value:+.2f}° ± {deviation:.2f}°" for name, value, deviation in rotation]
+    parts += [f"{name} {value:+.3f} m ± {deviation:.3f} m" for name, value, deviation in position if value]
+    return "off by " + ", ".join(parts)
+
+
+def _row(estimate: CameraEstimate) -> tuple[str, ...]:
+    if estimate.verdict is Verdict.NOT_MEASURABLE:
+        cells = ["–"] * 6
+    else:
+        pairs = zip(estimate.rotation_deg, estimate.rotation_deviation_deg, strict=True)
+        cells = [f"{value:+.2f}±{deviation:.2f}°" for value, deviation in pairs]
+        places = zip(estimate.position_m, estimate.position_deviation_m, strict=True)
+        cells += [_metres(value, deviation) for value, deviation in places]
+    verdict = estimate.verdict.value + (f": {estimate.reason}" if estimate.reason else "")
+    residual = f"{estimate.before_px:.2f} → {estimate.after_px:.2f}" if estimate.matches else "–"
+    return (estimate.camera, *cells, f"{estimate.matches}", residual, verdict)
+
+
+def _metres(value: float, deviation: float) -> str:
+    return f"{value:+.3f}±{deviation:.3f} m"
+
+
+SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
+POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
+CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
+TURN_ROUNDS = 4  # in which the error of the vehicle's rotation is estimated
+KERB_M = 0.09  # less than from the road to a pavement
+FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
+PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the drive says about the unknowns."""
+
+    views: Views
+    matches: PointMatches  # of all pairs
+    unknowns: adjustment.Unknowns
+    solution: adjustment.Solution
+    points: PointMatches  # the matches that were used
+    road: adjustment.RoadResiduals
+
+
+def measure(
+    views: Views, matches: PointMatches, options: CalibrateOptions, progress: Callable[[], None] = lambda: None
+) -> Measurement:
+    """Measure all unknowns. progress: called PARTS times."""
+    unknowns = unknowns_of(views, options)
+    within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
+    for scale in SCALES_PX:
+        x = adjustment.solve(unknowns, [(within, scale)], x).x
+    within = consistent(unknowns, within, x)
+    progress()
+    heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
+    x[heights] += search_heights(views, unknowns, x)
+    progress()
+    ties = matches.where(~matches.same)
+    for most_px in FLOWS_PX:
+        road = road_residuals(views, unknowns, x, most_px)
+        progress()
+        for scale in ROAD_SCALES_PX:
+            x = adjustment.solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
+        if most_px == FLOWS_PX[0]:
+            levels = level_corrections(unknowns, road, ties, x)
+            x = x + levels
+            # Shared points tell the level, and the road then tells the height to the step of the search.
+            x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
+        progress()
+    road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
+    for _ in range(TURN_ROUNDS):
+        solution = adjustment.solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
+        x, unknowns = solution.x, adjustment.with_estimated_turns(unknowns, solution)
+    return Measurement(views, matches, unknowns, solution, within, road)
+
+
+def _terms(
+    unknowns: adjustment.Unknowns, points: PointMatches, road: adjustment.RoadResiduals, x: Array, road_scale: float
+) -> list[adjustment.Term]:
+    """Both kinds of residuals, with the spread that they have at x (P,)."""
+    scales = ((points, POINT_SCALE_PX), (road, road_scale))
+    return [(residuals, np.maximum(least, adjustment.spread(unknowns, residuals, x))) for residuals, least in scales]
+
+
+def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) -> PointMatches:
+    """The points that fit at x (P,), of the image pairs in which most of them do.
+
+    Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
+    """
+    fits = np.abs(adjustment.values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
+    count = len(unknowns.groups)
+    fitting, matched = (np.bincount(group, minlength=count) for group in (points.group[fits], points.group))
+    shares = fitting / np.maximum(matched, 1)
+    return points.where(fits & (shares[points.group] >= CONSISTENT_SHARE))
+
 
 FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
-LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
 FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
 SHORT_PAIRS = 8  # of frames, for findings
@@ -68,19 +298,20 @@ class CalibrationResult:
     facts: DriveFacts
 
     def __getitem__(self, camera: str) -> CameraEstimate:
-        return next(each for each in self.cameras if each.camera == camera)
+        return next(estimate for estimate in self.cameras if estimate.camera == camera)
 
     def text(self) -> str:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
-        return "\n".join([table(self.cameras), "", pairs, rig_text(self.whole, self.cameras)])
+        table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
+        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras)])
 
     def to_json(self) -> str:
         """The content of report.json."""
         content = {
             "drive": self.name,
             "pairs": self.pairs,
-            "cameras": {each.camera: each.to_dict() for each in self.cameras},
+            "cameras": {estimate.camera: estimate.to_dict() for estimate in self.cameras},
             "rig": asdict(self.whole),
         }
         return json.dumps(content, indent=1, ensure_ascii=False)
@@ -154,7 +385,9 @@ def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
         stated,
         cameras=tuple(
             replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
-            for camera, pose, estimate in zip(stated.cameras, moved(unknowns.stated, changes), cameras, strict=True)
+            for camera, pose, estimate in zip(
+                stated.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
+            )
         ),
     )
     return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts)
@@ -211,7 +444,7 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
-    residuals_px = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
+    residuals_px = np.abs(adjustment.values(measurement.unknowns, measurement.points, x)[mine])
     return float(np.median(residuals_px)) if residuals_px.size else 0.0
 
 
@@ -229,8 +462,8 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
         The whole rig.
     """
     unknowns, solution = measurement.unknowns, measurement.solution
-    deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
-    covariance = _honest(unknowns, solution)
+    deviations, count = unknowns.deviations, adjustment.OF_CAMERA * unknowns.cameras
+    covariance = adjustment.honest_covariance(unknowns, solution)
     scale = deviations[:count]
     marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
     sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
@@ -238,37 +471,19 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
     change = scale * (seen @ (seen.T @ (solution.x[:count] / scale)))
     within = seen @ np.diag(1 / (1 + sizes[sizes >= LEAST_INFORMATION])) @ seen.T + unseen @ unseen.T
     whole = np.outer(scale, scale) * within + np.diag(np.tile(FINEST, unknowns.cameras) ** 2)
-    blocks = whole.reshape(unknowns.cameras, OF_CAMERA, unknowns.cameras, OF_CAMERA)
+    blocks = whole.reshape(unknowns.cameras, adjustment.OF_CAMERA, unknowns.cameras, adjustment.OF_CAMERA)
     changes = unknowns.of_camera(change)
-    of_rig, of_rig_deviations = solution.x[-OF_RIG:], np.sqrt(np.diag(covariance)[-OF_RIG:])
+    of_rig, of_rig_deviations = solution.x[-adjustment.OF_RIG :], np.sqrt(np.diag(covariance)[-adjustment.OF_RIG :])
     (along, across), (along_deviation, across_deviation) = np.degrees([of_rig[1:], of_rig_deviations[1:]]).tolist()
     rig = RigEstimate(
         scale=float(of_rig[0]),
         scale_deviation=float(of_rig_deviations[0]),
-        height_m=-float(changes[:, HEIGHT].mean()),
-        height_deviation_m=float(np.sqrt(blocks[:, HEIGHT, :, HEIGHT].sum()) / unknowns.cameras),
+        height_m=-float(changes[:, adjustment.HEIGHT].mean()),
+        height_deviation_m=float(np.sqrt(blocks[:, adjustment.HEIGHT, :, adjustment.HEIGHT].sum()) / unknowns.cameras),
         tilt_deg=(along, across),
         tilt_deviation_deg=(along_deviation, across_deviation),
     )
     return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
-
-
-def _honest(unknowns: Unknowns, solution: Solution) -> Array:
-    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
-
-    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
-    however small its residuals are.
-    """
-    prior = np.diag(1 / unknowns.deviations**2)
-    matrix = solution.information + prior
-    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    pulls = []
-    for pair in range(unknowns.pairs):
-        groups = unknowns.groups[:, 0] == pair
-        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
-    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
-    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
-    return covariance * np.outer(factor, factor)
 
 
 def motion_findings(drive: Sequence) -> tuple[Finding, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.calibration.options import (
+from bevcli.workshop.calibration import (
     CalibrateFirstOptions,
     CalibrateOptions,
     CalibrateOutputOptions,
@@ -60,15 +60,14 @@ def _corrected(options: CalibrateFirstOptions, drive: Sequence) -> Sequence:
     if not options.calibrate:
         return drive
     from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration.calibrate import STEPS, CorrectedDrive, calibrate as measure
-    from bevcli.workshop.calibration.estimates import Verdict, change_text
+    from bevcli.workshop.calibration import calibrate as calibration
 
-    with Progress(STEPS, "steps of the calibration") as progress:
-        result = measure(drive, after_step=progress.advance)
-    for each in result.cameras:
-        reason = change_text(each) if each.verdict is Verdict.CORRECTED else each.reason
-        say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return CorrectedDrive(drive, result)
+    with Progress(calibration.STEPS, "steps of the calibration") as progress:
+        result = calibration.calibrate(drive, after_step=progress.advance)
+    for camera in result.cameras:
+        reason = calibration.change_text(camera) if camera.verdict is calibration.Verdict.CORRECTED else camera.reason
+        say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
+    return calibration.CorrectedDrive(drive, result)
 
 
 def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], Sequence]) -> tuple[Finding, ...]:

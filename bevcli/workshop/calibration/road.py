@@ -73,7 +73,7 @@ def _best(views: Views, unknowns: Unknowns, x: Array, index: int, corrections: A
 
 
 def _lowest_level(scores: Array) -> int:
-    """The place of the lowest surface, the road, among the peaks of scores (H,): pavements lie above it."""
+    """The index of the lowest surface, the road, among the peaks of scores (H,): pavements lie above it."""
     sharpness = np.full(len(scores), -np.inf)
     sharpness[2:-2] = scores[2:-2] - (scores[:-4] + scores[4:]) / 2
     peak = np.r_[False, (scores[1:-1] >= scores[:-2]) & (scores[1:-1] >= scores[2:]), False]
@@ -86,7 +86,7 @@ def _lowest_level(scores: Array) -> int:
 
 def _scores(views: Views, unknowns: Unknowns, geometry: GroupGeometry, group: int, corrections: Array) -> Array:
     """The score of each correction (H,) in a pair of images: tiles of the road that look alike vote for it."""
-    pair, index, _ = (int(each) for each in unknowns.groups[group])
+    pair, index, _ = (int(index) for index in unknowns.groups[group])
     camera = views.rig.cameras[index]
     images = [view.texture for view in views.sides((pair, index, index))]
     pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
@@ -96,8 +96,8 @@ def _scores(views: Views, unknowns: Unknowns, geometry: GroupGeometry, group: in
     for height in corrections:
         at = pose[:3, 3] + [0, 0, height]
         first, second = (
-            _seen(camera, image, (each - at) @ pose[:3, :3])
-            for image, each in zip(images, (points, moved), strict=True)
+            _seen(camera, image, (seen - at) @ pose[:3, :3])
+            for image, seen in zip(images, (points, moved), strict=True)
         )
         alike.append(_correlation(first, second))
     correlations = np.stack(alike)  # (H, tiles)
@@ -152,7 +152,7 @@ def _points_of(
 ) -> tuple[Array, Array, Array, Array]:
     """The fields of `RoadResiduals` after the first for the points of a group."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
-    pair, index, _ = (int(each) for each in unknowns.groups[group])
+    pair, index, _ = (int(index) for index in unknowns.groups[group])
     camera = views.rig.cameras[index]
     first, second = (view.texture for view in views.sides((pair, index, index)))
     warp = _warp(camera, geometry, group)
@@ -198,8 +198,8 @@ def _warp(camera: Camera, geometry: GroupGeometry, group: int) -> tuple[NDArray[
     size = (columns[-1] + STRIDE, rows[-1] + STRIDE)
     matrix = np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]])
     whole, inside = (
-        cv2.warpAffine(each, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        for each in (near, road.reshape(shape).astype(np.float32))
+        cv2.warpAffine(coarse, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        for coarse in (near, road.reshape(shape).astype(np.float32))
     )
     cut = np.s_[: camera.height, : camera.width]
     return np.ascontiguousarray(whole[cut]), inside[cut] > 0.999
@@ -293,10 +293,10 @@ def level_corrections(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarRes
     ties = ties.where(np.abs(values(unknowns, ties, x)[:, 0]) < MOST_PX)
     # Two neighbours may see the same pavement; then only both together contradict the others.
     pairs = np.unique(np.sort(unknowns.groups[ties.group, 1:], axis=-1), axis=0)
-    sets = [each for each in (*np.arange(unknowns.cameras)[:, None], *pairs) if not stays[each].any()]
+    sets = [cameras for cameras in (*np.arange(unknowns.cameras)[:, None], *pairs) if not stays[cameras].any()]
     for _ in sets:  # the largest contradiction first: it may be the cause of others
         gain, best = max(
-            (_best_level(unknowns, ties, corrected, each) for each in sets), key=lambda gain_and_x: gain_and_x[0]
+            (_best_level(unknowns, ties, corrected, cameras) for cameras in sets), key=lambda gain_and_x: gain_and_x[0]
         )
         if gain <= 0:
             break
@@ -319,7 +319,7 @@ def sees_road(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarResiduals, 
     _, alike = connected_components(agree, directed=False)
     seen = np.zeros(unknowns.cameras, dtype=bool)
     while True:
-        untied = np.array([before[alike == each][:, seen].sum() < FEWEST_TIES for each in alike])
+        untied = np.array([before[alike == group][:, seen].sum() < FEWEST_TIES for group in alike])
         first = np.where(untied & ~seen, on_way, 0)
         if first.max() < FEWEST_ON_WAY:
             return seen
@@ -386,7 +386,7 @@ def _positioned(unknowns: Unknowns, ties: EpipolarResiduals, x: Array, columns: 
     for scale in SCALES_PX:
         here = values(unknowns, ties, x)[:, 0]
         steps = [x + DIFFERENCE_M * (np.arange(len(x)) == column) for column in columns]
-        slopes = np.stack([(values(unknowns, ties, each)[:, 0] - here) / DIFFERENCE_M for each in steps], axis=-1)
+        slopes = np.stack([(values(unknowns, ties, step)[:, 0] - here) / DIFFERENCE_M for step in steps], axis=-1)
         weighted = slopes / (scale**2 + here**2)[:, None]
         x[columns] -= np.linalg.solve(weighted.T @ slopes + prior, weighted.T @ here + prior @ x[columns])
     return x

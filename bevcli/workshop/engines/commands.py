@@ -10,7 +10,7 @@ from bevcli.cli.bridge import Part, argument, model_option
 from bevcli.inference.options import FILE_ENGINE, ModelOptions
 from bevcli.options import option, options
 from bevcli.printing import say
-from bevcli.workshop.engines.options import FileOptions, OnnxOptions
+from bevcli.workshop.engines import FileOptions, OnnxOptions
 
 PANEL = "Deploy"
 
@@ -38,8 +38,8 @@ def export_onnx(
     from bevcli.inference.load import load_model
     from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.differences import check_exported, difference_lines
     from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
+    from bevcli.workshop.engines.exported import check_exported, difference_lines
 
     loaded = load_model(model, options=replace(model_options, device="cpu"))
     loaded.require_parts("bevcli export-onnx")
@@ -102,9 +102,8 @@ def quantize(
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.differences import check_exported, difference_lines
-    from bevcli.workshop.engines.engine import load_exported
     from bevcli.workshop.engines.export_onnx import calibration_images, quantize as write_quantized
+    from bevcli.workshop.engines.exported import check_exported, difference_lines, load_exported
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")

@@ -1,20 +1,29 @@
 """The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bevcli.errors import BevcliError
 from bevcli.model.bevformer.bevformer import BevHistory
+from bevcli.model.bevformer_v2.bevformer_v2 import (
+    BEVFormerV2Config,
+    FeatureWindow,
+    FrameFeatures,
+    WindowFrame,
+    frames_at,
+    kept,
+)
 from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.segmentation import STUFF_CLASSES
-from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
 from bevcli.registry import for_model
-from bevcli.workshop.engines.export_step import RecurrentStep
+from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, WindowStep
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class ExportForm:
         cameras: N, the number of cameras.
     """
 
-    step: ClassVar[type[nn.Module]]
+    step: ClassVar[type[ExportedStep]]
 
     def __init__(self, config: ModelConfig, cameras: int) -> None:
         self.config, self.cameras = config, cameras
@@ -56,11 +65,9 @@ class ExportForm:
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         """The outputs, in the order of the results of the step's `forward`. decode: with boxes."""
         boxes = _box_ports(self.config) if decode else ()
-        return (*_output_ports(self.config), *self.further_outputs(), *boxes)
-
-    def further_outputs(self) -> Iterable[Port]:
-        """The outputs of `ModelOutputs.further`."""
-        return ()
+        stated = for_model("exported_outputs", model_class(self.config))
+        further = [Port(*port) for outputs_of in stated for port in outputs_of(self.config)]
+        return (*_output_ports(self.config), *further, *boxes)
 
     def facts(self) -> dict[str, Any]:
         """Further metadata of the file."""
@@ -72,10 +79,6 @@ class ExportForm:
         prepared: with `pixels`. memory: after the frame before; None where the history starts anew.
         """
         raise NotImplementedError
-
-    def model_outputs(self, outputs: ModelOutputs, by_name: Mapping[str, Tensor]) -> ModelOutputs:
-        """The outputs as the model's own decoders take them. by_name: all outputs of the file by name."""
-        return outputs
 
     def memory(self, prepared: PreparedFrame, memory: Any, by_name: Mapping[str, Tensor]) -> Any:
         """The memory after a frame. memory: before it. by_name: the file's outputs by name."""
@@ -214,7 +217,7 @@ class RecurrentForm(ExportForm):
         return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
 
     def feed(self, prepared: PreparedFrame, memory: BevHistory | None) -> dict[str, Tensor]:
-        inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
+        inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
     def memory(self, prepared: PreparedFrame, memory: BevHistory | None, by_name: Mapping[str, Tensor]) -> BevHistory:
@@ -258,3 +261,98 @@ def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelCon
         "previous_bev": previous,
         "use_previous": torch.tensor([history is not None]),
     }
+
+
+class WindowForm(ExportForm):
+    """The form of one step of a BEVFormerV2.
+
+    Attributes:
+        frames: of the window, relative to the current one, which is the last.
+    """
+
+    step = WindowStep
+
+    def __init__(self, config: BEVFormerV2Config, cameras: int) -> None:
+        """Raises BevcliError for a model that looks at later frames."""
+        if config.later_frames:
+            raise BevcliError(
+                f"{config.name}: a model that looks at later frames cannot be exported: frames is "
+                f"{list(config.frames)} (expected a window that ends with 0, the current frame)"
+            )
+        super().__init__(config, cameras)
+        self.frames = config.frames
+
+    @property
+    def inputs(self) -> tuple[Port, ...]:
+        lead, bev_frame = (1, len(self.frames), self.cameras), "the current frame's bev frame"
+        images, projection, camera_index, has_image = camera_ports(self.config, lead, "1, F, N", bev_frame)
+        window = (
+            " For the cameras of each of the window's F frames, which are, relative to the current one: "
+            f"{_listed(self.frames)}."
+        )
+        absent = (
+            " All false for a frame that does not exist, such as before a scene's first frame or before a gap in "
+            "time of more than max_gap_s: the BEV map of the next frame takes the place of its own."
+        )
+        projection = replace(projection, meaning=projection.meaning + window)
+        ports = (images, projection, camera_index, replace(has_image, meaning=has_image.meaning + absent))
+        if len(self.frames) == 1:
+            return ports
+        meaning = (
+            "(F - 1, N, S, C): the output image_features of the window's earlier frames "
+            f"{_listed(self.frames[:-1])}, in this order; ignored for a frame that does not exist."
+        )
+        return (*ports, Port("previous_features", (len(self.frames) - 1, *self._features_shape), meaning))
+
+    def outputs(self, *, decode: bool) -> tuple[Port, ...]:
+        ports = super().outputs(decode=decode)
+        if len(self.frames) == 1:
+            return ports
+        meaning = "(N, S, C): of the current frame's images, for previous_features of the next frames."
+        return (*ports, Port("image_features", self._features_shape, meaning))
+
+    def facts(self) -> dict[str, Any]:
+        return {"window": self.frames}
+
+    def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
+        """See `ExportForm`. Of a frame that does not exist no camera has an image."""
+        past = self._past(prepared, memory)
+        current = model_inputs(prepared, None, self.config)
+        indices = [len(past) + offset for offset in self.frames[:-1]]
+        absent = WindowFrame(
+            FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),
+            torch.zeros_like(current.image_from_bev),
+            torch.zeros_like(current.has_image),
+            current.image_size,
+        )
+        earlier = [frame or absent for frame in frames_at(past, indices, prepared)]
+        feed = camera_feed(current) | {
+            "image_from_bev": torch.stack(
+                [*(frame.image_from_bev for frame in earlier), current.image_from_bev], dim=1
+            ),
+            "has_image": torch.stack([*(frame.has_image for frame in earlier), current.has_image], dim=1),
+        }
+        if earlier:
+            feed["previous_features"] = torch.stack([frame.image_features.tokens for frame in earlier])
+        return feed
+
+    def memory(
+        self, prepared: PreparedFrame, memory: FeatureWindow | None, by_name: Mapping[str, Tensor]
+    ) -> FeatureWindow:
+        past = self._past(prepared, memory)
+        if "image_features" not in by_name:
+            return kept(past, len(past), -self.frames[0])
+        features = FeatureMaps(by_name["image_features"], self.config.level_shapes)
+        return kept([*past, FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
+
+    def _past(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> list[FrameFeatures]:
+        return [] if memory is None else memory.before(prepared.frame.stamp, -self.frames[0])
+
+    @property
+    def _features_shape(self) -> tuple[int, int, int]:
+        cells = sum(height * width for height, width in self.config.level_shapes)
+        return self.cameras, cells, self.config.channels
+
+
+def _listed(frames: tuple[int, ...]) -> str:
+    return ", ".join(map(str, frames))

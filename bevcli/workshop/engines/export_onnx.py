@@ -30,8 +30,8 @@ from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
 from bevcli.printing import counted
+from bevcli.workshop.engines import OnnxOptions
 from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
-from bevcli.workshop.engines.options import OnnxOptions
 from bevcli.writing import check_output, whole_file
 
 EXPORTERS = ("onnx", "onnxscript")  # packages that write the file
@@ -360,14 +360,14 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
     Raises InputError where a frame cannot be read, a rig has another number of cameras, or no frame has an image.
     """
     empty = True
-    places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
-    chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
+    all_frames = [(drive, index) for drive in drives for index in range(len(drive.stamps))]
+    chosen = np.linspace(0, len(all_frames) - 1, min(frames, len(all_frames))).round().astype(int)
     preprocess = Preprocessor(config, pixels=True)
-    for drive, place in (places[index] for index in chosen):
-        prepared = preprocess(drive.load(place))
+    for drive, index in (all_frames[number] for number in chosen):
+        prepared = preprocess(drive.load(index))
         if len(prepared.assignment.cameras) != cameras:
-            found = counted(len(prepared.assignment.cameras), "cameras")
-            raise InputError(f"{drive.name}: has {found} (the file takes {cameras})")
+            count = counted(len(prepared.assignment.cameras), "cameras")
+            raise InputError(f"{drive.name}: has {count} (the file takes {cameras})")
         if prepared.frame.images:
             empty = False
             yield prepared.images.movedim(2, -1).numpy()

@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.box_coding import best_boxes
 from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_boxes
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
 from bevcli.model.ego_motion import rotate_history
@@ -117,13 +117,51 @@ class RecurrentStep(ExportedStep):
         return self.outputs(bev, hits.most_cameras)
 
 
+class WindowStep(ExportedStep):
+    """One step of a BEVFormerV2 whose window ends with the current frame: `BEVFormerV2.forward`.
+
+    The image features of the earlier frames enter, and those of the current frame come out. All frames are encoded,
+    also those that do not exist, because a graph has no optional parts; a frame without any image then takes the map
+    of the next one, as in `fill_window`.
+    """
+
+    def forward(
+        self,
+        images: Tensor,
+        image_from_bev: Tensor,
+        camera_index: Tensor,
+        has_image: Tensor,
+        previous_features: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """One step; `WindowForm` documents every input and output."""
+        network = self.network
+        image_features = self.image_features(images, camera_index)
+        tokens = [*([] if previous_features is None else previous_features), image_features.tokens]
+        hits = [self.hits(image_from_bev[:, index], has_image[:, index]) for index in range(len(tokens))]
+        maps = [
+            network.encoder(
+                bev_query=network.bev_queries.embedding[None],
+                position=network.bev_queries.position(),
+                image_features=FeatureMaps(frame_tokens, image_features.level_shapes),
+                hits=frame_hits,
+            )
+            for frame_tokens, frame_hits in zip(tokens, hits, strict=True)
+        ]
+        for index in reversed(range(len(maps) - 1)):
+            maps[index] = torch.where(has_image[:, index].any(), maps[index], maps[index + 1])
+        bev = maps[0] if network.fusion is None else network.fusion(maps)
+        most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
+        outputs = self.outputs(bev, most_cameras)
+        return outputs if previous_features is None else (*outputs, image_features.tokens)
+
+
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """`bevcli.model.box_coding.decode` for a batch of one, in the graph.
+    """`ModelOutputs.boxes` for a batch of one, in the graph.
 
     class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
     height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
     """
-    best = best_boxes(class_logits, box_codes, config)
+    best = best_boxes(class_logits, box_codes, config.decoder)
     x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
     # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
     yaw = torch.atan2(-cos, -sin)
@@ -168,7 +206,7 @@ class SlottedSpatialCrossAttention(nn.Module):
     def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
         """As `SpatialCrossAttention.forward`."""
         offsets, logits = (part[:, :, 0] for part in self.attention.predict(query[0]))
-        weights = self.attention.weights(logits)
+        weights = self.attention.sampling.weights(logits)
         heads, levels = self.attention.shape[0], image_features.level_shapes
         values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
         points = hits.reference_points

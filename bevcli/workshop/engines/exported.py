@@ -1,25 +1,34 @@
-"""An exported file in the place of a model."""
+"""An exported file in the place of a model, and its comparison with the model over a drive: `check_exported`."""
 
+import contextlib
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence as Items
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.frame import BevMap, FrameResult
+from bevcli.frame import BevMap, FrameResult, Sequence
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, RunnerState
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.printing import counted, reason_of
+from bevcli.registry import for_model, load
 from bevcli.workshop.engines.export_form import export_form, pixels_of
 from bevcli.workshop.engines.export_onnx import read_metadata
 
 Arrays = Mapping[str, np.ndarray]
+NEAR_M = 0.1
+CENTER = (0, 1, 4)  # columns of box codes
 
 
 class LoadedFile(nn.Module):
@@ -47,7 +56,6 @@ class ExportedModel(TemporalModel):
     """
 
     stages: Mapping[str, str] = {"engine": "engine"}
-    takes_pixels = True
     device = torch.device("cpu")
     digest: Tensor
 
@@ -78,7 +86,7 @@ class ExportedModel(TemporalModel):
         return self.engine.input_shapes["images"][1]
 
     def step(
-        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Items[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, Memory]:
         """See `TemporalModel`. Raises WeightsError unless the file was exported for the frame's number of cameras."""
         count = prepared.images.shape[1]
@@ -103,7 +111,10 @@ class ExportedModel(TemporalModel):
             masks, classes = outputs["mask_logits"][None], outputs["mask_class_logits"][None]
             segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
         logits, codes = outputs["class_logits"][None], outputs["box_codes"][None]
-        return self.form.model_outputs(ModelOutputs(outputs["bev"], logits, codes, segmentation), outputs)
+        result = ModelOutputs(outputs["bev"], logits, codes, segmentation)
+        for own_outputs in for_model("outputs_of_file", self.kind):
+            result = own_outputs(result, outputs)
+        return result
 
     def outputs_by_name(self, feed: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Every output of the file by name. feed: its inputs by name, see `ExportForm.feed`.
@@ -128,3 +139,109 @@ class ExportedModel(TemporalModel):
                 f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
         return {name: torch.from_numpy(value) for name, value in outputs.items()}
+
+
+def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:
+    """An exported file in the place of a model, see `Engine.open`. engine: a name of `bevcli.engines`."""
+    exported: ExportedModel = load("bevcli.engines", engine).open(file, threads)
+    return exported
+
+
+@dataclass(frozen=True)
+class FrameDifference:
+    """The largest differences between the two runs in one frame.
+
+    Attributes:
+        frame: index of the frame.
+        bev: of the BEV map.
+        logits: of the class logits.
+        box_m: of the box centres, metres.
+        near: share of the box centres that differ by at most 0.1 m, 0 to 1.
+        code: of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s.
+        masks: of the probabilities of the map's cells; 0 without segmentation.
+        further: of each output that only this model has, by its name in the file.
+    """
+
+    frame: int
+    bev: float
+    logits: float
+    box_m: float
+    near: float
+    code: float
+    masks: float
+    further: Mapping[str, float] = field(default_factory=dict)
+
+
+def check_exported(
+    file: Path, reference: Model | Path, sequence: Sequence, engine: str = "onnxruntime"
+) -> Iterator[FrameDifference]:
+    """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
+
+    Args:
+        file: an exported file of the model.
+        reference: the model, which runs on the CPU in float32; or another exported file of it.
+        sequence: the drive. Frames without any image are left out.
+        engine: the program that runs the file.
+
+    Raises WeightsError where the file cannot be loaded, InputError where a frame cannot be read.
+    """
+    cpu = torch.device("cpu")
+    network: TemporalModel
+    if isinstance(reference, Path):
+        network = load_exported(reference, engine)
+    else:
+        network = prepare_for_inference(reference.network, cpu)
+    exported = load_exported(file, engine)
+    preprocess = Preprocessor(exported.config)  # of the exported file, whose images have one size
+    runners = [Runner(model, cpu) for model in (network, exported)]
+    states: list[RunnerState[Any]] = [RunnerState(), RunnerState()]
+    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
+    with contextlib.ExitStack() as hooks:
+        for runner in runners:
+            hook = runner.model.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
+            hooks.enter_context(hook)
+        for prepared in map(preprocess, map(sequence.load, range(len(sequence.stamps)))):
+            if prepared.frame.images:
+                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
+                yield compare_outputs(prepared.frame.stamp.index, *(outputs[runner] for runner in runners))
+
+
+def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:
+    """The largest differences of the last layers and the BEV map of a frame."""
+    codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
+    distances = codes[..., CENTER].norm(dim=-1)
+    others = [index for index in range(codes.shape[-1]) if index not in CENTER]
+    probabilities = [
+        _probabilities(outputs.segmentation) for outputs in (ours, theirs) if outputs.segmentation is not None
+    ]
+    return FrameDifference(
+        frame=frame,
+        bev=_largest(ours.bev, theirs.bev),
+        logits=_largest(ours.class_logits[-1], theirs.class_logits[-1]),
+        box_m=distances.max().item(),
+        near=(distances <= NEAR_M).float().mean().item(),
+        code=codes[..., others].max().item(),
+        masks=_largest(*probabilities) if len(probabilities) == 2 else 0.0,
+        further={name: _largest(tensor, theirs.further[name]) for name, tensor in ours.further.items()},
+    )
+
+
+def difference_lines(differences: list[FrameDifference]) -> list[str]:
+    """A table, one line a frame, and the largest of each column; of the share of boxes, the smallest."""
+    columns = ("bev", "logits", "box_m", "code", "masks")
+    numbers = [(*(getattr(row, name) for name in columns), *row.further.values()) for row in differences]
+    written = [[f"{number:.1e}" for number in row] for row in (*numbers, map(max, zip(*numbers, strict=True)))]
+    near = [row.near for row in differences]
+    firsts = [*((str(row.frame), f"{row.near:.1%}") for row in differences), ("largest", f"{min(near):.1%}")]
+    heads = ("frame", "in 0.1 m", "BEV map", "logits", "centres m", "codes", "masks", *differences[0].further)
+    rows = [heads, *((*first, *row) for first, row in zip(firsts, written, strict=True))]
+    widths = [max(9, len(head)) for head in heads]
+    return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
+
+
+def _probabilities(segmentation: SegmentationOutputs) -> Tensor:
+    return segmentation.mask_logits[-1].sigmoid() * segmentation.class_logits[-1].sigmoid()[..., None]
+
+
+def _largest(ours: Tensor, theirs: Tensor) -> float:
+    return (ours - theirs).abs().max().item()

@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.recording.colors import GROUND_TRUTH_COLOR, OTHER_COLOR, class_colors
+from bevcli.recording.entities import GROUND_TRUTH_COLOR, OTHER_COLOR, class_colors
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.workshop.formats import WriteOptions
 from bevcli.workshop.formats.output import OutputFormat, image_file

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -29,7 +29,7 @@ from bevcli.sequences.format import true_result_files
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats import WriteOptions
-from bevcli.writing import remove_parts, whole_file, whole_folder, write_whole
+from bevcli.writing import output_errors, remove_parts, whole_file, write_whole
 
 GROUP: Final = "bevcli.drive_writers"
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
@@ -44,6 +44,26 @@ class DriveWriter(AbstractContextManager["DriveWriter"], Protocol):
 
     def write(self, frame: Frame) -> None:
         """Write a frame and its images. Raises InputError for one that the format cannot hold, and OutputError."""
+
+
+@contextmanager
+def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
+    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
+
+    So is the folder itself if it was missing before. Other files in it are kept.
+    Raises OutputError where the folder cannot be made.
+    """
+    is_new = not folder.exists()
+    with output_errors(folder, "created"):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            remove_parts(folder, parts)
+            if is_new:
+                folder.rmdir()
+        raise
 
 
 class FolderWriter(ExitStack):

@@ -40,9 +40,8 @@ def stress(
     from bevcli.errors import InputError
     from bevcli.sequences.open import open_sequence, select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.results import read_results, stress_table
-    from bevcli.workshop.robustness.stress import stress
-    from bevcli.workshop.synth.drives import open_drives
+    from bevcli.workshop.robustness.stress import read_results, stress, stress_table
+    from bevcli.workshop.synth.drives import RenderedDrives
 
     conditions = choose_conditions(output.severity, output.only)
     other = None if options.against is None else read_results(options.against)
@@ -54,7 +53,7 @@ def stress(
         drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
     else:
         seeds, cache = drive_options.rendered, drive_options.cache
-        rendered = open_drives((), seeds, cache, loaded.config, class_map=source.class_map)
+        rendered = RenderedDrives(seeds, cache, loaded.config, class_map=source.class_map)
         drives = [rendered.open(index) for index in range(len(rendered))]
         if source.frames is not None:
             drives = [select_range(drive, source.frames) for drive in drives]

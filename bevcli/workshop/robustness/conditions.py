@@ -21,7 +21,6 @@ from bevcli.workshop.robustness.options import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
 
-KEPT_BYTES = 1 << 30  # decoded images that are kept in memory, of all scenes together
 LOST_PARTS = 6  # level L loses an image or a pose with probability L/6
 MOST_CRASHES = 5  # draws of cameras at the hardest level
 
@@ -84,30 +83,6 @@ class CorruptedImages(ChangedSequence):
 
 def _with_pixels(image: CameraImage, pixels_bgr: Pixels) -> CameraImage:
     return replace(image, pixels_bgr=pixels_bgr, encoded=None, media_type=None)
-
-
-class KeptFrames(DerivedSequence):
-    """Keeps decoded frames, without the bytes of files, while the memory lasts, because every condition needs them.
-
-    most_bytes: of decoded images that are kept; frames beyond it are read again each time.
-    """
-
-    def __init__(self, sequence: Sequence, most_bytes: int) -> None:
-        super().__init__(sequence)
-        self._left_bytes = most_bytes
-        self._frames: dict[int, Frame] = {}
-
-    def load(self, index: int) -> Frame:
-        if index in self._frames:
-            return self._frames[index]
-        frame = self.sequence.load(index)
-        images = {name: _with_pixels(image, image.pixels_bgr) for name, image in frame.images.items()}
-        frame = replace(frame, images=images)
-        size = sum(image.pixels_bgr.nbytes for image in images.values())
-        if size <= self._left_bytes:
-            self._left_bytes -= size
-            self._frames[index] = frame
-        return frame
 
 
 def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:

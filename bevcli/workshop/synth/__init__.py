@@ -1,7 +1,7 @@
 """The rendered world: drives through a procedural city, with images from any rig and exact ground truth.
 
-meshes     `mesh` (primitives), `vehicles`, `people`, `street_objects`; `catalog` has all annotated objects by class
-world      `city` (streets, blocks, routes), `looks`, `ground`, `traffic`, `roadside`, `scenery`, `simulation`
+meshes     `mesh` (primitives), `road_users`, `catalog` (what stands still; all annotated objects by class)
+world      `city` (streets, blocks, routes), `looks`, `ground`, `traffic`, `simulation` (all actors), `scenery`
 images     `rig` (cameras and lenses), `shading_kernels`, `renderer`
 drives     `drive` (one drive; `render`), `drives` (those of a training, a validation or a stress test)
 

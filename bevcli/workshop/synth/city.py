@@ -7,12 +7,12 @@ calls.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.transforms import Array
@@ -66,6 +66,11 @@ class Block:
     low: tuple[float, float]  # south-west corner of the kerb, metres
     high: tuple[float, float]  # north-east corner of the kerb, metres
     sidewalks: tuple[float, float, float, float]  # widths on the south, east, north and west side, metres
+
+    @property
+    def kerb(self) -> Array:
+        """(P, 2) outline of its kerb stones."""
+        return rounded_rectangle(self.low, self.high, CORNER_M)
 
     def inside(self, margin: float = 0.0) -> tuple[Array, Array]:
         """South-west and north-east corner (2,) of the land behind the pavements, `margin` metres from them."""
@@ -145,6 +150,12 @@ class CityPlan:
     def street_at(self, node: tuple[int, int], direction: int) -> Street:
         """The street through a junction (column, row) in a direction (index into DIRECTIONS)."""
         return self.street(0, node[1]) if direction % 2 == 0 else self.street(1, node[0])
+
+    def between_stop_lines(self, axis: int, index: int, cross: int) -> tuple[float, float]:
+        """Positions of the stop lines at both ends of a stretch, metres. cross: the street that crosses it first."""
+        before, after = self.street(1 - axis, cross), self.street(1 - axis, cross + 1)
+        low = before.position + before.half_width + STOP_LINE_M
+        return low, after.position - after.half_width - STOP_LINE_M
 
     def node_center(self, node: tuple[int, int]) -> Array:
         """Plan point (2,) at the centre of a junction (column, row)."""
@@ -252,18 +263,29 @@ class JunctionPass:
 
 
 @dataclass(frozen=True)
-class Route:
-    """The path of a vehicle."""
+class Line:
+    """A line of straight pieces."""
 
-    points: Array  # (P, 2) world, metres
-    positions: Array  # (P,) distance of each point from the start, along the route, metres
+    points: Array  # (P, 2) metres
+
+    @cached_property
+    def positions(self) -> Array:
+        """(P,) distance of each point from the start, along the line, metres."""
+        return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+
+    def at(self, position: ArrayLike) -> Array:
+        """Points (..., 2) at positions (...,) in metres along the line."""
+        at = np.asarray(position, dtype=np.float64)
+        return np.stack([np.interp(at, self.positions, self.points[:, k]) for k in (0, 1)], -1)
+
+
+@dataclass(frozen=True)
+class Route(Line):
+    """The path of a vehicle, in the world frame."""
+
     yaws: Array  # (P,) headings, radians, unwrapped
     speed_limits: Array  # (P,) m/s
     passes: tuple[JunctionPass, ...]  # the junctions, in order
-
-    def at(self, position: ArrayLike) -> Array:
-        """World points (..., 2) at positions (...,) in metres along the route."""
-        return points_at(position, self.points, self.positions)
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
@@ -349,14 +371,16 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
 
     marks: of each junction: node, direction, turn, and the plan points of stop and leave.
     """
-    along_corners = distances_along(corners)
-    samples = np.arange(0, along_corners[-1], STEP_M)
-    plan = points_at(samples, corners, along_corners)
+    line = Line(corners)
+    plan = line.at(np.arange(0, line.positions[-1], STEP_M))
     points = gaussian_filter1d(city.bend(plan), SMOOTHING_M / STEP_M, axis=0, mode="nearest")
-    positions = distances_along(points)
+    positions = Line(points).positions
     way = np.gradient(points, axis=0)
     yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-    limits = _speed_limits(positions, yaws, speed)
+    curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
+    squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
+    falling = squared + 2 * BRAKING * positions  # the limits fall before curves so that BRAKING is enough
+    limits = np.sqrt(np.minimum.accumulate(falling[::-1])[::-1] - 2 * BRAKING * positions)
     passes, start = [], 0
     for node, direction, turn, *plan_points in marks:
         reached = []
@@ -365,23 +389,4 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
             start += int(np.argmin(np.linalg.norm(window - point, axis=1)))
             reached.append(float(positions[start]))
         passes.append(JunctionPass(node, direction, turn, *reached))
-    return Route(points, positions, yaws, limits, tuple(passes))
-
-
-def distances_along(points: Array) -> Array:
-    """(P,) distance of each point (P, 2) of a line from its start, along the line."""
-    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-
-
-def points_at(distances: ArrayLike, points: Array, positions: Array) -> Array:
-    """Points (..., 2) of a line at distances (...,) along it. points: (P, 2) with positions (P,) along the line."""
-    at = np.asarray(distances, dtype=np.float64)
-    return np.stack([np.interp(at, positions, points[:, k]) for k in (0, 1)], -1)
-
-
-def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:
-    """(P,) m/s: the limits of the curves, lowered before them so that BRAKING is enough."""
-    curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
-    squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
-    falling = squared + 2 * BRAKING * positions
-    return np.sqrt(np.minimum.accumulate(falling[::-1])[::-1] - 2 * BRAKING * positions)
+    return Route(points, yaws, limits, tuple(passes))

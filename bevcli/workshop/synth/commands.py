@@ -1,7 +1,7 @@
 """`bevcli render` renders a drive; `bevcli demo` renders a short one, runs it and opens the viewer."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from bevcli.cli.bridge import argument
 from bevcli.inference.options import ModelOptions
@@ -19,7 +19,6 @@ DEMO_RESOLUTION = (800, 450)
 def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
     from bevcli.cli.progress import Progress
-    from bevcli.jit import is_compiled
     from bevcli.workshop.synth.drive import render as render_sequence
     from bevcli.workshop.synth.shading_kernels import shade_pixels
 
@@ -44,3 +43,11 @@ def demo(options: DemoOptions) -> None:
     run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
     if options.view:
         viz(options.out / "results/recording.rrd", ViewOptions())
+
+
+def is_compiled(function: Any) -> bool:
+    """True if the cache has the compiled function of this file's present state."""
+    code = function.py_func.__code__
+    name = f"{Path(code.co_filename).stem}.{function.py_func.__qualname__}-{code.co_firstlineno}.*.nbi"
+    folder, changed = function.stats.cache_path, Path(code.co_filename).stat().st_mtime
+    return folder is not None and any(file.stat().st_mtime >= changed for file in Path(folder).glob(name))

@@ -3,7 +3,7 @@
 `render` makes a drive and writes it, `export_drive` writes a given one.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,6 +20,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.options import gather
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
@@ -27,33 +28,19 @@ from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, pa
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
-from bevcli.workshop.synth.renderer import (
-    NO_PATTERN,
-    RenderedView,
-    ShadowMap,
-    WorldSnapshot,
-    render_through_lens,
-    render_view,
-)
+from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Simulation
 from bevcli.workshop.synth.traffic import ActorState
-from bevcli.workshop.vad.map_lines import MapLines
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
 SCENERY_M = 135.0  # scenery is drawn within this distance
 NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
 SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
+TEXELS_M = {500: (0.125, 0.16), 1000: (0.06, 0.08), np.inf: (0.04, 0.06)}  # largest width -> of ground and shadows
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
-
-
-def texel_sizes(width: int) -> tuple[float, float]:
-    """The texel sizes of the ground texture and the shadow map, metres, that suit images of a width in pixels."""
-    if width <= 500:
-        return 0.125, 0.16
-    return (0.06, 0.08) if width <= 1000 else (0.04, 0.06)
 
 
 @dataclass(frozen=True)
@@ -121,7 +108,8 @@ class RenderedDrive:
             self.weather = self._looks.weather(self.weather)
         self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
         self._ground = GroundPlan(self._city)
-        self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
+        width = max(camera.width for camera in self.rig.cameras) * supersampling
+        self._texels_m = next(sizes for most, sizes in TEXELS_M.items() if width <= most)
         self._scenery = Scenery(self._city, self._assets.furniture, self._looks)
         self._around = lru_cache(maxsize=1)(self._make_surroundings)
         self._template = lru_cache(maxsize=None)(self._make_template)
@@ -194,9 +182,10 @@ class RenderedDrive:
         signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
-        pattern = NO_PATTERN if self._looks is None else self._looks.pattern()
         soup = TriangleSoup.gather([scenery, moving])
-        snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather, pattern)
+        snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather)
+        if self._looks is not None:
+            snapshot = replace(snapshot, pattern=self._looks.pattern())
 
         def render_one(name: str) -> RenderedView:
             pose = world_from_ego.matrix
@@ -325,26 +314,22 @@ def export_drive(
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
     with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
-        for frame in _encoded(drive, quality):
+        motion = drive.ego_motion(EGO_MOTION_HZ)
+        for rendered in map(drive.frame, range(drive.frames)):
+            images = {}
+            for name, pixels in rendered.images.items():
+                encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+                images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
+            frame = Frame(
+                rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
+                motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
+                ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
+            )  # fmt: skip
             writer.write(frame)
             if progress is not None:
                 progress(frame)
     # The writer has written a pose for each frame. Replace them by denser ones, so that cameras may have time offsets.
-    write_ego_motion(folder / "ego_motion.csv", drive.ego_motion(EGO_MOTION_HZ))
-
-
-def _encoded(drive: RenderedDrive, quality: int) -> Iterator[Frame]:
-    motion = drive.ego_motion(EGO_MOTION_HZ)
-    for rendered in map(drive.frame, range(drive.frames)):
-        images = {}
-        for name, pixels in rendered.images.items():
-            encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-            images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
-        yield Frame(
-            rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
-            motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
-            ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
-        )  # fmt: skip
+    write_ego_motion(folder / "ego_motion.csv", motion)
 
 
 def _rounded(boxes: Boxes3D) -> Boxes3D:

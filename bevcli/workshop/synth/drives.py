@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -56,7 +56,7 @@ class FolderDrives:
     input_shapes: tuple[InputShape, ...] | None = None
 
     def __init__(self, folders: Items[Path], config: ModelConfig, class_map: Mapping[str, str] | None = None) -> None:
-        self._folders = tuple(folders)
+        self.folders = tuple(folders)
         self._options = SequenceOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
         self._of_thread = threading.local()  # a Sequence must be read from one thread
 
@@ -68,13 +68,13 @@ class FolderDrives:
         vars(self).update(state, _of_thread=threading.local())
 
     def __len__(self) -> int:
-        return len(self._folders)
+        return len(self.folders)
 
     def open(self, index: int) -> Sequence:
         """The drive at an index, thinned to the model's frame rate. Raises InputError."""
         opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
         if index not in opened:
-            opened[index] = open_sequence(self._folders[index], self._options)
+            opened[index] = open_sequence(self.folders[index], self._options)
         return opened[index]
 
 
@@ -100,7 +100,9 @@ class RenderedDrives(FolderDrives):
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
             self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
-            self.input_shapes = tuple(_input_shape(drawn.rig, image) for drawn in self._rigs)
+            sizes = [image_for_rig(drawn.rig, image).padded_size for drawn in self._rigs]
+            counts = [len(drawn.rig.cameras) for drawn in self._rigs]
+            self.input_shapes = tuple((count, h, w) for count, (w, h) in zip(counts, sizes, strict=True))
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
@@ -120,7 +122,7 @@ class RenderedDrives(FolderDrives):
 
     def open(self, index: int) -> Sequence:
         """The drive at an index. It is rendered first, which takes seconds, if the cache does not hold it."""
-        folder = self._folders[index]
+        folder = self.folders[index]
         with self._rendering:
             if not folder.exists():
                 self._render(self._seeds[index], self._rigs[index], folder)
@@ -159,11 +161,6 @@ def _enlarged(drawn: DrawnRig, image: ImageConfig) -> DrawnRig:
     return replace(drawn, rig=replace(drawn.rig, cameras=cameras))
 
 
-def _input_shape(rig: CameraRig, image: ImageConfig) -> InputShape:
-    width, height = image_for_rig(rig, image).padded_size
-    return len(rig.cameras), height, width
-
-
 def _digest(rig: CameraRig) -> str:
     """Eight hexadecimal digits that differ between rigs."""
     parts = [
@@ -171,67 +168,6 @@ def _digest(rig: CameraRig) -> str:
         for c in rig.cameras
     ]
     return hashlib.sha256(repr((parts, rig.ego_from_bev.tolist())).encode()).hexdigest()[:8]
-
-
-class _Subset:
-    def __init__(self, drives: Drives, indices: range) -> None:
-        self._drives, self._indices = drives, indices
-        shapes = drives.input_shapes
-        self.input_shapes = None if shapes is None else tuple(shapes[index] for index in indices)
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def open(self, index: int) -> Sequence:
-        return self._drives.open(self._indices[index])
-
-
-def open_drives(
-    folders: Items[Path],
-    seeds: Items[int] | None,
-    cache: Path,
-    config: ModelConfig,
-    rig: CameraRig | RigDistribution | None = None,
-    class_map: Mapping[str, str] | None = None,
-) -> Drives:
-    """The drives in folders, or those rendered from seeds.
-
-    Args:
-        folders: sequence folders with ground truth; empty if seeds are given.
-        seeds: of rendered drives; None if folders are given.
-        cache: the folder that keeps rendered drives.
-        rig: of rendered drives, or the distribution of their rigs; None for the default rig.
-        class_map: names of the ground truth -> classes of the model.
-
-    Raises:
-        InputError: both or neither are given.
-    """
-    if bool(folders) == (seeds is not None):
-        raise InputError("choose the drives: give either `data=DIR` (repeatable), `rendered=SEEDS` or `split=FILE`")
-    if seeds is None:
-        return FolderDrives(folders, config, class_map)
-    return RenderedDrives(seeds, cache, config, rig, class_map)
-
-
-def check_training_seeds(seeds: Items[int]) -> None:
-    """Raises InputError if a seed is reserved for evaluation."""
-    if max(seeds, default=0) >= FIRST_HELD_OUT_SEED:
-        raise InputError(
-            f"`rendered`: seed {max(seeds)} is reserved for evaluation; train on seeds below {FIRST_HELD_OUT_SEED}"
-        )
-
-
-def split_drives(drives: Drives, held_out: int) -> tuple[Drives, Drives]:
-    """The drives to train on, and the last `held_out` (0: all) to evaluate on. Raises InputError if none is left."""
-    count = len(drives)
-    if count <= held_out:
-        raise InputError(
-            f"{count} drives are too few with {held_out} of them held out for evaluation: give more, "
-            "or set held_out = 0 in [training] to evaluate on the training drives"
-        )
-    first_held_out = count - held_out
-    evaluated = range(first_held_out if held_out else 0, count)
-    return _Subset(drives, range(first_held_out)), _Subset(drives, evaluated)
 
 
 def count_frames(drives: Drives) -> int:
@@ -270,14 +206,6 @@ def read_split(path: Path) -> Split:
     return split
 
 
-def split_of(data: DriveOptions, held_out: int) -> Split | None:
-    """The folders to train on and to score on; None for rendered drives. Raises InputError as `read_split`."""
-    if data.split is not None:
-        return _only_split(data, data.split)
-    first = len(data.data) - held_out
-    return Split(data.data[:first], data.data[first:]) if data.rendered is None else None
-
-
 def write_split(path: Path, split: Split) -> None:
     """Write a split file with absolute paths. Raises OutputError."""
     for_glob = {key: [glob.escape(str(folder.resolve())) for folder in getattr(split, key)] for key in KEYS}
@@ -287,24 +215,49 @@ def write_split(path: Path, split: Split) -> None:
 
 def training_drives(
     data: DriveOptions, held_out: int, cache: Path, config: ModelConfig, rigs: RigDistribution | None
-) -> tuple[Drives, Drives]:
-    """The drives to train on, and those to score on: of the split file, or else the last `held_out`.
+) -> tuple[FolderDrives, FolderDrives]:
+    """The drives to train on, and those to score on: of the split file, or else the last `held_out` (0: all).
 
-    Raises InputError as `read_split` and `split_drives`.
+    Raises InputError as `read_split`, where a seed is reserved for evaluation, and where no drive is left to train on.
     """
-    if data.split is None:
-        drives = open_drives(data.data, data.rendered, cache, config, rigs, data.class_map)
-        return split_drives(drives, held_out)
-    split = _only_split(data, data.split)
-    train, validate = (FolderDrives(folders, config, data.class_map) for folders in (split.train, split.validate))
-    return train, validate
+    highest = max(data.rendered or (0,))
+    if highest >= FIRST_HELD_OUT_SEED:
+        raise InputError(
+            f"`rendered`: seed {highest} is reserved for evaluation; train on seeds below {FIRST_HELD_OUT_SEED}"
+        )
+    if data.split is not None:
+        split = _only_split(data, data.split)
+        train, validate = (FolderDrives(folders, config, data.class_map) for folders in (split.train, split.validate))
+        return train, validate
+    count = len(data.data if data.rendered is None else data.rendered)
+    if 0 < count <= held_out:
+        raise InputError(
+            f"{count} drives are too few with {held_out} of them held out for evaluation: give more, "
+            "or set held_out = 0 in [training] to evaluate on the training drives"
+        )
+    first = max(count - held_out, 0)
+    drives = _opened(data, slice(first), cache, config, rigs)
+    return drives, _opened(data, slice(first, None), cache, config, rigs) if held_out else drives
 
 
-def scored_drives(data: DriveOptions, config: ModelConfig, rig: CameraRig | RigDistribution | None = None) -> Drives:
-    """The drives to score on. rig: of rendered ones, as for `open_drives`. Raises InputError as `read_split`."""
+def scored_drives(
+    data: DriveOptions, config: ModelConfig, rig: CameraRig | RigDistribution | None = None
+) -> FolderDrives:
+    """The drives to score on. rig: of rendered ones, as for `RenderedDrives`. Raises InputError as `read_split`."""
     if data.split is None:
-        return open_drives(data.data, data.rendered, data.cache, config, rig, data.class_map)
+        return _opened(data, slice(None), data.cache, config, rig)
     return FolderDrives(_only_split(data, data.split).validate, config, data.class_map)
+
+
+def _opened(
+    data: DriveOptions, part: slice, cache: Path, config: ModelConfig, rig: CameraRig | RigDistribution | None
+) -> FolderDrives:
+    """Some of the drives in folders, or of the rendered ones. Raises InputError where both or neither are given."""
+    if bool(data.data) == (data.rendered is not None):
+        raise InputError("choose the drives: give either `data=DIR` (repeatable), `rendered=SEEDS` or `split=FILE`")
+    if data.rendered is None:
+        return FolderDrives(data.data[part], config, data.class_map)
+    return RenderedDrives(data.rendered[part], cache, config, rig, data.class_map)
 
 
 def _only_split(data: DriveOptions, path: Path) -> Split:
@@ -325,3 +278,59 @@ def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
     if not folders:
         raise InputError(f"{path}: {key}: leaves no drive (expected at least one folder)")
     return tuple(folders)
+
+
+class FrameMemory:
+    """Keeps decoded frames of several sequences, without the bytes of files, while its memory lasts.
+
+    Frames beyond it are read each time. A copy in another process begins empty. Frames are shared: do not change their
+    images in place.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        """most_bytes: of decoded images that are kept."""
+        self._most_bytes = self._left_bytes = most_bytes
+        self._frames: dict[tuple[int, int], Frame] = {}
+
+    def __reduce__(self) -> tuple[type["FrameMemory"], tuple[int]]:
+        return FrameMemory, (self._most_bytes,)
+
+    def load(self, sequence: Sequence, key: int, place: int) -> Frame:
+        """The frame at a place of a sequence, whose number is `key`."""
+        if (key, place) in self._frames:
+            return self._frames[key, place]
+        frame = sequence.load(place)
+        images = {name: replace(image, encoded=None, media_type=None) for name, image in frame.images.items()}
+        frame = replace(frame, images=images)
+        size = sum(image.pixels_bgr.nbytes for image in images.values())
+        if size <= self._left_bytes:
+            self._left_bytes -= size
+            self._frames[key, place] = frame
+        return frame
+
+
+class KeptFrames(DerivedSequence):
+    """A sequence whose frames come from a `FrameMemory`, in which its number is `key`."""
+
+    def __init__(self, sequence: Sequence, memory: FrameMemory, key: int) -> None:
+        super().__init__(sequence)
+        self._memory, self._key = memory, key
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self.sequence.ground_truth_frame(place)
+
+    def load(self, place: int) -> Frame:
+        return self._memory.load(self.sequence, self._key, place)
+
+
+class KeptDrives:
+    """Drives whose frames are kept in memory; see `Drives`."""
+
+    def __init__(self, drives: Drives, memory: FrameMemory) -> None:
+        self._drives, self._memory, self.input_shapes = drives, memory, drives.input_shapes
+
+    def __len__(self) -> int:
+        return len(self._drives)
+
+    def open(self, index: int) -> Sequence:
+        return KeptFrames(self._drives.open(index), self._memory, index)

@@ -17,11 +17,10 @@ from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, MapLines, lines_in_area
 from bevcli.workshop.synth.city import CORNER_M, CROSSING_M, STOP_LINE_M, CityPlan, Street, along, rounded_rectangle
 from bevcli.workshop.synth.looks import tiling_noise
 from bevcli.workshop.synth.mesh import Color, linear
-from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
-from bevcli.workshop.vad.true_lines import lines_in_area
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)
@@ -75,7 +74,7 @@ class GroundPlan:
     def _make_block(self, column: int, row: int) -> GroundPiece:
         city, block = self.city, self.city.block(column, row)
         (x0, y0), (x1, y1) = block.low, block.high
-        outline = city.bend(rounded_rectangle(block.low, block.high, CORNER_M))
+        outline = city.bend(block.kerb)
         inner = rounded_rectangle((x0 + 0.25, y0 + 0.25), (x1 - 0.25, y1 - 0.25), CORNER_M - 0.25)
         paints = [GroundPaint(outline, KERB), GroundPaint(city.bend(inner), PAVEMENT)]
         south, east, north, west = block.sidewalks
@@ -109,10 +108,8 @@ class GroundPlan:
     def _make_stretch(self, axis: int, index: int, cross: int) -> GroundPiece:
         """A street between two junctions: asphalt from centre to centre, lines between the stop lines."""
         street = self.city.street(axis, index)
-        before, after = self.city.street(1 - axis, cross), self.city.street(1 - axis, cross + 1)
-        start, end = before.position, after.position
-        low = start + before.half_width + STOP_LINE_M
-        high = end - after.half_width - STOP_LINE_M
+        start, end = (self.city.street(1 - axis, k).position for k in (cross, cross + 1))
+        low, high = self.city.between_stop_lines(axis, index, cross)
         paints = [GroundPaint(self._band(street, start, end), ASPHALT)]
         boundaries = []
         lanes_edge = street.lanes * street.lane_m

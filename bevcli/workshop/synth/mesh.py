@@ -56,12 +56,6 @@ def linear(color: ArrayLike) -> NDArray[np.float32]:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def darker(color: Color, factor: float) -> Color:
-    """The colour with each component multiplied by a factor."""
-    red, green, blue = (int(component * factor) for component in color)
-    return red, green, blue
-
-
 Point = tuple[float, float, float]  # x, y, z, metres
 NO_FACADES = np.zeros((0, 16), np.float32)
 Row = tuple[Any, ...]  # of a table of parts: the function that makes a part, and its arguments
@@ -231,17 +225,6 @@ def loft(rings: Sequence[ArrayLike], surface: Surface) -> Mesh:
     if shape.volume < 0:
         shape.invert()
     return from_faces(shape.triangles[shape.area_faces > 1e-9], surface)
-
-
-def prism(rings: ArrayLike, surface: Surface) -> Mesh:
-    """A faster `loft` between two convex rings (2, P, 3), counter-clockwise from above, the lower one first."""
-    points = np.asarray(rings, dtype=np.float32)
-    count = points.shape[1]
-    following = [(i, (i + 1) % count) for i in range(count)]
-    faces = [(i, j, j + count) for i, j in following] + [(i, j + count, i + count) for i, j in following]
-    for i in range(1, count - 1):
-        faces += [(0, i + 1, i), (count, count + i, count + i + 1)]
-    return from_faces(points.reshape(-1, 3)[faces], surface)
 
 
 def side_profile(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
-from bevcli.options import option, option_of, options
+from bevcli.options import option, options
 from bevcli.sequences.options import ClassOptions
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            stated, value = option_of(field), getattr(self, field.name)
+            stated, value = field.metadata.get("option"), getattr(self, field.name)
             if stated is None or stated.minimum is None or value is None:
                 continue
             low, high = stated.minimum, stated.maximum

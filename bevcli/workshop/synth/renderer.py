@@ -290,9 +290,6 @@ class ShadowMap:
         return replace(self, heights=heights)
 
 
-NO_PATTERN = (0.0, 1.0, 0.0)
-
-
 @dataclass(frozen=True)
 class WorldSnapshot:
     """The world at one time, as the renderer needs it."""
@@ -302,7 +299,7 @@ class WorldSnapshot:
     ground: GroundTexture
     shadows: ShadowMap
     weather: Weather  # light, sky and haze
-    pattern: tuple[float, float, float] = NO_PATTERN  # strength, waves per metre, hardness; not on the ground
+    pattern: tuple[float, float, float] = (0.0, 1.0, 0.0)  # strength, waves per metre, hardness; not on the ground
 
 
 @dataclass(frozen=True)
@@ -329,13 +326,16 @@ def render_view(
     needed: (H, W) 0 for pixels that may stay black. Default: all are coloured.
     """
     soup = snapshot.soup
-    fine = _supersampled(camera, supersampling)
+    shift = np.array([[1.0, 0, (supersampling - 1) / 2], [0, 1.0, (supersampling - 1) / 2], [0, 0, 1.0]])
+    fine = camera.scaled(supersampling)
+    fine = replace(fine, intrinsics=shift @ fine.intrinsics)  # each pixel is divided into equal parts
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(soup, fine, inverse(world_from_camera), snapshot.object_count)
     wanted = np.ones((camera.height, camera.width), np.uint8) if needed is None else needed
     wanted = wanted.repeat(supersampling, axis=0).repeat(supersampling, axis=1)
     image = shade(snapshot, buffer, fine, world_from_camera, wanted)
-    objects = _seen_objects(buffer, soup)
+    owners = np.repeat(soup.mesh_objects, soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0])
+    objects = np.append(owners, -1).astype(np.int32)[buffer.triangles]  # triangle -1 is the last entry
     area = supersampling**2
     visible = np.bincount(objects[objects >= 0], minlength=snapshot.object_count)
     if supersampling > 1:
@@ -366,19 +366,6 @@ def render_through_lens(
     share = np.minimum(seen_flat / np.maximum(unoccluded_flat, 1), 1.0)
     unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), unoccluded_flat)
     return RenderedView(image, objects, visible, unoccluded.astype(np.int64))
-
-
-def _supersampled(camera: Camera, factor: int) -> Camera:
-    """The camera with each pixel divided into factor x factor equal parts."""
-    scaled = camera.scaled(factor)
-    shift = np.array([[1.0, 0, (factor - 1) / 2], [0, 1.0, (factor - 1) / 2], [0, 0, 1.0]])
-    return replace(scaled, intrinsics=shift @ scaled.intrinsics)
-
-
-def _seen_objects(buffer: VisibilityBuffer, soup: TriangleSoup) -> NDArray[np.int32]:
-    """(H, W) index of the object that each pixel sees; -1 for none."""
-    owners = np.repeat(soup.mesh_objects, soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0])
-    return np.append(owners, -1).astype(np.int32)[buffer.triangles]  # triangle -1 is the last entry
 
 
 TABLE_SIZE = 4096

@@ -62,24 +62,14 @@ def lens_parts(camera: Camera) -> tuple[LensPart, ...]:
     directions = _directions(camera, some_u, some_v)
     if (np.abs(directions[..., :2]) <= WIDEST * directions[..., 2:]).all():
         some = directions[..., :2] / directions[..., 2:]
-        rays = [RectBivariateSpline(some_v, some_u, some[..., axis])(v, u) for axis in range(2)]
-        return (_part(camera, FACES[0], rays),)
-    if camera.distortion.model == "kannala_brandt":
-        return _fisheye_parts(camera, _directions(camera, u, v))
-    raise InputError(
-        "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis, or a "
-        '"kannala_brandt" lens): remove "distortion" from the rig or use a narrower lens'
-    )
-
-
-def _directions(camera: Camera, u: Array, v: Array) -> Array:
-    """(V, U, 3) in the camera frame, of the pixels in columns (U,) and rows (V,)."""
-    return camera.rays(np.stack(np.meshgrid(u, v), -1))
-
-
-def _fisheye_parts(camera: Camera, directions: Array) -> tuple[LensPart, ...]:
-    """directions: (H, W, 3) of the pixels in the camera frame; NaN where the image is black."""
-    assert camera.distortion is not None
+        interpolated = [RectBivariateSpline(some_v, some_u, some[..., axis])(v, u) for axis in range(2)]
+        return (_part(camera, FACES[0], interpolated),)
+    if camera.distortion.model != "kannala_brandt":
+        raise InputError(
+            "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis, or a "
+            '"kannala_brandt" lens): remove "distortion" from the rig or use a narrower lens'
+        )
+    directions = _directions(camera, u, v)  # NaN where the image is black
     end = fisheye_table(camera.distortion.coefficients)[0][-1]
     if end < SMALLEST_ANGLE and np.isnan(directions).any():
         raise InputError(
@@ -97,6 +87,11 @@ def _fisheye_parts(camera: Camera, directions: Array) -> tuple[LensPart, ...]:
     if not parts:
         raise InputError('no pixel sees less than 120 degrees off the optical axis: check "intrinsics"')
     return tuple(parts)
+
+
+def _directions(camera: Camera, u: Array, v: Array) -> Array:
+    """(V, U, 3) in the camera frame, of the pixels in columns (U,) and rows (V,)."""
+    return camera.rays(np.stack(np.meshgrid(u, v), -1))
 
 
 def _part(camera: Camera, camera_from_part: Array, rays: Sequence[Array] | Array) -> LensPart:
@@ -279,7 +274,9 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
         spread = random.uniform(-1, 1)
         own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
         intrinsics = _intrinsics(image_size, own_fov, distribution, random)
-        position = _position(yaw_deg, radius, height, distribution, random)
+        around = np.radians(yaw_deg + random.uniform(-20, 20))  # on an ellipse around the middle of the vehicle
+        x, y = _CENTER_X_M + radius * np.cos(around), 0.5 * radius * np.sin(around)
+        position = (x, y, np.clip(height + random.uniform(-0.15, 0.15), *distribution.height_m))
         tilt = _tilt(distribution.tilt_deg, random)
         rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
         distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
@@ -306,15 +303,6 @@ def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribu
     ratio = 1 + random.uniform(-1, 1) * distribution.focal_ratio
     x, y = 0.5 + random.uniform(-1, 1, 2) * distribution.principal_point
     return np.array([[focal, 0, x * width], [0, focal * ratio, y * height], [0, 0, 1.0]])
-
-
-def _position(yaw_deg: float, radius: float, height: float, distribution: RigDistribution, random: Generator) -> Array:
-    """(3,) ego, metres: on an ellipse around the middle of the vehicle, in the viewing direction."""
-    around = np.radians(yaw_deg + random.uniform(-20, 20))
-    x = _CENTER_X_M + radius * np.cos(around)
-    y = 0.5 * radius * np.sin(around)
-    z = np.clip(height + random.uniform(-0.15, 0.15), *distribution.height_m)
-    return np.array([x, y, z])
 
 
 def _lens(distribution: RigDistribution, random: Generator) -> tuple[float, ...] | None:

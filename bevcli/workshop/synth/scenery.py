@@ -9,30 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.synth.city import (
-    CORNER_M,
-    DIRECTIONS,
-    KERB_M,
-    Block,
-    CityPlan,
-    right_of,
-    rounded_rectangle,
-    side_of,
-)
+from bevcli.workshop.synth.catalog import TREE_KINDS, StreetFurniture
+from bevcli.workshop.synth.city import CORNER_M, DIRECTIONS, KERB_M, Block, CityPlan, right_of, side_of
 from bevcli.workshop.synth.looks import Looks
-from bevcli.workshop.synth.mesh import (
-    Color,
-    Finish,
-    Material,
-    Mesh,
-    TriangleSoup,
-    darker,
-    from_faces,
-    joined,
-    linear,
-    prism,
-)
-from bevcli.workshop.synth.street_objects import TREE_KINDS, StreetFurniture
+from bevcli.workshop.synth.mesh import Color, Finish, Material, Mesh, TriangleSoup, from_faces, joined, linear
 from bevcli.workshop.synth.traffic import Signals
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
@@ -118,7 +98,7 @@ def _house(
     for _ in range(int(rng.integers(0, 3))):
         at = middle + rng.uniform(-3, 3, 2)
         square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
-        rest.append(prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
+        rest.append(_prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
     facade = np.repeat(np.arange(4), 2).astype(np.int32)
     return [TriangleSoup.from_mesh(joined(walls), facade, np.stack(rows)), TriangleSoup.from_mesh(joined(rest))]
 
@@ -141,7 +121,8 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
     middle = ground.mean(0)
     wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
     rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
-    return prism(rings, darker(style.wall, 0.8) if style.band else ROOF)
+    red, green, blue = (int(component * 0.8) for component in style.wall)
+    return _prism(rings, (red, green, blue) if style.band else ROOF)
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
@@ -157,7 +138,18 @@ def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
         b = a + way * 4.0
         footprint = np.array([a, a + out * 1.3, b + out * 1.3, b])
         rings = [np.column_stack([footprint, (h, e, e, h)]) for h, e in ((3.15, 2.65), (3.3, 2.72))]
-        yield prism(rings, colors[int(rng.integers(len(colors)))])
+        yield _prism(rings, colors[int(rng.integers(len(colors)))])
+
+
+def _prism(rings: ArrayLike, color: Color) -> Mesh:
+    """A faster `mesh.loft` between two convex rings (2, P, 3), counter-clockwise from above, the lower one first."""
+    points = np.asarray(rings, dtype=np.float32)
+    count = points.shape[1]
+    following = [(i, (i + 1) % count) for i in range(count)]
+    faces = [(i, j, j + count) for i, j in following] + [(i, j + count, i + count) for i, j in following]
+    for i in range(1, count - 1):
+        faces += [(0, i + 1, i), (count, count + i, count + i + 1)]
+    return from_faces(points.reshape(-1, 3)[faces], color)
 
 
 def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
@@ -196,7 +188,7 @@ class Scenery:
 
     def _make_block(self, column: int, row: int) -> list[TriangleSoup]:
         land, use = self.city.block(column, row), self.city.landuse(column, row)
-        meshes = [TriangleSoup.from_mesh(kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M)))]
+        meshes = [TriangleSoup.from_mesh(kerb_slab(self.city, land.kerb))]
         if use == "houses":
             meshes += houses(self.city, land)
         rng = self.city.stream("furniture", column, row)

@@ -1,128 +1,312 @@
-"""The simulation of a drive: traffic and pedestrians over its whole time, and the ego vehicle's motion."""
+"""All actors of a drive: pedestrians, what stands at the roadside, driving vehicles; and the ego vehicle's motion."""
 
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
 
-from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.synth.catalog import Assets, draw_body
-from bevcli.workshop.synth.city import DIRECTIONS, STOP_LINE_M, CityPlan, Route, build_route, right_of
-from bevcli.workshop.synth.people import RIDDEN
-from bevcli.workshop.synth.roadside import Roadside, StandingActor, Walker, crossers, strollers
-from bevcli.workshop.synth.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
+from bevcli.workshop.synth import traffic
+from bevcli.workshop.synth.catalog import Assets, Body, draw_body
+from bevcli.workshop.synth.city import DIRECTIONS, KERB_M, CityPlan, Line, Street, along, rounded_rectangle, side_of
+from bevcli.workshop.synth.road_users import CYCLES, PERSON_NAMES
 
-Actor = DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
-TRAFFIC_MIX = {
-    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
-}  # fmt: skip
-MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
-SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
+STRIDE_M = 0.72  # distance after which the pose changes
+CROSSING_LINE_M = 3.2  # from the edge of the junction to the line on which people cross
+ALONG_PAVEMENT_M = 26.0  # length of a crosser's path on the pavement, before and after the road
+STROLLERS_PER_BLOCK = 4.5  # mean number
+SECONDS_BETWEEN_CROSSERS = 8.0  # mean time at a junction
 
 
-class VehicleSpawner:
-    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
+@dataclass(frozen=True)
+class Walker:
+    """A person on a path."""
 
-    def __init__(self, city: CityPlan, assets: Assets, route_m: float) -> None:
-        self.city, self.assets, self.route_m = city, assets, route_m
-        self._rng = city.stream("population")
-        self._count = 0
+    city: CityPlan  # the plan that the path belongs to
+    body: Body  # size and looks
+    path: Line  # in plan coordinates
+    times: Array  # (K,) seconds; between them the person moves evenly
+    walked_m: Array  # (K,) position along the path at these times, metres
+    road: tuple[float, float]  # start and end of the part of the path that is on a road, metres; negative for none
 
-    def spawn_ego(self, units: tuple[Unit, ...]) -> Vehicle:
-        """The ego vehicle, on the approach to junction (0, 0)."""
-        rng = self.city.stream("ego")
-        direction = int(rng.integers(4))
-        lane = int(rng.integers(self.city.street_at((0, 0), direction).lanes))
-        edge = self.city.street_at((0, 0), direction + 1).half_width + STOP_LINE_M
-        before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
-        route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
-        return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
+    def plan_at(self, time_s: ArrayLike) -> Array:
+        """Plan points (..., 2) at times (...,) in seconds."""
+        walked_m = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.walked_m)
+        return self.path.at(walked_m)
 
-    def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
-        """Try to place a vehicle on a lane at a random point; None where it does not fit.
+    def on_road(self, time_s: float) -> bool:
+        """True while the person walks and is on the road, so that vehicles must stop."""
+        walks = self.times[0] < time_s < self.times[-1]
+        return bool(walks and self.road[0] - 0.3 < np.interp(time_s, self.times, self.walked_m) < self.road[1] + 0.3)
 
-        around: world point (2,). near_m, far_m: least and greatest distance from it, metres.
-        taken: (M, 2) world points of other vehicles. bicycle: whether to place a bicycle.
+    def state(self, time_s: float) -> traffic.ActorState | None:
+        """The state, or None before the walk begins and after it ends."""
+        if not self.times[0] <= time_s <= self.times[-1]:
+            return None
+        walked = float(np.interp(time_s, self.times, self.walked_m))
+        plan = self.plan_at([time_s - 0.02, time_s, time_s + 0.02])
+        before, here, after = self.city.bend(plan)
+        velocity = (after - before) / 0.04
+        moving = float(np.hypot(*velocity)) > traffic.MOVING_M_S
+        if moving:
+            yaw = float(np.arctan2(velocity[1], velocity[0]))
+        else:  # a waiting person faces along the path
+            segment = int(np.searchsorted(self.path.positions, walked, side="right"))
+            way = self.path.points[segment] - self.path.points[segment - 1]
+            yaw = self.city.heading(plan[1], way / max(float(np.hypot(*way)), 1e-9))
+        inside = min(walked - self.road[0], self.road[1] - walked)  # metres into the road, negative on pavements
+        position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
+        attribute = "pedestrian.moving" if moving else "pedestrian.standing"
+        return traffic.ActorState(self.body, position, yaw, attribute, velocity, int(walked / STRIDE_M) % 2)
+
+
+def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
+    """People who walk around a block on its pavement. span_s: start and end of the simulation, seconds."""
+    rng = city.stream("strollers", column, row)
+    land = city.block(column, row)
+    walkers = []
+    for k in range(int(rng.poisson(STROLLERS_PER_BLOCK))):
+        inset = rng.uniform(1.3, min(land.sidewalks) - 2.1)
+        low, high = (land.low[0] + inset, land.low[1] + inset), (land.high[0] - inset, land.high[1] - inset)
+        ring = np.roll(rounded_rectangle(low, high, 3.5), int(rng.integers(100)), axis=0)
+        if rng.random() < 0.5:
+            ring = ring[::-1]
+        speed = rng.uniform(0.8, 1.7)
+        lap = float(np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum())
+        walked = (span_s[1] - span_s[0]) * speed
+        path = np.concatenate([ring] * (int(np.ceil(walked / lap)) + 1) + [ring[:1]])
+        body = _person(assets, rng, f"stroller-{column}-{row}-{k}")
+        walkers.append(Walker(city, body, Line(path), np.array(span_s), np.array([0.0, walked]), (-1.0, -1.0)))
+    return walkers
+
+
+def crossers(
+    city: CityPlan, assets: Assets, signals: traffic.Signals, span_s: tuple[float, float], node: tuple[int, int]
+) -> list[Walker]:
+    """People who walk to the kerb at a junction (column, row), wait for the signal, cross the road and walk on."""
+    rng = city.stream("crossers", *node)
+    walkers: list[Walker] = []
+    begin = span_s[0] - 30
+    while begin < span_s[1]:
+        index = len(walkers)
+        arm = int(rng.integers(4))
+        street, cross = city.street_at(node, arm), city.street_at(node, arm + 1)
+        side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
+        sideways = DIRECTIONS[(arm + 1) % 4] * side
+        ahead = cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
+        spot, reach = city.node_center(node) + DIRECTIONS[arm] * ahead, street.half_width + ALONG_PAVEMENT_M
+        path = Line(along(spot - sideways * reach, spot + sideways * reach))
+        speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # crosses within 13 s
+        kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
+        arrival = begin + kerb / speed
+        start = arrival
+        while not signals.walk(node, arm % 2, start):
+            start += 0.25
+        start += rng.uniform(0, 1.0) if start > arrival else 0.0
+        end = start + (2 * reach - kerb) / speed
+        body = _person(assets, rng, f"crosser-{node[0]}-{node[1]}-{index}")
+        times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
+        walkers.append(Walker(city, body, path, times, walked_m, (ALONG_PAVEMENT_M, far)))
+        begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
+    return walkers
+
+
+def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:
+    names = [n for n in PERSON_NAMES if n != "worker"]
+    return draw_body(assets.draw("pedestrian", rng, names), rng, name, 0.03, rng.uniform(0.94, 1.05))
+
+
+PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
+FILLED = 0.55  # share of parking spaces that are taken
+WORKS_SHARE = 0.27  # share of parking lanes (one side of a stretch) with road works
+PARKED_LOOKS = {**CYCLES, "bus": ("mini", "shuttle")}
+ATTRIBUTES = {
+    "bicycle": "cycle.without_rider", "motorcycle": "cycle.without_rider", "pedestrian": "pedestrian.standing",
+    "barrier": "", "traffic_cone": "",
+}  # of classes other than vehicles, which are parked  # fmt: skip
+
+
+class StandingActor(traffic.ActorState):
+    """An actor that never moves."""
+
+    def state(self, time_s: float) -> traffic.ActorState:
+        """The same state at all times."""
+        return self
+
+
+class Roadside:
+    """The standing actors of a city. They are made when they are first needed, and kept."""
+
+    def __init__(self, city: CityPlan, assets: Assets) -> None:
+        self.city, self.assets = city, assets
+        self.stretch = lru_cache(maxsize=None)(self._stretch)
+        self.block = lru_cache(maxsize=None)(self._block)
+
+    def _stretch(self, axis: int, index: int, cross: int) -> list[StandingActor]:
+        """Actors on the parking lanes of a stretch of street. cross: index of the street that crosses it first."""
+        return [*self._kerbside(axis, index, cross, -1), *self._kerbside(axis, index, cross, 1)]
+
+    def _block(self, column: int, row: int) -> list[StandingActor]:
+        site = self._site(column, row) if self.city.landuse(column, row) == "site" else []
+        return [*self._on_pavement(column, row), *site]
+
+    def _body(
+        self,
+        class_name: str,
+        rng: np.random.Generator,
+        instance: str,
+        spread: float = 0.05,
+        names: Collection[str] | None = None,
+    ) -> Body:
+        return draw_body(self.assets.draw(class_name, rng, names), rng, instance, spread)
+
+    def _kerbside(self, axis: int, index: int, cross: int, side: int) -> list[StandingActor]:
+        """One side of a stretch. side: +1 or -1, the sign of the offset from the centre line."""
+        street = self.city.street(axis, index)
+        if not street.parking_m:
+            return []
+        rng = self.city.stream("kerbside", axis, index, cross, side)
+        low, high = self.city.between_stop_lines(axis, index, cross)
+        low, high = low + 2.5, high - 2.5
+        name = f"{axis}.{index}.{cross}.{side}"
+        made: list[StandingActor] = []
+        closed = (high + 1, high + 1)
+        if rng.random() < WORKS_SHARE:
+            length = rng.uniform(15, 24)
+            if length < high - low:  # there is no room for them in a short block
+                begin = rng.uniform(low, high - length)
+                closed = (begin, begin + length)
+                made += self._works(street, side, closed, rng, name)
+        at = low
+        while at < high - 4:
+            class_name = str(rng.choice(list(PARKED_MIX), p=list(PARKED_MIX.values())))
+            body = self._body(class_name, rng, f"parked-{name}-{len(made)}", names=PARKED_LOOKS.get(class_name))
+            length = float(body.size_lwh[0])
+            if at + length > high:
+                break
+            free = at + length + 1 < closed[0] or at > closed[1] + 1
+            if free and rng.random() < FILLED:
+                offset = street.half_width - 0.18 - body.size_lwh[1] / 2
+                made.append(self._stand(street, body, at + length / 2, side * offset))
+            at = at + length + rng.uniform(0.6, 1.3) if not (at <= closed[1] and not free) else closed[1] + 1.2
+        return made
+
+    def _works(
+        self, street: Street, side: int, closed: tuple[float, float], rng: np.random.Generator, name: str
+    ) -> Iterator[StandingActor]:
+        """Barriers along the traffic, cones, a machine and workers. closed: start and end along the street, metres."""
+        start, end = closed
+        edge, middle = street.half_width - 3.05, street.half_width - 1.4
+        barrier = self.assets.draw("barrier", rng)
+        for k, at in enumerate(np.arange(start + 4.0, end - 3.9, rng.choice([2.65, 2.65, 4.0]))):
+            body = draw_body(barrier, rng, f"barrier-{name}-{k}", 0.02)
+            yield self._stand(street, body, float(at), side * edge, np.pi / 2)
+        cone = self.assets.draw("traffic_cone", rng)
+        across = np.linspace(street.half_width - 0.3, edge + 0.1, 4)
+        along = [*(start + 0.75 * np.arange(4)), *(end - 0.75 * np.arange(4))]
+        for k, (at, offset) in enumerate(zip(along, [*across, *across], strict=True)):
+            body = draw_body(cone, rng, f"cone-{name}-{k}", 0.03)
+            yield self._stand(street, body, at, side * offset)
+        machines = [(v.name, v.size_lwh) for v in self.assets.by_class["construction_vehicle"]]
+        small = [look for look, size in machines if size[0] < end - start - 8 and size[1] < 2.72]
+        machine = self._body("construction_vehicle", rng, f"machine-{name}", names=small)
+        space = (start + 4 + machine.size_lwh[0] / 2, end - 4 - machine.size_lwh[0] / 2)
+        at = float(rng.uniform(*space)) if space[1] > space[0] else (start + end) / 2
+        turned = np.pi if rng.random() < 0.3 else 0.0
+        yield self._stand(street, machine, at, side * middle, turned)
+        for k in range(int(rng.integers(1, 4))):
+            body = self._body("pedestrian", rng, f"worker-{name}-{k}", 0.03, ["worker_standing"])
+            at = start + 2.9 if k == 0 else end - 2.1 - 0.8 * k
+            offset = side * (street.half_width - (0.6, 0.7, 1.5)[k])
+            yield self._stand(street, body, at, offset, float(rng.uniform(0, 6.3)))
+
+    def _stand(self, street: Street, body: Body, at: float, offset: float, turn: float = 0.0) -> StandingActor:
+        """An actor on a street that faces in the direction of the traffic on its side, turned by `turn` radians.
+
+        at: position along the street; offset: from its centre line; metres, plan coordinates.
         """
-        rng = self._rng
-        x, y = self.city.unbend(around)
-        axis = int(rng.integers(2))
-        across, lengthwise = (y, x) if axis == 0 else (x, y)
-        streets = self.city.streets_between(axis, across - far_m, across + far_m)
-        if not streets:
-            return None
-        street = self.city.street(axis, streets[int(rng.integers(len(streets)))])
-        at = lengthwise + rng.uniform(-far_m, far_m)
-        direction = axis + 2 * int(rng.integers(2))
-        following = self.city.below(1 - axis, at) + (direction < 2)
-        node = (following, street.index) if axis == 0 else (street.index, following)
-        before = float((self.city.node_center(node) - street.point(at)) @ DIRECTIONS[direction])
-        lane = int(rng.integers(street.lanes))
-        units = self._units(bicycle)
-        length = units[-1].lag + float(units[-1].body.size_lwh[0])
-        cross = self.city.street_at(node, direction + 1)
-        if before < cross.half_width + STOP_LINE_M + 1:
-            return None
-        point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
-        front = self.city.bend(point)
-        if not near_m <= np.hypot(*(front - around)) <= far_m:
-            return None
-        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # the space needed before and behind
-        gaps = self.city.bend(point + reach)[:, None] - taken
-        if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
-            return None
-        speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
-        route_m, before = self.route_m * speed / 12 + length, before + length + 2
-        route = build_route(self.city, rng, node, direction, lane, before, route_m, speed, bicycle=bicycle)
-        return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
+        plan, forward = street.point(at, offset), float(-np.sign(offset) if street.axis == 0 else np.sign(offset))
+        direction = (forward, 0.0) if street.axis == 0 else (0.0, forward)
+        return self._stand_on_land(body, plan, self.city.heading(plan, direction) + turn, 0.0)
 
-    def _units(self, bicycle: bool) -> tuple[Unit, ...]:
-        rng, draw = self._rng, self.assets.draw
-        class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
-        self._count += 1
-        name = f"moving-{self._count}"
-        if class_name == "train":
-            heavy = rng.random() < 0.7
-            first = draw("truck", rng, ("tractor",) if heavy else ("pickup", "delivery", "box"))
-            second = draw("trailer", rng, SEMITRAILERS if heavy else ("utility",))
-            tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
-            lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
-            return Unit(tractor, 0.0), Unit(towed, lag)
-        return (Unit(draw_body(draw(class_name, rng, MOVING_LOOKS.get(class_name)), rng, name), 0.0),)
+    def _on_pavement(self, column: int, row: int) -> list[StandingActor]:
+        rng = self.city.stream("pavement", column, row)
+        land, made = self.city.block(column, row), []
+        for side in range(4):
+            start, way, inward, length = side_of(land.low, land.high, side)
+            depth, name = land.sidewalks[side] - 1.0, f"{column}.{row}.{side}"
+            for group in range(int(rng.poisson(0.7))):
+                # Racks do not overlap: each has a quarter of the side for itself.
+                at = 9 + (length - 22) * (group + rng.random()) / 4
+                for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
+                    class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
+                    body = self._body(class_name, rng, f"rack-{name}.{group}.{k}", 0.03, CYCLES[class_name])
+                    point = start + way * (at + 0.85 * k) + inward * depth
+                    made.append(self._stand_on_land(body, point, self.city.heading(point, inward)))
+            for group in range(int(rng.poisson(0.5))):
+                middle = start + way * rng.uniform(8, length - 8) + inward * depth
+                if (self._distances(made, middle) < 2.6).any():
+                    continue
+                for k in range(int(rng.integers(1, 4))):
+                    names = [f"{n}_standing" for n in PERSON_NAMES if n != "worker"]
+                    body = self._body("pedestrian", rng, f"standing-{name}.{group}.{k}", 0.03, names)
+                    angle = 2.1 * k + rng.uniform(-0.3, 0.3)
+                    point = middle + 0.55 * np.array([np.cos(angle), np.sin(angle)])
+                    made.append(self._stand_on_land(body, point, self.city.heading(point, middle - point)))
+        return made
 
+    def _distances(self, made: list[StandingActor], point: Array) -> Array:
+        """(M,) distances of the actors from a plan point (2,), metres."""
+        x, y = self.city.bend(point)
+        return np.array([np.hypot(m.position[0] - x, m.position[1] - y) for m in made])
+
+    def _stand_on_land(self, body: Body, point: ArrayLike, yaw: float, height: float = KERB_M) -> StandingActor:
+        """An actor at a plan point (2,). height: of the ground, metres."""
+        attribute = ATTRIBUTES.get(body.variant.class_name, "vehicle.parked")
+        return StandingActor(body, np.array([*self.city.bend(point), height]), yaw, attribute)
+
+    def _site(self, column: int, row: int) -> list[StandingActor]:
+        rng = self.city.stream("site", column, row)
+        name, (low, high) = f"{column}.{row}", self.city.block(column, row).inside(0.4)
+        made: list[StandingActor] = []
+        barrier = self.assets.draw("barrier", rng)
+        for side in range(4):
+            start, way, _, length = side_of(low, high, side)
+            for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):
+                if rng.random() >= 0.12:
+                    body = draw_body(barrier, rng, f"fence-{name}.{side}.{k}", 0.02)
+                    yaw = self.city.heading(start + way * at, way) + np.pi / 2
+                    made.append(self._stand_on_land(body, start + way * at, yaw))
+        machines = [("construction_vehicle", None)] * int(rng.integers(4, 7))
+        trucks = [("truck", ("dumper", "flatbed"))] * 2
+        trailers = [("trailer", ("flatbed", "container", "utility"))]
+        for k, (class_name, names) in enumerate([*machines, *trucks, *trailers]):
+            body = self._body(class_name, rng, f"site-{name}.{k}", names=names)
+            lengths = np.array([m.body.size_lwh[0] for m in made]) + body.size_lwh[0]
+            for _ in range(12):
+                point = low + 8 + rng.random(2) * (high - low - 16)
+                if (self._distances(made, point) > lengths / 2).all():
+                    made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3))))
+                    break
+        for k in range(8):
+            point = low + 1.4 + rng.random(2) * (high - low - 2.8)
+            if rng.random() < 0.5:
+                body = self._body("pedestrian", rng, f"siteworker-{name}.{k}", 0.03, ["worker_standing"])
+                made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3))))
+            else:
+                body = self._body("traffic_cone", rng, f"sitecone-{name}.{k}", 0.03)
+                made.append(self._stand_on_land(body, point, 0.0))
+        return made
+
+
+Actor = traffic.DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
 
 WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
 AFTER_S = 0.6  # simulated time after the last frame
 VEHICLES, BICYCLES = 22, 6  # numbers around the ego vehicle, which counts as a vehicle
 REACH_M = 75.0  # traffic is simulated within this distance of the ego vehicle
-EGO_REAR_AXLE_M = 3.75  # from the front of the ego vehicle to its rear axle, the origin of the ego frame
-EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle's speed
-
-
-@dataclass(frozen=True)
-class EgoTrack:
-    """The motion of the ego vehicle's rear axle."""
-
-    route: Route  # its route
-    track: Array  # (3, T) times (seconds), route positions (metres), speeds (m/s)
-
-    def pose(self, time_s: float) -> tuple[Array, float]:
-        """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
-        s = interpolated_track(self.track, time_s)
-        return self.route.at(s), float(self.route.yaw_at(s))
-
-    def motion(self, time_s: float) -> tuple[Array, Array, Array]:
-        """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
-        h = 0.05
-        s = [interpolated_track(self.track, time_s + d) for d in (-h, 0.0, h)]
-        speed = (s[2] - s[0]) / (2 * h)
-        rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
-        before, after = np.interp([time_s - h, time_s + h], self.track[0], self.track[2])
-        forward = float(after - before) / (2 * h)
-        return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
 
 class Simulation:
@@ -132,16 +316,16 @@ class Simulation:
         self.city, self.assets = city, assets
         self.roadside = Roadside(city, assets)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
-        self.spawner = VehicleSpawner(city, assets, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
+        self.spawner = traffic.VehicleSpawner(city, assets, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
         self.ego_body = draw_body(assets.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
-        self._ego = self.spawner.spawn_ego((Unit(self.ego_body, 0.0),))
+        self._ego = self.spawner.spawn_ego((traffic.Unit(self.ego_body, 0.0),))
         first = self._ego.route.passes[0]
-        self.signals = Signals(city, (first.node, first.direction % 2))
+        self.signals = traffic.Signals(city, (first.node, first.direction % 2))
         self._crossers = lru_cache(maxsize=None)(partial(crossers, city, assets, self.signals, self.span_s))
         self._strollers = lru_cache(maxsize=None)(partial(strollers, city, assets, self.span_s))
-        self._driving: list[DrivingActor] = []
+        self._driving: list[traffic.DrivingActor] = []
         self._run()
-        self.ego = _smoothed(self._ego)
+        self.ego = traffic.EgoTrack.smoothed(self._ego)
 
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
         """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
@@ -156,20 +340,20 @@ class Simulation:
         return actors
 
     def _run(self) -> None:
-        vehicles, start = [self._ego], self.span_s[0] - STEP_S
-        gone: list[Vehicle] = []
-        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / STEP_S)) + 2
+        vehicles, start = [self._ego], self.span_s[0] - traffic.STEP_S
+        gone: list[traffic.Vehicle] = []
+        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / traffic.STEP_S)) + 2
         self._ego.track.append((start, self._ego.front, self._ego.speed))
         self._populate(vehicles, 0.0, start)
         for k in range(steps):
-            time_s = start + k * STEP_S
-            step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
+            time_s = start + k * traffic.STEP_S
+            traffic.step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
             if k % 10 == 9:
-                gone += self._renew(vehicles, time_s + STEP_S)
+                gone += self._renew(vehicles, time_s + traffic.STEP_S)
         seen = [vehicle for vehicle in [*gone, *vehicles[1:]] if len(vehicle.track) > 1]
-        self._driving = [DrivingActor(v, unit, np.array(v.track).T) for v in seen for unit in v.units]
+        self._driving = [traffic.DrivingActor(v, unit, np.array(v.track).T) for v in seen for unit in v.units]
 
-    def _populate(self, vehicles: list[Vehicle], near_m: float, time_s: float) -> None:
+    def _populate(self, vehicles: list[traffic.Vehicle], near_m: float, time_s: float) -> None:
         """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
         around = self._ego.route.at(self._ego.front + 25.0)
         taken = [vehicle.body_points() for vehicle in vehicles]
@@ -184,7 +368,7 @@ class Simulation:
                 vehicles.append(new)
                 taken.append(new.body_points())
 
-    def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
+    def _renew(self, vehicles: list[traffic.Vehicle], time_s: float) -> list[traffic.Vehicle]:
         """Remove vehicles that are far away or at the end of their route, and spawn others. Returns those removed."""
         here = self._ego.route.at(self._ego.front)
         gone = [
@@ -198,16 +382,8 @@ class Simulation:
         self._populate(vehicles, 58.0, time_s)
         return gone
 
-    def _people_on_roads(self, vehicles: list[Vehicle], time_s: float) -> Array:
+    def _people_on_roads(self, vehicles: list[traffic.Vehicle], time_s: float) -> Array:
         """(H, 2) world points of people on the road at the junctions that vehicles approach."""
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
         points = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
         return self.city.bend(np.array(points).reshape(-1, 2))
-
-
-def _smoothed(ego: Vehicle) -> EgoTrack:
-    """The track of the ego vehicle with its speed smoothed, which limits its acceleration."""
-    times, fronts, speeds = np.array(ego.track).T
-    soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / STEP_S, mode="nearest")
-    moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * STEP_S)])
-    return EgoTrack(ego.route, np.stack([times, fronts[0] - EGO_REAR_AXLE_M + moved, soft]))

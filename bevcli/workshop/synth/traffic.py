@@ -7,12 +7,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
+from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.workshop.synth.catalog import Body
-from bevcli.workshop.synth.city import CityPlan, JunctionPass, Route
-from bevcli.workshop.synth.people import RIDDEN
+from bevcli.workshop.synth.catalog import Assets, Body, draw_body
+from bevcli.workshop.synth.city import DIRECTIONS, STOP_LINE_M, CityPlan, JunctionPass, Route, build_route, right_of
+from bevcli.workshop.synth.road_users import RIDDEN
 
 Light = Literal["red", "yellow", "green"]
 YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all directions
@@ -121,7 +123,10 @@ def _acceleration(
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
-        lead = vehicles[other].speed if other >= 0 and _same_way(vehicle, vehicles[other]) else 0.0
+        lead = 0.0
+        if other >= 0:  # the speed counts if the other vehicle drives in about the same direction, within 60 degrees
+            yaw = vehicles[other].route.yaw_at(vehicles[other].front)
+            lead = vehicles[other].speed if np.cos(route.yaw_at(vehicle.front) - yaw) > 0.5 else 0.0
         wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
@@ -136,11 +141,6 @@ def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed
     """Acceleration (IDM) behind a vehicle at `lead_speed`, `gap` metres ahead: keep a distance of 2 m plus 1.2 s."""
     desired = 2.0 + max(0.0, speed * 1.2 + speed * (speed - lead_speed) / (2 * np.sqrt(strongest * COMFORT)))
     return strongest * (1 - (speed / max(limit, 0.3)) ** 4 - (desired / max(gap, 0.1)) ** 2)
-
-
-def _same_way(vehicle: Vehicle, other: Vehicle) -> bool:
-    """True where the other vehicle drives in about the same direction (within 60 degrees)."""
-    return bool(np.cos(vehicle.route.yaw_at(vehicle.front) - other.route.yaw_at(other.front)) > 0.5)
 
 
 def _may_enter(
@@ -263,3 +263,116 @@ def interpolated_track(track: Array, time_s: float) -> float:
     return float(
         (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
     )
+
+
+EGO_REAR_AXLE_M = 3.75  # from the front of the ego vehicle to its rear axle, the origin of the ego frame
+EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle's speed
+
+
+@dataclass(frozen=True)
+class EgoTrack:
+    """The motion of the ego vehicle's rear axle."""
+
+    route: Route  # its route
+    track: Array  # (3, T) times (seconds), route positions (metres), speeds (m/s)
+
+    @staticmethod
+    def smoothed(ego: Vehicle) -> "EgoTrack":
+        """The track of the ego vehicle with its speed smoothed, which limits its acceleration."""
+        times, fronts, speeds = np.array(ego.track).T
+        soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / STEP_S, mode="nearest")
+        moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * STEP_S)])
+        return EgoTrack(ego.route, np.stack([times, fronts[0] - EGO_REAR_AXLE_M + moved, soft]))
+
+    def pose(self, time_s: float) -> tuple[Array, float]:
+        """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
+        s = interpolated_track(self.track, time_s)
+        return self.route.at(s), float(self.route.yaw_at(s))
+
+    def motion(self, time_s: float) -> tuple[Array, Array, Array]:
+        """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
+        h = 0.05
+        s = [interpolated_track(self.track, time_s + d) for d in (-h, 0.0, h)]
+        speed = (s[2] - s[0]) / (2 * h)
+        rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
+        before, after = np.interp([time_s - h, time_s + h], self.track[0], self.track[2])
+        forward = float(after - before) / (2 * h)
+        return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
+
+
+TRAFFIC_MIX = {
+    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
+}  # fmt: skip
+MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
+SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
+
+
+class VehicleSpawner:
+    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
+
+    def __init__(self, city: CityPlan, assets: Assets, route_m: float) -> None:
+        self.city, self.assets, self.route_m = city, assets, route_m
+        self._rng = city.stream("population")
+        self._count = 0
+
+    def spawn_ego(self, units: tuple[Unit, ...]) -> Vehicle:
+        """The ego vehicle, on the approach to junction (0, 0)."""
+        rng = self.city.stream("ego")
+        direction = int(rng.integers(4))
+        lane = int(rng.integers(self.city.street_at((0, 0), direction).lanes))
+        edge = self.city.street_at((0, 0), direction + 1).half_width + STOP_LINE_M
+        before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
+        route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
+        return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
+
+    def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
+        """Try to place a vehicle on a lane at a random point; None where it does not fit.
+
+        around: world point (2,). near_m, far_m: least and greatest distance from it, metres.
+        taken: (M, 2) world points of other vehicles. bicycle: whether to place a bicycle.
+        """
+        rng = self._rng
+        x, y = self.city.unbend(around)
+        axis = int(rng.integers(2))
+        across, lengthwise = (y, x) if axis == 0 else (x, y)
+        streets = self.city.streets_between(axis, across - far_m, across + far_m)
+        if not streets:
+            return None
+        street = self.city.street(axis, streets[int(rng.integers(len(streets)))])
+        at = lengthwise + rng.uniform(-far_m, far_m)
+        direction = axis + 2 * int(rng.integers(2))
+        following = self.city.below(1 - axis, at) + (direction < 2)
+        node = (following, street.index) if axis == 0 else (street.index, following)
+        before = float((self.city.node_center(node) - street.point(at)) @ DIRECTIONS[direction])
+        lane = int(rng.integers(street.lanes))
+        units = self._units(bicycle)
+        length = units[-1].lag + float(units[-1].body.size_lwh[0])
+        cross = self.city.street_at(node, direction + 1)
+        if before < cross.half_width + STOP_LINE_M + 1:
+            return None
+        point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
+        front = self.city.bend(point)
+        if not near_m <= np.hypot(*(front - around)) <= far_m:
+            return None
+        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # the space needed before and behind
+        gaps = self.city.bend(point + reach)[:, None] - taken
+        if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
+            return None
+        speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
+        route_m, before = self.route_m * speed / 12 + length, before + length + 2
+        route = build_route(self.city, rng, node, direction, lane, before, route_m, speed, bicycle=bicycle)
+        return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
+
+    def _units(self, bicycle: bool) -> tuple[Unit, ...]:
+        rng, draw = self._rng, self.assets.draw
+        class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
+        self._count += 1
+        name = f"moving-{self._count}"
+        if class_name == "train":
+            heavy = rng.random() < 0.7
+            first = draw("truck", rng, ("tractor",) if heavy else ("pickup", "delivery", "box"))
+            second = draw("trailer", rng, SEMITRAILERS if heavy else ("utility",))
+            tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
+            lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
+            return Unit(tractor, 0.0), Unit(towed, lag)
+        return (Unit(draw_body(draw(class_name, rng, MOVING_LOOKS.get(class_name)), rng, name), 0.0),)

@@ -1,12 +1,14 @@
 """Augmentation of a clip's images and calibration; boxes and maps stay as they are.
 
-Of the images as read: photometric distortion, exposure, noise, missing images, corruptions, grid mask. Of the images
-that enter the network, on its device: randomisation, so that a model trained on renderings learns shapes and not
-textures. Each image of each camera then gets its own draw of random convolution (Xu et al. 2021, "Robust and
-generalizable visual representation learning via random convolutions"), contrast, colour, saturation, blur and noise.
+Of the images as read: exposure, noise, missing images, corruptions and, last, photometric distortion. A GPU that trains
+distorts the images that enter the network instead. Of those: grid mask and, on the device that trains, randomisation,
+so that a model trained on renderings learns shapes and not textures. Each image of each camera then gets its own draw
+of random convolution (Xu et al. 2021, "Robust and generalizable visual representation learning via random
+convolutions"), contrast, colour, saturation, blur and noise.
 """
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from statistics import NormalDist
@@ -103,12 +105,24 @@ class AugmentationConfig:
             )
 
 
-def augmented(clip: list[Frame], config: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
-    """Copies of the frames of a clip with all changes but the grid mask, which is for the network's input."""
+ColorChange = tuple[float, float, float, float]  # added brightness, factors of contrast and saturation, change of hue
+
+
+def augmented(
+    clip: list[Frame], config: AugmentationConfig, random: np.random.Generator
+) -> tuple[list[Frame], list[dict[str, ColorChange]]]:
+    """Copies of the frames of a clip with all changes of images as read but the last, and the draws of the last.
+
+    The last is the photometric distortion of each image, by camera: `distorted` applies it, or `distorted_images` on a
+    GPU.
+    """
     vary_images, vary_rig = ImageVariation(config, random), CalibrationVariation(config, random)
-    worsen = BadConditions(config, random)
-    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
-    return [distort_images(frame, config.photometric, random) for frame in frames]
+    worsen, frames, distortions = BadConditions(config, random), [], []
+    for frame in clip:
+        frames.append(vary_rig(worsen(vary_images(frame))))
+        names = frames[-1].images if config.photometric else ()
+        distortions.append({name: draw_color_change(config.photometric, random) for name in names})
+    return frames, distortions
 
 
 class ImageVariation:
@@ -245,30 +259,56 @@ class CalibrationVariation:
         return replace(frame, rig=self._noisy[1])
 
 
-def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:
-    """A copy of the frame with `distort` applied to each image."""
-    if probability == 0:
-        return frame
-    images = {
-        name: replace(image, pixels_bgr=distort(image.pixels_bgr, probability, random))
-        for name, image in frame.images.items()
-    }
-    return replace(frame, images=images)
+UNDISTORTED: ColorChange = (0.0, 1.0, 1.0, 0.0)
 
 
-def distort(pixels_bgr: NDArray[np.uint8], probability: float, random: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 with brightness, contrast, saturation and hue changed, each with the given probability."""
+def draw_color_change(probability: float, random: np.random.Generator) -> ColorChange:
+    """Brightness, contrast, saturation and hue (degrees) of an image, each changed with the given probability."""
     applied = random.random(4) < probability
-    brightness = random.uniform(-MAX_BRIGHTNESS, MAX_BRIGHTNESS) * applied[0]
-    contrast, saturation = random.uniform(*DISTORTION_RANGE), random.uniform(*DISTORTION_RANGE)
-    hue_deg = random.uniform(-MAX_HUE_DEG, MAX_HUE_DEG) * applied[3]
-    pixels = (pixels_bgr.astype(np.float32) + np.float32(brightness)) * np.float32(contrast if applied[1] else 1)
-    if applied[2] or applied[3]:
+    drawn = [random.uniform(-MAX_BRIGHTNESS, MAX_BRIGHTNESS), *random.uniform(*DISTORTION_RANGE, 2)]
+    drawn.append(random.uniform(-MAX_HUE_DEG, MAX_HUE_DEG))
+    brightness, contrast, saturation, hue_deg = np.where(applied, drawn, UNDISTORTED).tolist()
+    return brightness, contrast, saturation, hue_deg
+
+
+def distorted(frame: Frame, distortions: Mapping[str, ColorChange]) -> Frame:
+    """A copy of the frame with the images of some cameras distorted."""
+    changed = {
+        name: replace(frame.images[name], pixels_bgr=distort(frame.images[name].pixels_bgr, distortion))
+        for name, distortion in distortions.items()
+    }
+    return replace(frame, images={**frame.images, **changed}) if changed else frame
+
+
+def distort(pixels_bgr: NDArray[np.uint8], distortion: ColorChange) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 with brightness, contrast, saturation and hue changed."""
+    brightness, contrast, saturation, hue_deg = distortion
+    pixels = (pixels_bgr.astype(np.float32) + np.float32(brightness)) * np.float32(contrast)
+    if (saturation, hue_deg) != UNDISTORTED[2:]:
         hsv = cv2.cvtColor(pixels.clip(0, 255) / np.float32(255), cv2.COLOR_BGR2HSV)
         hsv[..., 0] = (hsv[..., 0] + hue_deg) % 360
-        hsv[..., 1] = (hsv[..., 1] * (saturation if applied[2] else 1)).clip(0, 1)
+        hsv[..., 1] = (hsv[..., 1] * saturation).clip(0, 1)
         pixels = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR) * np.float32(255)
     return pixels.clip(0, 255).astype(np.uint8)
+
+
+def distorted_images(pixels: Tensor, distortions: Tensor, color_order: str) -> Tensor:
+    """As `distort`, but on any device and without rounding: up to one level brighter.
+
+    pixels: (M, 3, H, W) float32, 0 to 255, in that order of the colours. distortions: (M, 4).
+    """
+    brightness, contrast, saturation, hue_deg = distortions[:, :, None, None].split(1, dim=1)  # (M, 1, 1, 1) each
+    pixels = ((pixels + brightness) * contrast).clamp(0, 255)
+    red, green, blue = pixels.unbind(1) if color_order == "rgb" else pixels.flip(1).unbind(1)
+    value, chroma = pixels.amax(1), pixels.amax(1) - pixels.amin(1)  # (M, H, W)
+    third = torch.where(value == green, 2 + (blue - red) / chroma, 4 + (red - green) / chroma)
+    sixths = torch.where(value == red, (green - blue) / chroma, third).where(chroma > 0, 0)[:, None]  # the hue in 60°
+    chroma = (chroma / value.clamp(min=1e-6))[:, None].mul(saturation).clamp(0, 1) * value[:, None]
+    # Each channel is the value less a share of the chroma, which depends on its distance from the hue.
+    starts = torch.arange(5, 0, -2, device=pixels.device).view(3, 1, 1)
+    starts = starts if color_order == "rgb" else starts.flip(0)
+    distance = (starts + sixths + hue_deg / 60) % 6  # (M, 3, H, W)
+    return value[:, None] - chroma * torch.minimum(distance, 4 - distance).clamp(0, 1)
 
 
 def mask_images(images: Tensor, probability: float, random: np.random.Generator) -> None:

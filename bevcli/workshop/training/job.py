@@ -5,6 +5,7 @@ import difflib
 import json
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import torch.distributed
 from torch import Tensor, nn
 
 from bevcli.config import TRAINING, load_config, load_table, settings_of_table
@@ -22,15 +22,14 @@ from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
-from bevcli.workshop.synth.drives import Drives, check_training_seeds, split_of, training_drives, write_split
+from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.files import require_tensorboard
 from bevcli.workshop.training.frame_losses import LossConfigs
 from bevcli.workshop.training.options import Log, TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.validation import check_training_drives
+from bevcli.workshop.training.validation import check_training_drives, require_tensorboard
 from bevcli.workshop.training.warm_start import WarmStart, start_backbone, warm_start
 from bevcli.writing import write_whole
 
@@ -150,6 +149,8 @@ class TrainingConfig(LossConfigs):
             batch norms; 0 trains all of it.
         loaders: processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all
             cores but two.
+        kept_share: share of the free memory (0 to below 1) for decoded images, of all loaders together, so that each
+            loader decodes an image once; 0 keeps none. Batches are the same.
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
         augmentation: image augmentation.
@@ -164,6 +165,7 @@ class TrainingConfig(LossConfigs):
     freeze_batch_norm: bool = False
     frozen_stages: int = 0
     loaders: int = 0
+    kept_share: float = 0.25
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
@@ -175,6 +177,8 @@ class TrainingConfig(LossConfigs):
             raise ValueError("steps, evaluate_every and checkpoint_every must be positive")
         if min(self.held_out, self.loaders, self.frozen_stages) < 0:
             raise ValueError("held_out, loaders and frozen_stages must not be negative")
+        if not 0 <= self.kept_share < 1:
+            raise ValueError("kept_share must be from 0 to below 1")
 
 
 CORES_OF_TRAINING = 2  # that make no batches, with a GPU
@@ -218,7 +222,12 @@ class TrainingJob:
         if self.config.loaders or self.device.type == "cpu":
             return self.config.loaders or 1
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - CORES_OF_TRAINING)
+        return max(1, cores // _trainings_here() - CORES_OF_TRAINING)
+
+    @property
+    def kept_bytes(self) -> int:
+        """Memory for the decoded images that each loader keeps."""
+        return int(self.config.kept_share * free_memory() / (self.loaders * _trainings_here()))
 
     def changed_settings(self) -> tuple[str, ...]:
         """A note where the settings differ from those of the training so far in this folder; stores them."""
@@ -229,6 +238,36 @@ class TrainingJob:
         write_whole(file, json.dumps(settings).encode(), parents=True)
         changed = [f"{name} {new} (before {old[name]})" for name, new in settings.items() if old.get(name, new) != new]
         return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
+
+
+def _trainings_here() -> int:
+    """Processes on this machine that train together."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+
+
+def free_memory(root: Path = Path("/")) -> int:
+    """Bytes that a process may still take, within the limit of a Linux container; 0 where that is not known."""
+    groups = root / "sys/fs/cgroup"
+    try:
+        free = [1024 * _number(root / "proc/meminfo", r"MemAvailable:\s+(\d+)")]
+    except (OSError, ValueError):
+        return 0
+    for limit, used, cache in (
+        ("memory.max", "memory.current", "memory.stat"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"),
+    ):
+        with contextlib.suppress(OSError, ValueError):  # no such limit
+            left = _number(groups / limit) - _number(groups / used)
+            free.append(left + _number(groups / cache, r"\binactive_file (\d+)"))
+    return max(0, min(free))
+
+
+def _number(path: Path, pattern: str = r"^(\d+)$") -> int:
+    """The number in a file of the system. Raises OSError, and ValueError where there is none."""
+    match = re.search(pattern, path.read_text())
+    if match is None:
+        raise ValueError
+    return int(match[1])
 
 
 def prepare_training(
@@ -248,7 +287,6 @@ def prepare_training(
     check_folder(out, resume=options.resume)
     if options.log is not None:
         require_tensorboard()
-    check_training_seeds(data.rendered or ())
     if data.split is not None and options.held_out is not None:
         raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
     rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
@@ -272,9 +310,8 @@ def prepare_training(
     if group.leads and not (options.resume and not out.exists()):
         lock.enter_context(folder_lock(out))
         check_folder(out, resume=options.resume)  # again: another training may have been faster
-    split = split_of(data, config.held_out)
-    if group.leads and split is not None and split.validate:
-        write_split(out / "split.toml", split)
+    if group.leads and own is not None and data.rendered is None:
+        write_split(out / "split.toml", Split(drives.folders, own.folders))
     rest = options.seed, group, notes, options.log, tuple(started), lock
     return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
@@ -312,15 +349,15 @@ def with_changes(config: TrainingConfig, changes: Mapping[str, str]) -> Training
     Raises ConfigError for an unknown key, which names the nearest, or a wrong value.
     """
     table: dict[str, Any] = asdict(config)
-    known = list(_keys(config))
+    keys = list(_keys(config))
     for key, text in changes.items():
         key = key.removeprefix(f"{TRAINING}.")
-        if key not in known:
-            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, known)}')
+        if key not in keys:
+            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, keys)}')
         *tables, name = key.split(".")
         inner = table
-        for each in tables:
-            inner = inner[each]
+        for name_of_table in tables:
+            inner = inner[name_of_table]
         inner[name] = _value(text)
     return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes`")
 
@@ -341,8 +378,10 @@ def _value(text: str) -> Any:
         return text
 
 
-def _nearest(key: str, known: list[str]) -> str:
+def _nearest(key: str, keys: list[str]) -> str:
     """The key with the most similar name or, without its table, with the most similar last part."""
-    last = {name.rpartition(".")[2]: name for name in reversed(known)}
-    found = difflib.get_close_matches(key, known, 1) or [last[name] for name in difflib.get_close_matches(key, last, 1)]
-    return f'did you mean "{found[0]}"?' if found else "the keys are in the table of docs/training.md"
+    last = {name.rpartition(".")[2]: name for name in reversed(keys)}
+    similar = difflib.get_close_matches(key, keys, 1) or [
+        last[name] for name in difflib.get_close_matches(key, last, 1)
+    ]
+    return f'did you mean "{similar[0]}"?' if similar else "the keys are in the table of docs/training.md"

@@ -7,7 +7,7 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence as Items
+from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,7 @@ from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.inference.machine import peak_memory
-from bevcli.inference.training_rigs import rigs_of
+from bevcli.inference.training_rigs import fov_deg, tilt_deg
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
@@ -33,7 +33,7 @@ from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
 from bevcli.workshop.training.options import Preset, TrainOptions
-from bevcli.workshop.training.samples import ground_truth_boxes
+from bevcli.workshop.training.targets import ground_truth_boxes
 from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.training.validation import longest_scene
 from bevcli.writing import write_whole
@@ -118,7 +118,7 @@ def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
         stamps = [frame.stamp for frame in frames]
         gaps_s += [np.diff([stamps[i].timestamp_ns for i in scene]) / 1e9 for scene in scenes_of(stamps)]
         maps = [frame.ground_truth_map for frame in frames if frame.ground_truth_map is not None]
-        map_reaches += [min(abs(end) for end in (*each.x_range_m, *each.y_range_m)) for each in maps]
+        map_reaches += [min(abs(end) for end in (*bev_map.x_range_m, *bev_map.y_range_m)) for bev_map in maps]
     names = np.concatenate([boxes.classes for boxes in labelled])
     if not len(names):
         raise InputError(f"the {len(drives)} drives have no boxes (expected some to train on)")
@@ -158,6 +158,21 @@ PRESETS: Mapping[Preset, tuple[str, Changes]] = {
 }
 
 
+def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
+    """The table [training_rigs] of a model that is trained on some rigs."""
+    rigs = [rig for rig in rigs if rig.cameras]
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    counts = [len(rig.cameras) for rig in rigs]
+    fovs = [fov_deg(camera) for camera in cameras]
+    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
+    return {
+        "cameras": [min(counts), max(counts)],
+        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
+        "height_m": [round(min(heights), 2), round(max(heights), 2)],
+        "tilt_deg": round(max(map(tilt_deg, cameras)), 1),
+    }
+
+
 def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     """The contents of a model's file for a data set.
 
@@ -168,9 +183,9 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     table = copy.deepcopy(read_model_file(model)[0])
     for path, changes in changes_by_table.items():
         _change(table, path, changes)
-    known = [each for each in NUSCENES_CLASSES if each in facts.class_counts]
-    own = [each for each in facts.class_counts if each not in NUSCENES_CLASSES]  # the most frequent first
-    table |= {"name": name, "classes": known + own, "cameras": list(facts.cameras)}
+    official = [label for label in NUSCENES_CLASSES if label in facts.class_counts]
+    own = [label for label in facts.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": official + own, "cameras": list(facts.cameras)}
     if own:
         table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
@@ -360,7 +375,8 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
         if times[-1] - times[0] >= longest_s:
             raise _EnoughMeasured
 
-    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
+    # Images are not kept: they would count as memory of the training, and be read sooner than in a longer one.
+    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6, kept_share=0.0)
     config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
     machine = f"{job.device.type}, {torch.get_num_threads()} threads"
     if job.device.type == "cuda":

@@ -1,12 +1,30 @@
-"""Training samples: clips drawn from drives, and their frames as network inputs and targets.
+"""Training samples: clips drawn from drives, their frames as network inputs and targets, and batches made ahead.
 
-As in the paper, the last frame of a clip is trained on; the others are its history.
+As in the paper, the last frame of a clip is trained on; the others are its history. Batches are made by a thread, or by
+processes that share no lock with the training. Each process makes one clip at a time, so that all of them work for the
+first batch. A clip from a process comes through a file in memory or, where that is small, in the folder for temporary
+files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence as Items
+import mmap
+import os
+import pickle
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence as Items
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from io import BytesIO
+from itertools import zip_longest
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -15,24 +33,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Sequence
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import inverse
+from bevcli.inference.pipeline import read_ahead
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
-from bevcli.model.temporal_model import model_class
 from bevcli.model.upload import pinned, upload
 from bevcli.printing import counted
-from bevcli.registry import for_model
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
-from bevcli.workshop.training.augmentation import AugmentationConfig, augmented, mask_images
-from bevcli.workshop.training.detection_loss import PaddedTargets, box_targets, detection_targets, padded
-from bevcli.workshop.training.segmentation_loss import PaddedMasks, padded_masks, segmentation_targets
+from bevcli.workshop.training.augmentation import (
+    UNDISTORTED,
+    AugmentationConfig,
+    ColorChange,
+    augmented,
+    distorted,
+    distorted_images,
+    mask_images,
+)
+from bevcli.workshop.training.targets import Targets, frame_targets, joined_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
+
+MEMORY_FOLDER = Path("/dev/shm")  # files in memory, on Linux
+FREE_CLIPS = 64  # for so many, that folder has to have space
+ALIGNMENT = 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -141,61 +167,6 @@ def draw_frames(
 
 
 @dataclass(frozen=True)
-class OwnHeads:
-    """The training of a model's heads beyond boxes and maps, registered as "training_heads CLASS".
-
-    Attributes:
-        missing: the truth that a frame lacks, in words, and its file; None where nothing is missing.
-        truth: of a frame of a drive, at an index, on the CPU. Raises InputError where some of it is missing.
-        losses: the weighted scalar losses by name. They take the outputs for B frames, B truths, and of each frame the
-            queries that the detection loss matches to boxes, with the indices of these.
-    """
-
-    missing: Callable[[Frame, Any], tuple[str, str] | None]
-    truth: Callable[[Frame, Sequence, int, Any], Any]
-    losses: Callable[[Any, Items[Any], Items[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
-
-
-def own_heads(config: ModelConfig) -> OwnHeads | None:
-    """The registered training of a model's own heads, if it has some."""
-    return next(iter(for_model("training_heads", model_class(config))), None)
-
-
-@dataclass(frozen=True)
-class Targets:
-    """The targets of B frames, one of each clip.
-
-    Attributes:
-        detection: B, the boxes inside the BEV grid.
-        perspective: B, all boxes, for the perspective loss.
-        segmentation: B, or None if the model has no segmentation head.
-        truths: B, see `OwnHeads`; empty for a model without heads of its own.
-    """
-
-    detection: PaddedTargets
-    perspective: PaddedTargets
-    segmentation: PaddedMasks | None
-    truths: tuple[Any, ...] = ()
-
-    def to(self, device: torch.device) -> Targets:
-        """A copy on a device."""
-        return self._changed(lambda tensor: upload(tensor, device))
-
-    def pinned(self) -> Targets:
-        """A copy in memory that a GPU reads by itself."""
-        return self._changed(pinned)
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
-
-        def changed(part: Any) -> Any:
-            tensors = {name: x for name, x in vars(part).items() if isinstance(x, Tensor)}
-            return replace(part, **{name: change(x) for name, x in tensors.items()})
-
-        masks = None if self.segmentation is None else changed(self.segmentation)
-        return Targets(changed(self.detection), changed(self.perspective), masks, self.truths)
-
-
-@dataclass(frozen=True)
 class Batch:
     """B clips of the same length.
 
@@ -204,31 +175,38 @@ class Batch:
         world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
         plain: the same clips before augmentation, for a teacher; None without one.
+        distortions: (B, N, 4) float32 of each input: photometric ones of images in bytes; () where they are distorted.
     """
 
     inputs: tuple[ModelInputs, ...]
     world_from_bev: Tensor
     targets: tuple[Targets, ...]
     plain: Batch | None = None
+    distortions: tuple[Tensor, ...] = ()
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
-        inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
+        inputs = tuple(inputs.to(device) for inputs in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
-        return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
+        targets = tuple(targets.to(device) for targets in self.targets)
+        return Batch(inputs, self.world_from_bev, targets, plain, tuple(upload(x, device) for x in self.distortions))
 
     def pinned(self) -> Batch:
         """A copy whose images and targets are in memory that a GPU reads by itself."""
-        return replace(self._with_images(pinned), targets=tuple(targets.pinned() for targets in self.targets))
+        inputs = tuple(replace(step, images=pinned(step.images)) for step in self.inputs)
+        plain = None if self.plain is None else self.plain.pinned()
+        return replace(self, inputs=inputs, targets=tuple(targets.pinned() for targets in self.targets), plain=plain)
 
     def normalised(self, image: ImageConfig) -> Batch:
-        """The batch with its images normalised, where they are in bytes."""
-        in_bytes = self.inputs[0].images.dtype == torch.uint8
-        return self._with_images(lambda images: images_from_bytes(images, image)) if in_bytes else self
-
-    def _with_images(self, changed: Callable[[Tensor], Tensor]) -> Batch:
-        inputs = tuple(replace(one, images=changed(one.images)) for one in self.inputs)
-        return replace(self, inputs=inputs, plain=None if self.plain is None else self.plain._with_images(changed))
+        """The batch with its images distorted and normalised, where they are in bytes."""
+        if self.inputs[0].images.dtype != torch.uint8:
+            return self
+        inputs = tuple(
+            replace(step, images=images_from_bytes(step.images, image, distortions))
+            for step, distortions in zip_longest(self.inputs, self.distortions)
+        )
+        plain = None if self.plain is None else self.plain.normalised(image)
+        return replace(self, inputs=inputs, plain=plain, distortions=())
 
 
 def load_batch(
@@ -255,17 +233,18 @@ def load_batch(
     def load_clip(clip: Clip) -> Batch:
         drive = drives.open(clip.drive)
         loaded = [drive.load(index) for index in clip.frames]
-        shown = augmented(loaded, augmentation, random)
-        prepared = _prepared(shown, config, in_bytes)
+        shown, drawn = augmented(loaded, augmentation, random)
+        prepared = _prepared(shown if in_bytes else [*map(distorted, shown, drawn)], config, in_bytes)
         inputs = _inputs(prepared, config)
         for step in inputs:
             mask_images(step.images, augmentation.grid_mask, random)
-        poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev] for one in prepared]
+        poses = [[x.frame.world_from_ego.matrix @ x.frame.rig.ego_from_bev] for x in prepared]
         world_from_bev = torch.from_numpy(np.array(poses))
         learned = list(zip(prepared, clip.frames, strict=True))[0 if learn_all else -1 :]
-        targets = tuple(_targets(one.frame, drive, index, config) for one, index in learned)
+        targets = tuple(frame_targets(x.frame, drive, index, config) for x, index in learned)
         before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
-        return Batch(inputs, world_from_bev, targets, before)
+        distortions = tuple(map(_distortions, prepared, drawn)) if in_bytes and augmentation.photometric else ()
+        return Batch(inputs, world_from_bev, targets, before, distortions)
 
     return joined([load_clip(clip) for clip in clips])
 
@@ -275,42 +254,11 @@ def joined(batches: Items[Batch]) -> Batch:
     if len(batches) == 1:
         return batches[0]
     inputs = tuple(joined_inputs(steps) for steps in zip(*(batch.inputs for batch in batches), strict=True))
-    targets = tuple(_joined_targets(steps) for steps in zip(*(batch.targets for batch in batches), strict=True))
+    targets = tuple(joined_targets(steps) for steps in zip(*(batch.targets for batch in batches), strict=True))
     plain = [batch.plain for batch in batches if batch.plain is not None]
     world_from_bev = torch.cat([batch.world_from_bev for batch in batches], dim=1)
-    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None)
-
-
-def _joined_targets(parts: Items[Targets]) -> Targets:
-    masks = [one.segmentation[frame] for one in parts if one.segmentation for frame in range(len(one.segmentation))]
-    return Targets(
-        padded([one.detection[frame] for one in parts for frame in range(len(one.detection))]),
-        padded([one.perspective[frame] for one in parts for frame in range(len(one.perspective))]),
-        padded_masks(masks) if masks else None,
-        tuple(truth for one in parts for truth in one.truths),
-    )
-
-
-def ground_truth_boxes(frame: Frame) -> Boxes3D:
-    """The ground truth boxes in the bev frame. Raises InputError if the frame has none."""
-    if frame.ground_truth is None:
-        raise InputError(
-            f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no ground truth boxes: "
-            "training needs ground_truth.json (bevcli convert writes it)"
-        )
-    return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
-
-
-def _targets(frame: Frame, drive: Sequence, index: int, config: ModelConfig) -> Targets:
-    """index: of the frame in the drive."""
-    boxes = ground_truth_boxes(frame)
-    detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
-    heads = own_heads(config)
-    truths = () if heads is None else (heads.truth(frame, drive, index, config),)
-    if "segmentation" not in config.heads:
-        return Targets(detection, perspective, None, truths)
-    masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
-    return Targets(detection, perspective, padded_masks([masks]), truths)
+    distortions = tuple(map(torch.cat, zip(*(batch.distortions for batch in batches), strict=True)))
+    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None, distortions)
 
 
 def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
@@ -318,9 +266,14 @@ def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[Pr
     return [*map(Preprocessor(config, threads=1, **written), clip)]
 
 
+def _distortions(prepared: PreparedFrame, drawn: Mapping[str, ColorChange]) -> Tensor:
+    """(1, N, 4) those of the images of a frame."""
+    return torch.tensor([[drawn.get(name, UNDISTORTED) for name in prepared.assignment.cameras]])
+
+
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:
-    poses = [None, *(one.frame.world_from_ego for one in frames[:-1])]
-    return tuple(model_inputs([one], [pose], config) for one, pose in zip(frames, poses, strict=True))
+    poses = [None, *(prepared.frame.world_from_ego for prepared in frames[:-1])]
+    return tuple(model_inputs(prepared, pose, config) for prepared, pose in zip(frames, poses, strict=True))
 
 
 def _grey(image: ImageConfig) -> NDArray[np.uint8]:
@@ -350,12 +303,190 @@ def write_bytes(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[
     np.subtract(pixels.reshape(rows, -1), np.tile(_grey(image), columns), out=lines)
 
 
-def images_from_bytes(images: Tensor, image: ImageConfig) -> Tensor:
-    """The normalised images of `write_bytes` (B, N, 3, H, W), on the same device, channels last."""
+def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | None = None) -> Tensor:
+    """The normalised images of `write_bytes` (B, N, 3, H, W), on the same device, channels last.
+
+    distortions: (B, N, 4), photometric. What is 0 in all channels (padding, missing images, masks) stays 0.
+    """
     flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
-    grey, mean, std = (
-        torch.tensor(of_channels, dtype=torch.float32).view(3, 1, 1).to(flat.device, non_blocking=True)
-        for of_channels in (_grey(image).tolist(), image.mean, image.std)
-    )
+    of_channels = torch.tensor([_grey(image).tolist(), image.mean, image.std], dtype=torch.float32)
+    grey, mean, std = upload(of_channels, flat.device)[..., None, None].unbind(0)  # (3, 1, 1) each
     pixels = (flat + grey.to(torch.uint8)).float()
+    if distortions is not None:
+        changed = distorted_images(pixels, distortions.flatten(0, 1), image.color_order)
+        pixels = changed.where(flat.ne(0).any(dim=1, keepdim=True), pixels)
     return pixels.sub_(mean).div_(std).unflatten(0, images.shape[:2])
+
+
+@dataclass(frozen=True)
+class BatchMaker:
+    """Makes any batch of a training; it can be pickled.
+
+    Attributes:
+        drives: to draw clips from.
+        model: the configuration of the model.
+        clips: how clips are drawn.
+        augmentation: of their images.
+        seed: of the training.
+        rank: of this process among those that train together.
+        with_gap: leave out a frame of the clips, see `draw_clips`.
+        plain: give the clips before augmentation too.
+        in_bytes: give images as bytes, see `write_bytes`.
+    """
+
+    drives: Drives
+    model: ModelConfig
+    clips: ClipConfig
+    augmentation: AugmentationConfig
+    seed: int
+    rank: int
+    with_gap: bool
+    plain: bool
+    in_bytes: bool
+
+    def __call__(self, step: int, turn: int) -> Batch:
+        """The batch of a step (0 to `clips.in_turn` - 1 are its turns). It depends on no other batch."""
+        return joined([self.clip(step, turn, index) for index in range(self.clips.batch)])
+
+    def clip(self, step: int, turn: int, index: int) -> Batch:
+        """The clip at an index (0 to `clips.batch` - 1) of that batch. It depends on no other clip."""
+        seed = [self.seed, step, self.rank, turn]
+        clip, random = draw_clip(self.drives, self.clips, seed, index, with_gap=self.with_gap)
+        return load_batch(
+            self.drives, [clip], self.model, self.augmentation, random,
+            learn_all=self.clips.learn == "all", plain=self.plain, in_bytes=self.in_bytes,
+        )  # fmt: skip
+
+
+def loaded_batches(
+    maker: BatchMaker, turns: Iterable[tuple[int, int]], loaders: int, *, pin: bool = False
+) -> Generator[Batch]:
+    """The batches of these turns (step, turn), in order, made ahead by `loaders`: one thread, or several processes.
+
+    pin: copy them to memory that a GPU reads by itself. Close the generator to end the processes.
+    Raises what making a batch raises, and OutputError where a process ends early.
+    """
+    count = maker.clips.batch
+    depth = max(maker.clips.in_turn, -(-2 * loaders // count))  # two clips a process are waiting
+    if loaders == 1:
+        yield from read_ahead(lambda turn: maker(*turn), turns, depth)
+        return
+    context = get_context("spawn")
+    line_end, line = context.Pipe(duplex=False)
+    parents = [str(MEMORY_FOLDER)] * os.access(MEMORY_FOLDER, os.W_OK) + [tempfile.gettempdir()]
+    folders = tuple(Path(tempfile.mkdtemp(prefix="bevcli-batches-", dir=parent)) for parent in parents)
+    pool = ProcessPoolExecutor(loaders, context, _start_loader, (maker, line_end, folders))
+
+    def load(turn: tuple[int, int]) -> Batch:
+        try:
+            packed = [pool.submit(_make_packed, (*turn, index)) for index in range(count)]
+            clips = [clip.result().unpack() for clip in packed]
+        except BrokenProcessPool:
+            raise OutputError(
+                "a process that makes batches ended early (out of memory?): use fewer `loaders`"
+            ) from None
+        batch = joined(clips)
+        return batch.pinned() if pin else batch
+
+    try:
+        with blocked_interrupts():
+            for _ in range(loaders):  # starts a process each
+                pool.submit(int)
+        with closing(read_ahead(load, turns, depth, threads=depth)) as batches:  # threads that only wait
+            yield from batches
+    finally:
+        line.close()  # the processes end at once
+        pool.shutdown(cancel_futures=True)
+        _remove(folders)
+
+
+_loader: tuple[BatchMaker, tuple[Path, ...]]  # of a process that makes clips
+
+
+def _remove(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start_loader(maker: BatchMaker, line: Connection, folders: tuple[Path, ...]) -> None:
+    """Prepare a process, which ends as soon as the other end of the line is closed, or the process that holds it."""
+    global _loader
+    _loader = maker, folders
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the other end of the line is closed in any case
+
+    def end_with_parent() -> None:
+        line.poll(None)
+        _remove(folders)
+        os._exit(0)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A clip in a file.
+
+    Attributes:
+        path: of the file, which holds the contents of all arrays.
+        ends: where each begins and ends in the file.
+        rest: the clip without them, pickled.
+    """
+
+    path: Path
+    ends: tuple[tuple[int, int], ...]
+    rest: bytes
+
+    def unpack(self) -> Batch:
+        """The clip; its tensors are views of the file, which loses its name."""
+        with open(self.path, "r+b") as file:
+            contents = memoryview(mmap.mmap(file.fileno(), 0))
+        self.path.unlink()
+        batch: Batch = pickle.loads(self.rest, buffers=[contents[start:end] for start, end in self.ends])
+        return batch
+
+
+def _make_packed(clip: tuple[int, int, int]) -> _Packed:
+    """clip: step, turn, and index in the batch."""
+    maker, folders = _loader
+    arrays: list[pickle.PickleBuffer] = []
+    rest = BytesIO()
+    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker.clip(*clip))
+    needed = FREE_CLIPS * sum(array.raw().nbytes for array in arrays)
+    roomy = (folder for folder in folders if shutil.disk_usage(folder).free >= needed)
+    path, ends = next(roomy, folders[-1]) / "-".join(map(str, clip)), []
+    with open(path, "wb") as file:
+        for array in arrays:
+            start = file.tell()
+            file.write(array.raw())
+            ends.append((start, file.tell()))
+            file.write(bytes(-file.tell() % ALIGNMENT))
+        file.write(bytes(ALIGNMENT))  # an empty file cannot be mapped
+    return _Packed(path, tuple(ends), rest.getvalue())
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles a tensor as an array, whose contents can be kept apart."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            strides = value.stride()
+            order = sorted(range(value.ndim), key=lambda axis: -strides[axis])  # as it lies in memory
+            return _from_array, (value.permute(order).contiguous().numpy(), order)
+        return NotImplemented
+
+
+def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
+    return torch.from_numpy(array).permute(np.argsort(order).tolist())
+
+
+@contextmanager
+def blocked_interrupts() -> Iterator[None]:
+    """Processes that start in the block never see Ctrl-C: it reaches their parent, which ends them."""
+    resource_tracker.ensure_running()  # it would be started with the first process, and unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

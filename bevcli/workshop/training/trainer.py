@@ -10,99 +10,35 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, product, repeat
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from bevcli.errors import BevcliError
-from bevcli.inference.cpu_settings import trim_memory
+from bevcli.errors import BevcliError, WeightsError
+from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
-from bevcli.model.backbone import Backbone
-from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
-from bevcli.model.kernels.onednn import use_onednn
+from bevcli.inference.training_rigs import weights_facts
+from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
-from bevcli.model.step import ModelOutputs
-from bevcli.workshop.training import files
+from bevcli.parsing.pth import read_pth
+from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
 from bevcli.workshop.training.augmentation import randomised
-from bevcli.workshop.training.clip_steps import clip_steps
-from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
+from bevcli.workshop.training.clip_steps import FrozenStages, Lesson, Teacher, forward_clip
+from bevcli.workshop.training.frame_losses import FrameLosses
 from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
-from bevcli.workshop.training.loading import BatchMaker, loaded_batches
-from bevcli.workshop.training.samples import Batch
-from bevcli.workshop.training.validation import Validation, validate
+from bevcli.workshop.training.samples import Batch, BatchMaker, loaded_batches
+from bevcli.workshop.training.validation import LearningCurve, Validation, draw_learning_curves, event_writer, validate
+from bevcli.writing import whole_file, write_whole
 
 T = TypeVar("T")
 
-
-class FrozenStages:
-    """A copy of the stem and the first stages of a backbone, computed as in inference: faster, the same results.
-
-    Batch norms are folded into their convolutions and, on a CPU, oneDNN runs the residual blocks, one image at a time,
-    whose feature maps fit into the caches.
-    """
-
-    def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
-        """stages: how many, from the first. dtype: of the computation and its results."""
-        self._device = backbone.conv1.weight.device
-        self._dtype = dtype
-        part = copy.deepcopy(backbone)
-        part.stages = nn.ModuleList(part.stages[:stages])
-        part.output_stages = tuple(range(1, len(part.stages) + 1))
-        part.eval().requires_grad_(False)
-        fold_batch_norms(part, self._device)
-        part.to(dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        if self._device.type == "cpu":
-            use_onednn(part)
-        self._part = part
-
-    @contextlib.contextmanager
-    def used_by(self, backbone: Backbone) -> Iterator[None]:
-        """Inside, the backbone takes the maps of its first stages from here."""
-        backbone.frozen_maps = self._maps
-        try:
-            yield
-        finally:
-            backbone.frozen_maps = None
-
-    @torch.no_grad()
-    def _maps(self, images: Tensor) -> list[Tensor]:
-        """images: (B, 3, H, W) -> the map of each stage, without gradient."""
-        with torch.autocast(self._device.type, enabled=False):
-            images = images.to(self._dtype).contiguous(memory_format=torch.channels_last)
-            if self._device.type != "cpu":
-                return list(self._part(images))
-            each = [self._part(image) for image in images.split(1)]
-            return [torch.cat(maps) for maps in zip(*each, strict=True)]
-
-
-def forward_clip(
-    model: Network, batch: Batch, *, learn_all: bool = False, freeze_batch_norm: bool = False
-) -> Iterator[ModelOutputs]:
-    """The outputs, in training mode, for the last frame of a batch of clips.
-
-    The frames before it only build its history, in evaluation mode and without gradient, as in the papers. Of a model
-    with a window of frames, this applies to the image features of the earlier frames.
-
-    Args:
-        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
-        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
-    """
-    frames = len(batch.inputs)
-    first_learned = 0 if learn_all else frames - 1
-    steps, memory = clip_steps(model), None
-    model.eval()
-    with torch.no_grad():
-        for frame in range(first_learned):
-            memory = steps.history(batch, frame, memory)
-    model.train()
-    for module in model.modules():
-        if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
-            module.eval()
-    for frame in range(first_learned, frames):
-        outputs, memory = steps.outputs(batch, frame, memory)
-        yield outputs
+FORMAT = "bevcli-training/1"
+# What PyTorch raises for contents that belong to another model.
+_DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
 def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
@@ -186,12 +122,13 @@ class Trainer:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
         self.done, self.waited_s = 0, 0.0
         if resume:
-            self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
+            self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self.maker = BatchMaker(
-            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            KeptDrives(job.drives, FrameMemory(job.kept_bytes)),
+            job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
             with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
             in_bytes=job.device.type == "cuda",
         )  # fmt: skip
@@ -200,9 +137,9 @@ class Trainer:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
-            events = files.event_writer(job.out / "tensorboard", self.done) if job.log else None
-            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done, "training", events)
-            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done, "validation", events)
+            events = event_writer(job.out / "tensorboard", self.done) if job.log else None
+            self._loss_curve = LearningCurve(job.out / "loss.csv", self.done, "training", events)
+            self._validation_curve = LearningCurve(job.out / "validation.csv", self.done, "validation", events)
 
     def run(
         self,
@@ -241,7 +178,7 @@ class Trainer:
 
     def _save_checkpoint(self) -> None:
         path = self.job.out / CHECKPOINT
-        files.save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
+        save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
 
     def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
         """The same batches, with the time spent waiting for them added to `waited_s`."""
@@ -285,7 +222,7 @@ class Trainer:
         job, config = self.job, self.job.config
         random = config.augmentation.randomisation, job.model.config.image, torch.default_generator
         batch = replace(
-            batch, inputs=tuple(replace(one, images=randomised(one.images, *random)) for one in batch.inputs)
+            batch, inputs=tuple(replace(step, images=randomised(step.images, *random)) for step in batch.inputs)
         )
         outputs = forward_clip(
             job.model, batch, learn_all=config.clips.learn == "all", freeze_batch_norm=config.freeze_batch_norm
@@ -330,8 +267,8 @@ class Trainer:
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
-        files.save_weights(job.out / "weights.safetensors", model, dtype)
-        files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
+        save_weights(job.out / "weights.safetensors", model, dtype)
+        draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 
 
@@ -360,3 +297,73 @@ def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
 def computes_in_bfloat16(device: torch.device) -> bool:
     """True where the device has bfloat16 instructions, so that mixed precision is faster."""
     return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
+
+
+def save_checkpoint(
+    path: Path,
+    step: int,
+    trained: nn.Module,
+    optimizer: torch.optim.AdamW,
+    average: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Writes the state after `step` steps, to resume from. Random numbers are drawn from seed and step, not stored.
+
+    trained: the model and its auxiliary heads. average: the running average of the model's weights, None without one.
+    """
+    contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
+    if average is not None:
+        contents["average"] = dict(average)
+    with whole_file(path) as unfinished:
+        torch.save(contents, unfinished)
+
+
+def load_checkpoint(
+    path: Path, trained: nn.Module, optimizer: torch.optim.AdamW, average: dict[str, Tensor] | None = None
+) -> int:
+    """Restores model, auxiliary heads, optimizer and, in place, the running average of the weights.
+
+    Returns the number of steps done. Raises WeightsError.
+    """
+    if not path.exists():
+        raise WeightsError(f"{path}: no checkpoint to resume from; leave out `resume` to start a training")
+    file = read_pth(path)
+    if file.left_out:
+        raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")
+    try:
+        contents = file.with_tensors()
+        if contents["format"] != FORMAT:
+            raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r:.60}')
+        trained.load_state_dict(contents["model"])
+        settings = [dict(group) for group in optimizer.param_groups]
+        optimizer.load_state_dict(contents["optimizer"])
+        for group, own in zip(optimizer.param_groups, settings, strict=True):
+            group.update(own)  # of this training, not of the file
+        for key, value in {} if average is None else average.items():
+            value.copy_(contents["average"][key])
+        _check_numbers(optimizer, [*trained.state_dict().values(), *(average or {}).values()])
+        if type(contents["step"]) is not int or contents["step"] < 0:
+            raise ValueError(f"its step is {contents['step']!r:.40} (expected an integer, 0 or more)")
+        return contents["step"]
+    except _DAMAGE as error:
+        reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
+        raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
+
+
+def _check_numbers(optimizer: torch.optim.AdamW, tensors: list[Tensor]) -> None:
+    """Raises ValueError for what PyTorch takes: moments of a wrong shape or sign, NaN in them or in `tensors`."""
+    for parameter, own in optimizer.state.items():
+        first, second, step = (own[name] for name in ("exp_avg", "exp_avg_sq", "step"))
+        if not first.shape == second.shape == parameter.shape or step.shape or min(step, second.min()) < 0:
+            raise ValueError("the optimizer's moments do not fit the weights")
+        tensors = [*tensors, first, second, step]
+    if not all(torch.isfinite(tensor).all() for tensor in tensors):
+        raise ValueError("some of its numbers are NaN or infinite")
+
+
+def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
+    """Writes the model's weights as .safetensors, for `bevcli run --weights`, with the frame and rigs they expect."""
+    state = {
+        key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
+        for key, tensor in model.state_dict().items()
+    }
+    write_whole(path, safetensors.torch.save(state, weights_facts(model.config)))

@@ -1,18 +1,23 @@
-"""Checks of drives before they are trained on or scored, and scores of a model over several drives.
+"""Checks of drives before they are trained on or scored, scores of a model over several drives, and learning curves.
 
 Each drive is run as by `bevcli run`, and all are scored as by `bevcli eval`.
 """
 
+import contextlib
+import csv
+import importlib.util
+import io
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from bevcli.errors import InputError
+from bevcli.errors import BevcliError, InputError
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite, score_results
 from bevcli.evaluation.inputs import Compared, FramePairs
@@ -23,12 +28,15 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
+from bevcli.parsing.files import MIB, read_text
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes, count_classes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.samples import ClipConfig, own_heads
+from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.targets import own_heads
+from bevcli.writing import output_errors, whole_file
 
 
 def check_training_drives(
@@ -97,9 +105,9 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
 def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
     first, heads = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0, own_heads(config)
     for drive in map(drives.open, range(len(drives))):
-        places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
+        indices = [index for scene in scenes_of(drive.stamps) for index in scene[first:]]
         without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): []}
-        for frame in map(drive.ground_truth_frame, places):
+        for frame in map(drive.ground_truth_frame, indices):
             if frame.ground_truth is None:
                 without["boxes", BOXES_FILE].append(frame.stamp.index)
             lacking = None if heads is None else heads.missing(frame, config)
@@ -108,7 +116,7 @@ def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) 
         for (truth, file), missing in without.items():
             if missing:
                 raise InputError(
-                    f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
+                    f"{drive.name}: {len(missing)} of {len(indices)} frames to train on have no ground truth {truth}, "
                     f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
                 )
 
@@ -215,15 +223,15 @@ def validate(
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
-        places, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
-        for frame, prediction, _ in runner.run(sequence, places, preprocessor):
+        indices, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
+        for frame, prediction, _ in runner.run(sequence, indices, preprocessor):
             if frame.ground_truth is not None:
                 if tracked:
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
                     sides = (prediction.boxes_world, frame.ground_truth)
-                    found, true = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
-                    tracks.append((found, true))
+                    predicted_frame, true_frame = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
+                    tracks.append((predicted_frame, true_frame))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -246,8 +254,8 @@ def drives_table(drives: Items[DriveScores]) -> str:
     """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
     width = max(len("drive"), *(len(drive.name) for drive in drives))
     lines = [f"{'drive':{width}}  cameras    mAP    NDS"]
-    lines += [f"{one.name:{width}}  {one.cameras:7}  {one.mean_ap:.3f}  {one.nd_score:.3f}" for one in drives]
-    scored = [one.mean_ap for one in drives if not math.isnan(one.mean_ap)]
+    lines += [f"{drive.name:{width}}  {drive.cameras:7}  {drive.mean_ap:.3f}  {drive.nd_score:.3f}" for drive in drives]
+    scored = [drive.mean_ap for drive in drives if not math.isnan(drive.mean_ap)]
     if scored:
         lines.append(f"mAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}")
     return "\n".join(lines)
@@ -264,6 +272,119 @@ def boxes_ego(
 
 def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
     """Predicted and true boxes in the world frame, for the scores of tracks."""
-    found, true = zip(*frames, strict=True) if frames else ((), ())
+    predicted, true = zip(*frames, strict=True) if frames else ((), ())
     poses = [frame.world_from_ego.matrix for frame in true]
-    return FramePairs("world", found, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())
+    return FramePairs("world", predicted, true, np.array(poses).reshape(-1, 4, 4), True, "frame", ())
+
+
+LARGEST_CSV_BYTES = 256 * MIB
+Row = Mapping[str, float]
+
+
+class LearningCurve:
+    """A CSV file with a column `step` and one row a step, and TensorBoard's curves of the same numbers.
+
+    Attributes:
+        path: the file.
+        rows: its rows.
+    """
+
+    def __init__(self, path: Path, done: int = 0, group: str = "", events: Any = None) -> None:
+        """Opens the file of a resumed training, or starts a new one.
+
+        done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
+        group: of the curves in TensorBoard, before their names. events: of `event_writer`; None for no such curves.
+        Raises OutputError, and InputError for a damaged file.
+        """
+        self.path, self._group, self._events = path, group, events
+        self.rows: list[Row] = [row for row in _read_rows(path) if row["step"] <= done] if done else []
+        with whole_file(path) as unfinished:
+            _write_rows(unfinished, self.rows, "w")
+
+    def add(self, step: int, numbers: Row) -> None:
+        """Appends a row and writes it to the files at once, finite numbers only for TensorBoard."""
+        row = {"step": step, **numbers}
+        _write_rows(self.path, [row], "a", header=not self.rows)
+        self.rows.append(row)
+        if self._events is not None:
+            for name, value in numbers.items():
+                if math.isfinite(value):
+                    self._events.add_scalar(f"{self._group}/{name}", value, step)
+            self._events.flush()
+
+
+def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
+    """Writes a PNG: smoothed losses on the left, scores on the right."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
+    _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
+    left.set(title="Training loss", xlabel="step", yscale="log")
+    right.set(title="Validation", xlabel="step", ylim=(0, 1))
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)
+
+
+def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
+    for name in rows[0] if rows else ():
+        values = [row[name] for row in rows]
+        if name not in skipped and not all(map(math.isnan, values)):
+            axes.plot([row["step"] for row in rows], values, label=name, marker=marker)
+    if rows:
+        axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def _scores(row: Row) -> Row:
+    return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
+
+
+def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
+    """Means over blocks of equal length, at least `points` blocks if there are so many rows."""
+    size = max(1, len(rows) // points)
+    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
+    return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
+
+
+def _read_rows(path: Path) -> list[Row]:
+    """The rows of a file, without damaged ones. Raises InputError."""
+    if not path.is_file():
+        return []
+    text = read_text(path, LARGEST_CSV_BYTES)
+    rows: list[Row] = []
+    try:
+        for row in csv.DictReader(io.StringIO(text)):
+            with contextlib.suppress(ValueError, TypeError):  # half a row, from a full disk
+                rows.append({name: float(value) for name, value in row.items()})
+    except csv.Error as error:
+        raise InputError(f"{path}: {error}: move it away, or start a new training") from None
+    if rows and "step" not in rows[0]:
+        raise InputError(f"{path}: has no column step: move it away, or start a new training")
+    return rows
+
+
+def _write_rows(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
+    with output_errors(path), path.open(mode, newline="") as file:
+        if rows:
+            writer = csv.DictWriter(file, list(rows[0]))
+            if header:
+                writer.writeheader()
+            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
+
+
+def require_tensorboard() -> None:
+    """Raise BevcliError where the package tensorboard is not installed."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
+
+
+def event_writer(folder: Path, done: int) -> Any:
+    """A writer of event files: `tensorboard --logdir FOLDER` draws them, also while the training runs.
+
+    done: steps done. TensorBoard hides later ones, of an interrupted training.
+    """
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=done + 1 if done else None)

@@ -16,10 +16,10 @@ from bevcli.checkpoints import INTEGER_KEY, Checkpoint, read_checkpoint
 from bevcli.config import load_config
 from bevcli.errors import InputError, WeightsError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.model.camera_assignment import assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import CAMERA_EMBEDDING, Network
+from bevcli.model.step import assign_cameras
 
 LEAST_SHARE = 0.5  # of the model's numbers, that a file must hold
 State = Literal["loaded", "new", "unused"]
@@ -51,7 +51,7 @@ class WarmStart:
 
     def numbers(self, state: State) -> int:
         """How many numbers are in a state."""
-        return sum(count for (each, *_), (count, _) in self.rows.items() if each == state)
+        return sum(count for (counted, *_), (count, _) in self.rows.items() if counted == state)
 
     @property
     def share(self) -> float:
@@ -89,23 +89,23 @@ class NamedRows:
     starts: Starts
     remark: str = ""
 
-    def fit(self, found: Tensor, own: Tensor) -> bool:
+    def fit(self, rows: Tensor, own: Tensor) -> bool:
         """The file names the rows of its tensor, and they have the size of the model's."""
-        return len(found) == len(self.source) and found.shape[1:] == own.shape[1:]
+        return len(rows) == len(self.source) and rows.shape[1:] == own.shape[1:]
 
-    def filled(self, found: Tensor, own: Tensor) -> Tensor:
+    def filled(self, rows: Tensor, own: Tensor) -> Tensor:
         """The model's tensor, with the rows that the file has for its names."""
         filled = own.clone()
         for index, origins in enumerate(self.starts.values()):
             if origins:
-                filled[index] = found[[self.source.index(each) for each in origins]].float().mean(0)
+                filled[index] = rows[[self.source.index(name) for name in origins]].float().mean(0)
         return filled
 
     def count(self, start: WarmStart, size: int) -> None:
         """Count the rows, of so many numbers each."""
         loaded = {name: origins for name, origins in self.starts.items() if origins}
         new = [name for name in self.starts if name not in loaded]
-        taken = {each for origins in loaded.values() for each in origins}
+        taken = {name for origins in loaded.values() for name in origins}
         unused = [name for name in self.source if name not in taken]
         start.count("loaded", self.part, self._origins(loaded), size * len(loaded))
         start.count("new", self.part, f"not in the file: {', '.join(new)}", size * len(new))
@@ -114,7 +114,7 @@ class NamedRows:
     def _origins(self, loaded: Starts) -> str:
         """The loaded rows in words: each with the row that it starts from, if that has another name."""
         renamed = {name: origins for name, origins in loaded.items() if origins != (name,)}
-        origin_of = {name: one if not others else "the mean of all" for name, (one, *others) in renamed.items()}
+        origin_of = {name: "the mean of all" if others else first for name, (first, *others) in renamed.items()}
         texts = [f"{name} from {origin_of[name]}" if name in origin_of else name for name in loaded]
         return ", ".join(texts) + (self.remark if renamed else "")
 
@@ -161,14 +161,14 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
     return start
 
 
-def _whole(start: WarmStart, key: str, found: Tensor, own: Tensor, reason: str) -> Tensor:
+def _whole(start: WarmStart, key: str, tensor: Tensor, own: Tensor, reason: str) -> Tensor:
     """A tensor of the file if it has the model's shape, or else the model's. reason: for the line of a loaded one."""
-    if found.shape == own.shape:
+    if tensor.shape == own.shape:
         start.count("loaded", _part(key), reason, own.numel())
-        return found
-    shapes = f"{key}: {_shape(found)} and {_shape(own)}"
+        return tensor
+    shapes = f"{key}: {_shape(tensor)} and {_shape(own)}"
     start.count("new", _part(key), "another shape in the file", own.numel(), shapes)
-    start.count("unused", _part(key), "another shape in the model", found.numel())
+    start.count("unused", _part(key), "another shape in the model", tensor.numel())
     return own
 
 
@@ -211,16 +211,16 @@ def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes",
         stated = None
     if isinstance(stated, list) and all(isinstance(name, str) for name in stated):
         return tuple(stated)
-    name, known = checkpoint.facts.get("model"), checkpoint.models
-    if known and (name is None or name in known):
-        return tuple(getattr(load_config(known[0]), what))
+    name, models = checkpoint.facts.get("model"), checkpoint.models
+    if models and (name is None or name in models):
+        return tuple(getattr(load_config(models[0]), what))
     return tuple(getattr(config, what)) if name == config.name else ()
 
 
 def _likes(config: ModelConfig, source: tuple[str, ...]) -> Starts:
     settings = config.class_settings
     likes = {name: settings[name].like if name in settings else "" for name in config.classes}
-    return {name: next(((each,) for each in (name, like) if each in source), ()) for name, like in likes.items()}
+    return {name: next(((label,) for label in (name, like) if label in source), ()) for name, like in likes.items()}
 
 
 def _views(cameras: tuple[str, ...], source: tuple[str, ...], rig: Callable[[], CameraRig]) -> Starts:
@@ -306,7 +306,7 @@ def _notes(usual: Normalisation | None, image: ImageConfig, start: WarmStart) ->
     if usual is None:
         return []
     pairs = zip((*usual[0], *usual[1]), (*image.mean, *image.std), strict=True)
-    if image.color_order == "rgb" and all(abs(one - other) <= ALMOST for one, other in pairs):
+    if image.color_order == "rgb" and all(abs(theirs - own) <= ALMOST for theirs, own in pairs):
         return []
     text = f"{start.file}: such weights usually take images with mean {list(usual[0])} and std {list(usual[1])}"
     return [f"{text} in RGB; the model's are {list(image.mean)}, {list(image.std)} in {image.color_order.upper()}"]

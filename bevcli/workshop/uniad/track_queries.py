@@ -65,13 +65,13 @@ class Memories:
     is_empty: Tensor
     wait: Tensor
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> Memories:
+    def changed(self, change: Callable[[Tensor], Tensor]) -> Memories:
         """The memories after a change of every tensor."""
         return Memories(change(self.embeddings), change(self.is_empty), change(self.wait))
 
     def __getitem__(self, selection: Tensor) -> Memories:
         """The memories of a mask (K,) bool."""
-        return self.each(lambda column: column[selection])
+        return self.changed(lambda column: column[selection])
 
     @staticmethod
     def empty(like: Tensor, length: int) -> Memories:
@@ -96,7 +96,7 @@ class TrackQueries:
     Attributes:
         position: (K, C) first half of the queries.
         content: (K, C) second half of the queries.
-        box_codes: (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.box_coding`.
+        box_codes: (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.decoder`.
         ids: (K,) int64 identities.
         misses: (K,) int64 number of misses since the score was last high.
         memories: of the K tracks.
@@ -124,7 +124,9 @@ class TrackQueries:
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> TrackQueries:
         queries = change(self.position), change(self.content), change(self.box_codes)
-        return TrackQueries(*queries, change(self.ids), change(self.misses), self.memories.each(change), self.next_id)
+        return TrackQueries(
+            *queries, change(self.ids), change(self.misses), self.memories.changed(change), self.next_id
+        )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from shapely import LineString
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.vad.map_lines import MapLines
+from bevcli.workshop.formats.map_lines import MapLines
 
 # Lines: average precision by Chamfer distance, after MapTR. A line is a curve: its direction, its number of points, and
 # where a closed line starts do not matter.

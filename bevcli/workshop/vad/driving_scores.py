@@ -21,18 +21,8 @@ from bevcli.printing import aligned, counted
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes import is_nuscenes_root
-from bevcli.workshop.vad import DrivingScoreOptions
-from bevcli.workshop.vad.driving_metrics import (
-    THRESHOLDS_M,
-    LineScores,
-    MotionSums,
-    PlannedFrame,
-    PlanScores,
-    evaluate_lines,
-    evaluate_motion,
-    evaluate_plans,
-)
-from bevcli.workshop.vad.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.vad import DrivingScoreOptions, driving_metrics as metrics
 from bevcli.workshop.vad.plan import Plan, read_plans
 
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
@@ -86,9 +76,9 @@ def with_true_futures(
 class DrivingScores:
     """Scores that were asked for; the others are None. notes: what was assumed or left out."""
 
-    lines: LineScores | None = None
-    motion: Mapping[str, MotionSums] | None = None
-    plan: PlanScores | None = None
+    lines: metrics.LineScores | None = None
+    motion: Mapping[str, metrics.MotionSums] | None = None
+    plan: metrics.PlanScores | None = None
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,7 +105,7 @@ class DrivingScores:
     def tables(self) -> Iterator[str]:
         """One table for each kind of scores that was asked for."""
         if (lines := self.lines) is not None:
-            rows = [("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in THRESHOLDS_M))]
+            rows = [("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in metrics.THRESHOLDS_M))]
             for name, of_class in lines.ap.items():
                 numbers = (lines.mean_by_class[name], *of_class.values())
                 rows.append((name, str(lines.truth_count[name]), *map(number, numbers)))
@@ -136,7 +126,9 @@ class DrivingScores:
             yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"
 
 
-def _horizons(plan: PlanScores, of: Callable[[Any, float], float], collisions: Any) -> dict[str, dict[str, float]]:
+def _horizons(
+    plan: metrics.PlanScores, of: Callable[[Any, float], float], collisions: Any
+) -> dict[str, dict[str, float]]:
     """Distances and shares of collisions by horizon, in one convention."""
     seconds = [s for s in (1, 2, 3) if s <= plan.step_s * plan.distances_m.shape[1] + 1e-6]
     return {
@@ -168,7 +160,7 @@ def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> FramesByTime:
     return FramesByTime(truth.boxes.frames)
 
 
-def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
+def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> metrics.LineScores:
     predicted, true = read_lines(file), _true_lines(truth)
     if predicted.frame_of_reference != true.frame_of_reference:
         raise InputError(
@@ -180,7 +172,7 @@ def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
     lines = [(predicted_of[one], true_of[other]) for one, other in stamps if one in predicted_of and other in true_of]
     if not lines:
         raise InputError("`map`: no frame has both predicted and true lines")
-    return evaluate_lines(lines, true.classes)
+    return metrics.evaluate_lines(lines, true.classes)
 
 
 def _true_lines(truth: ScoredInput) -> LinesFile:
@@ -204,7 +196,7 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
     return LinesFile("world", LINE_CLASSES, tuple(frames))
 
 
-def _motion(predicted: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
+def _motion(predicted: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, metrics.MotionSums]:
     """The scores of forecasts of the objects whose centre is in the area that the model sees."""
     drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
     ranges = [predicted.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
@@ -219,7 +211,7 @@ def _motion(predicted: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> di
         with_futures = with_true_futures(true.boxes, true.stamp, drives, times)
         return inside(predicted.boxes, bev_from_world), inside(with_futures, bev_from_world)
 
-    return evaluate_motion(map(scored, pairs.predictions, pairs.ground_truth, pairs.reference_from_ego))
+    return metrics.evaluate_motion(map(scored, pairs.predictions, pairs.ground_truth, pairs.reference_from_ego))
 
 
 def _times(predictions: Sequence[FrameBoxes]) -> Array:
@@ -238,7 +230,7 @@ def ego_from_bev_of(frame: FrameBoxes) -> Array:
     return pose_from_json(stated, "ego_from_bev", f"frame {frame.stamp.index}").matrix
 
 
-def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
+def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.PlanScores, tuple[str, ...]]:
     drives, frames, left_out, guessed, times = _drives(truth, pairs, "plan"), [], 0, 0, np.zeros(0)
     plans = {planned.stamp: planned for planned in read_plans(file)}
     for predicted, true, world_from_ego in zip(
@@ -261,16 +253,18 @@ def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores
     notes = [f"{left_out} frames at the end of scenes have no whole driven path: left out"] if left_out else []
     if guessed:
         notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")
-    return evaluate_plans(frames, float(times[0])), tuple(notes)
+    return metrics.evaluate_plans(frames, float(times[0])), tuple(notes)
 
 
-def _planned(plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]) -> PlannedFrame:
+def _planned(
+    plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]
+) -> metrics.PlannedFrame:
     bev_from_world = inverse(world_from_bev)
     origins = [frame.world_from_ego.matrix @ ego_from_bev[:, 3] for frame in later if frame.world_from_ego is not None]
     driven = apply(bev_from_world, np.array(origins)[:, :3])[:, :2]
     command = plan.command or followed(driven, plan.commands)
     path = apply(bev_from_world, plan.paths[plan.commands.index(command)])[:, :2]
-    return PlannedFrame(path, driven, [frame.boxes.transformed(bev_from_world) for frame in later])
+    return metrics.PlannedFrame(path, driven, [frame.boxes.transformed(bev_from_world) for frame in later])
 
 
 def followed(driven: Array, commands: Sequence[str]) -> str:

@@ -1,10 +1,10 @@
-"""The losses of VAD's own heads: lines, futures, and the planned path with its constraints (VAD, section 3.4).
+"""The training of VAD's own heads: the ground truth of a frame beyond boxes, and the losses (VAD, section 3.4).
 
 Each predicted line is matched to a true one in that order of points that fits best (MapTR). The constraints know the
 scene from the model's own lines and futures, which they do not change.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence as Items
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,19 +13,19 @@ import torch.nn.functional as F
 from shapely import LineString, box, get_coordinates, get_parts, line_interpolate_point, line_merge
 from torch import Tensor
 
+from bevcli.errors import InputError
+from bevcli.frame import Frame, Sequence, result_of
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array
-from bevcli.workshop.training.detection_loss import focal_cost, focal_loss, hungarian_matching
-from bevcli.workshop.training.samples import OwnHeads
-from bevcli.workshop.vad.config import LossWeights, VADConfig
-from bevcli.workshop.vad.frame_truth import FrameTruth, frame_truth, missing_truth
-from bevcli.workshop.vad.line_decoder import LineDecoderConfig, LineOutputs
-from bevcli.workshop.vad.map_lines import LINE_CLASSES, MapLines
-from bevcli.workshop.vad.motion_head import MotionOutputs
-from bevcli.workshop.vad.vad import VADOutputs
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.workshop.formats.map_lines import BOUNDARY, DIVIDER, TRUE_LINES, MapLines
+from bevcli.workshop.training.losses import focal_cost, focal_loss, hungarian_matching
+from bevcli.workshop.training.targets import OwnHeads, boxes_inside
+from bevcli.workshop.vad.driving_scores import LATE_S, FramesByTime, followed, with_true_futures
+from bevcli.workshop.vad.heads import LineDecoderConfig, LineOutputs, MotionOutputs
+from bevcli.workshop.vad.vad import LossWeights, VADConfig, VADOutputs
 
-DIVIDER, _, BOUNDARY = LINE_CLASSES
 SURE = 0.5  # lines and vehicles with lower scores constrain nothing
 BOUNDARY_M = 1.0  # places keep this distance from boundaries
 NEAR_M = 3.0  # vehicles further away cannot be hit
@@ -36,8 +36,69 @@ CLOSED_M = 0.01  # a line whose ends are so near to each other is closed
 SHORTEST_M = 0.5  # shorter rests of lines that the range cuts are left out
 
 
+@dataclass(frozen=True)
+class FrameTruth:
+    """The ground truth of one frame, bev frame.
+
+    Attributes:
+        boxes: the G boxes to be found, each with one future of T steps; NaN from the step on in which the object is
+            not there.
+        lines: of the map.
+        driven: (T, 2) places where the vehicle was at the same times, metres; NaN after the end of the scene.
+        command: the driver's command that the driven path follows; "" where no place is known.
+    """
+
+    boxes: Boxes3D
+    lines: MapLines
+    driven: Array
+    command: str
+
+
+def missing_truth(frame: Frame, config: VADConfig) -> tuple[str, str] | None:
+    """The truth beyond boxes that a frame lacks, in words, and its file; None where nothing is missing."""
+    return ("lines", TRUE_LINES) if result_of(MapLines, frame.ground_truth_results) is None else None
+
+
+def frame_truth(frame: Frame, sequence: Sequence, index: int, config: VADConfig) -> FrameTruth:
+    """The truth of a frame that a model trains on.
+
+    frame: with ground truth boxes, and the rig that the model sees; at `index` of its drive, `sequence`.
+    Raises InputError where the frame has no true lines, or its objects have no identities.
+    """
+    assert frame.ground_truth is not None
+    times, boxes = config.future_times_s, frame.ground_truth
+    lines = result_of(MapLines, frame.ground_truth_results)
+    if lines is None:
+        raise InputError(
+            f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no true lines of the map: training "
+            f"{config.name} needs {TRUE_LINES} (bevcli render writes it)"
+        )
+    later = FramesByTime(_frames_until(sequence, index, max(times)))
+    bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
+    boxes = with_true_futures(boxes, frame.stamp, later, times)
+    driven = np.full((len(times), 2), np.nan)
+    for step, seconds in enumerate(times):
+        future = later.after(frame.stamp, seconds)
+        if future is not None and future.world_from_ego is not None:
+            driven[step] = apply(bev_from_world, (future.world_from_ego.matrix @ frame.rig.ego_from_bev)[:3, 3])[:2]
+    boxes = boxes_inside(boxes.transformed(bev_from_world), config)
+    known = driven[np.isfinite(driven).all(-1)]
+    return FrameTruth(boxes, lines, driven, followed(known, config.commands) if len(known) else "")
+
+
+def _frames_until(sequence: Sequence, index: int, seconds: float) -> Iterator[FrameBoxes]:
+    """The frames of the same scene from an index on, and up to so many seconds later."""
+    now = sequence.stamps[index]
+    last_ns = now.timestamp_ns + round((seconds + LATE_S) * 1e9)
+    for later, stamp in enumerate(sequence.stamps):
+        if stamp.scene == now.scene and now.timestamp_ns <= stamp.timestamp_ns <= last_ns:
+            frame = sequence.ground_truth_frame(later)
+            boxes = Boxes3D.empty() if frame.ground_truth is None else frame.ground_truth
+            yield FrameBoxes(stamp, frame.world_from_ego, boxes)
+
+
 def head_losses(
-    outputs: VADOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]], config: VADConfig
+    outputs: VADOutputs, truths: Items[FrameTruth], matches: Items[tuple[Tensor, Tensor]], config: VADConfig
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of lines, futures and paths by name.
 
@@ -51,7 +112,7 @@ def head_losses(
 
 
 def motion_losses(
-    outputs: MotionOutputs, truths: Sequence[Boxes3D], matches: Sequence[tuple[Tensor, Tensor]], weights: LossWeights
+    outputs: MotionOutputs, truths: Items[Boxes3D], matches: Items[tuple[Tensor, Tensor]], weights: LossWeights
 ) -> dict[str, Tensor]:
     """The weighted scalar losses, divided by the number of matched boxes whose next place is known.
 
@@ -93,7 +154,7 @@ def best_modes(offsets: Tensor, true: Tensor, known: Tensor) -> Tensor:
     return summed.norm(dim=-1).argmin(-1)
 
 
-def plan_losses(outputs: VADOutputs, truths: Sequence[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
+def plan_losses(outputs: VADOutputs, truths: Items[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
     """The weighted scalar losses of the paths of the commands that were followed.
 
     Each is the mean over frames and steps; unknown steps count as zero. As published, the mean of the distances is
@@ -133,7 +194,7 @@ def scene_of(outputs: VADOutputs, element: int, config: VADConfig) -> tuple[Tens
         return lines[scores[:, classes.index(name)] >= SURE] if name in classes else lines[:0]
 
     best, labels = outputs.class_logits[-1, element].sigmoid().max(-1)  # (Q,)
-    is_vehicle = torch.tensor([one.vehicle for one in config.object_classes.values()], device=start.device)
+    is_vehicle = torch.tensor([kind.vehicle for kind in config.object_classes.values()], device=start.device)
     seen = (best >= SURE) & is_vehicle[labels]
     modes = outputs.motion.mode_logits[element, seen].argmax(-1)
     offsets = outputs.motion.offsets[element, seen, modes]  # (V, T, 2)
@@ -255,7 +316,7 @@ def _orders(points: Array) -> Array:
 
 
 def line_losses(
-    outputs: LineOutputs, targets: Sequence[LineTargets], weights: LossWeights, extent_m: Tensor
+    outputs: LineOutputs, targets: Items[LineTargets], weights: LossWeights, extent_m: Tensor
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of all decoder layers, divided by the number of matched lines of the batch.
 
@@ -267,7 +328,7 @@ def line_losses(
 
 
 def _layer_loss(
-    logits: Tensor, points: Tensor, targets: Sequence[LineTargets], weights: LossWeights, extent_m: Tensor
+    logits: Tensor, points: Tensor, targets: Items[LineTargets], weights: LossWeights, extent_m: Tensor
 ) -> Tensor:
     """(3,) losses of one decoder layer. logits: (B, N, classes). points: (B, N, P, 2)."""
     class_targets, matched, true = torch.zeros_like(logits), [], []
@@ -280,7 +341,7 @@ def _layer_loss(
     at, wanted = torch.cat(matched), torch.cat(true)  # (K, P, 2)
     classes = weights.line_class * focal_loss(logits, class_targets).sum()
     distances = weights.line_points * F.l1_loss(at, wanted, reduction="sum")
-    segments, true_segments = (each.diff(dim=1) * extent_m for each in (at, wanted))
+    segments, true_segments = (points.diff(dim=1) * extent_m for points in (at, wanted))
     turned = weights.line_direction * (1 - F.cosine_similarity(segments, true_segments, dim=-1)).sum()
     return torch.stack([classes, distances, turned]) / max(len(at), 1)
 

@@ -14,7 +14,7 @@ from bevcli.frame import FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CsvRow, cell_of, read_csv
-from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.entities import EGO_COLOR
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 COLUMNS = (

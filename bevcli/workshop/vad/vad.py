@@ -1,28 +1,95 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import astuple, dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import best_boxes
-from bevcli.model.decoder import best_classes
+from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import best_boxes, best_classes
 from bevcli.model.network import STAGES
-from bevcli.model.official_keys import OfficialNames, Renames
 from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import ModelOutputs
+from bevcli.model.temporal_model import OfficialNames, Renames
 from bevcli.model.upload import without_autocast
-from bevcli.workshop.vad.config import VADConfig
-from bevcli.workshop.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
-from bevcli.workshop.vad.map_lines import MapLines
-from bevcli.workshop.vad.motion_head import MapTokens, MotionHead, MotionOutputs, Planner, line_positions
+from bevcli.workshop.formats.map_lines import MapLines
+from bevcli.workshop.vad import heads
 from bevcli.workshop.vad.plan import Plan
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """The [loss_weights] table: weights of the losses of lines, futures and paths. Defaults: as published (stage 2).
+
+    Attributes:
+        line_class: of the focal loss of the lines' classes; also of their cost in the matching.
+        line_points: of the L1 loss of the lines' points, summed, as shares of the range; also of their cost.
+        line_direction: of 1 minus the cosine between the segments of a line and the true ones.
+        future: of the L1 loss of the movements in the best mode of an object.
+        mode: of the focal loss of the modes.
+        plan: of the L1 loss of the movements of the vehicle.
+        boundary: of the shares of a metre by which planned places are nearer than that to a boundary.
+        collision: of the metres by which planned places are too near to vehicles.
+        direction: of the angle between the planned path and the nearest divider, radians.
+    """
+
+    line_class: float = 0.8
+    line_points: float = 0.4
+    line_direction: float = 0.005
+    future: float = 0.2
+    mode: float = 0.2
+    plan: float = 1.0
+    boundary: float = 1.0
+    collision: float = 1.0
+    direction: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(astuple(self)) < 0:
+            raise ValueError("the weights must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VADConfig(ModelConfig):
+    """A whole VAD.
+
+    Attributes:
+        commands: of the driver, in the order of the planned paths.
+        line_decoder: the map decoder.
+        motion: the motion head and the planner.
+        loss_weights: of the losses of lines, futures and paths.
+    """
+
+    architecture: ClassVar[str] = "VAD"
+
+    commands: tuple[str, ...] = ("right", "left", "straight")
+    line_decoder: heads.LineDecoderConfig = field(default_factory=heads.LineDecoderConfig)
+    motion: heads.MotionConfig = field(default_factory=heads.MotionConfig)
+    loss_weights: LossWeights = field(default_factory=LossWeights)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.heads != ("detection",) or self.decoder.training_groups != 1:
+            raise ValueError('heads must be ["detection"] and decoder.training_groups 1: VAD has heads of its own')
+        if self.channels % self.line_decoder.attention_heads or self.channels % self.motion.attention_heads:
+            raise ValueError(f"channels is {self.channels}; it must be a multiple of the attention_heads")
+        if not self.commands or len(set(self.commands)) < len(self.commands):
+            raise ValueError("commands must name at least one command, and none twice")
+
+    @property
+    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
+        return {MapLines: self.line_decoder.classes, Plan: self.commands}
+
+    @property
+    def future_times_s(self) -> tuple[float, ...]:
+        return tuple(self.motion.step_s * step for step in range(1, self.motion.steps + 1))
+
 
 _RENAMES: Renames = (
     (r"^pts_bbox_head\.map_instance_embedding\.weight$", "line_decoder.line_embedding"),
@@ -76,8 +143,8 @@ class VADOutputs(ModelOutputs):
         plan: (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres.
     """
 
-    lines: LineOutputs
-    motion: MotionOutputs
+    lines: heads.LineOutputs
+    motion: heads.MotionOutputs
     plan: Tensor
 
     @property
@@ -93,7 +160,7 @@ class VADOutputs(ModelOutputs):
     def last_layers(self) -> Self:
         """See `ModelOutputs`. Features, which only the network uses, are left out."""
         lines, none = self.lines, self.plan[:0]
-        last = LineOutputs(lines.class_logits[-1:], lines.points[-1:], none)
+        last = heads.LineOutputs(lines.class_logits[-1:], lines.points[-1:], none)
         return replace(super().last_layers(), lines=last, motion=replace(self.motion, features=none))
 
 
@@ -107,10 +174,10 @@ class VAD(BEVFormer):
 
     def __init__(self, config: VADConfig) -> None:
         super().__init__(config)
-        self.line_decoder = LineDecoder(config.line_decoder, config.channels, config.bev_grid)
-        self.line_encoder = LineEncoder(config.channels)
-        self.motion_head = MotionHead(config.motion, config.channels)
-        self.planner = Planner(config.motion, len(config.commands), config.channels)
+        self.line_decoder = heads.LineDecoder(config.line_decoder, config.channels, config.bev_grid)
+        self.line_encoder = heads.LineEncoder(config.channels)
+        self.motion_head = heads.MotionHead(config.motion, config.channels)
+        self.planner = heads.Planner(config.motion, len(config.commands), config.channels)
 
     def detect(self, bev: Tensor) -> VADOutputs:
         """The outputs for a BEV map (B, Y·X, C)."""
@@ -119,16 +186,18 @@ class VAD(BEVFormer):
             lines, motion, plan = self.further(bev.float(), box_codes[-1], features)
         return VADOutputs(bev, class_logits, box_codes, lines=lines, motion=motion, plan=plan)
 
-    def further(self, bev: Tensor, box_codes: Tensor, features: Tensor) -> tuple[LineOutputs, MotionOutputs, Tensor]:
+    def further(
+        self, bev: Tensor, box_codes: Tensor, features: Tensor
+    ) -> tuple[heads.LineOutputs, heads.MotionOutputs, Tensor]:
         """Lines, futures and plan for a BEV map, and box codes (B, Q, 10) and features (B, Q, C) of objects."""
         lines = self.line_decoder(bev)
         tokens, positions = self.map_tokens(lines), self.positions(box_codes)
         motion = self.motion_head(features, positions, tokens)
         return lines, motion, self.planner(motion.features, positions, tokens)
 
-    def map_tokens(self, lines: LineOutputs) -> MapTokens:
+    def map_tokens(self, lines: heads.LineOutputs) -> heads.MapTokens:
         scores = lines.class_logits[-1].sigmoid().amax(-1)
-        return MapTokens(self.line_encoder(lines.features), line_positions(lines.points[-1]), scores)
+        return heads.MapTokens(self.line_encoder(lines.features), heads.line_positions(lines.points[-1]), scores)
 
     def positions(self, box_codes: Tensor) -> Tensor:
         """x and y (B, Q, 2), 0 to 1 over the range, of box codes (B, Q, 10)."""
@@ -149,9 +218,46 @@ def fix_first_attentions(model: VAD) -> None:
     first.self_attention = ConstantSelfAttention(first, model.line_decoder.queries(batch=1))
 
 
+def exported_outputs(config: VADConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
+    """Name, shape and meaning of each of `VADOutputs.further` in an exported file."""
+    lines, motion, queries = config.line_decoder, config.motion, config.decoder.queries
+    commands = config.commands
+    yield (
+        "line_class_logits",
+        (1, lines.lines, len(lines.classes)),
+        f"(1, N, classes): of lines of the map: {', '.join(lines.classes)}.",
+    )
+    yield (
+        "line_points",
+        (1, lines.lines, lines.line_points, 2),
+        "(1, N, P, 2): points of the lines, x and y, 0 to 1 over x_range_m and y_range_m.",
+    )
+    yield (
+        "future_offsets",
+        (1, queries, motion.modes, motion.steps, 2),
+        f"(1, Q, M, T, 2): movement of each object in each step of {motion.step_s:g} s, x and y in metres, bev "
+        "frame. Sums over the steps, added to the centre, are places.",
+    )
+    yield "mode_logits", (1, queries, motion.modes), "(1, Q, M): of the futures."
+    yield (
+        "plan_offsets",
+        (1, len(commands), motion.steps, 2),
+        f"(1, commands, T, 2): movement of the vehicle in each step, for the commands {', '.join(commands)}.",
+    )
+
+
+def outputs_of_file(outputs: ModelOutputs, by_name: Mapping[str, Tensor]) -> VADOutputs:
+    """The outputs of an exported file as the model's own. outputs: those of every model. by_name: all of the file."""
+    none = torch.zeros(0)  # features between the heads are not in the file
+    lines = heads.LineOutputs(by_name["line_class_logits"][None], by_name["line_points"][None], none)
+    motion = heads.MotionOutputs(by_name["future_offsets"], by_name["mode_logits"], none)
+    parts = outputs.bev, outputs.class_logits, outputs.box_codes
+    return VADOutputs(*parts, lines=lines, motion=motion, plan=by_name["plan_offsets"])
+
+
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
-    """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config)
+    """The boxes of `ModelOutputs.boxes`, with futures: the places of each object's centre in each mode."""
+    best = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config.decoder)
     boxes, queries = best.decoded(config.classes), best.query[0]
     offsets = _array(outputs.motion.offsets[0, queries])  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
@@ -163,15 +269,10 @@ def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
 def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
     """The line_decoder.max_lines lines with the best scores, by falling score, bev frame; see `best_classes`."""
     decoder = config.line_decoder
-    scores, queries, labels = (each[0] for each in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
-    points = line_places(outputs.lines.points[-1, 0, queries], config)  # (K, P, 2)
-    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
-
-
-def line_places(points: Tensor, config: VADConfig) -> Array:
-    """Points of lines (..., 2), 0 to 1 over the range -> metres, bev frame."""
+    scores, queries, labels = (column[0] for column in best_classes(outputs.lines.class_logits[-1], decoder.max_lines))
     (x0, x1), (y0, y1) = config.bev_grid.x_range_m, config.bev_grid.y_range_m
-    return _array(points) * (x1 - x0, y1 - y0) + (x0, y0)
+    points = _array(outputs.lines.points[-1, 0, queries]) * (x1 - x0, y1 - y0) + (x0, y0)  # (K, P, 2)
+    return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
 
 
 def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:

@@ -1,10 +1,10 @@
-"""The detection loss: targets, Hungarian matching, then focal and L1 loss after each decoder layer, as published.
+"""The losses of the model's heads: boxes, masks, and, in training only, boxes of BEV cells.
 
-The losses of all heads that find things share its focal loss and its one-to-one matching.
+The detection loss as published: Hungarian matching, then focal and L1 loss after each decoder layer. The segmentation
+loss: focal, dice and L1 loss after each mask layer. All heads that find things share the focal loss and the matching.
 """
 
-from __future__ import annotations
-
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,12 +13,13 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from torch import Tensor
+from torch import Tensor, nn
 
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import encode
-from bevcli.model.config import ModelConfig
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.decoder import BOX_CODE_SIZE
+from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
+from bevcli.workshop.training.targets import AnyMasks, AnyTargets, PaddedMasks, PaddedTargets, padded, padded_masks
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
 UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
@@ -83,94 +84,6 @@ def _finite(costs: Tensor) -> NDArray[np.float64]:
 
 VELOCITY_START = 8  # entries 8 and 9 of a box code are vx and vy
 MIN_MOVING_MPS = 0.5  # slower objects count as stationary
-
-
-@dataclass(frozen=True)
-class DetectionTargets:
-    """The G ground truth boxes of one frame.
-
-    Attributes:
-        labels: (G,) int64, indices into the model's classes.
-        codes: (G, 10) float32 box codes (see `bevcli.model.box_coding`); unknown velocities are NaN.
-    """
-
-    labels: Tensor
-    codes: Tensor
-
-
-@dataclass(frozen=True)
-class PaddedTargets:
-    """The ground truth boxes of B frames, padded to the G boxes of the frame with the most, at least 1.
-
-    Attributes:
-        labels: (B, G) int64, indices into the model's classes; 0 for padding.
-        codes: (B, G, 10) float32 box codes; 0 for padding.
-        exists: (B, G) bool, false for padding.
-        counts: B numbers of boxes.
-    """
-
-    labels: Tensor
-    codes: Tensor
-    exists: Tensor
-    counts: tuple[int, ...]
-
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    def __getitem__(self, frame: int) -> DetectionTargets:
-        """The boxes of one frame."""
-        count = self.counts[frame]
-        return DetectionTargets(self.labels[frame, :count], self.codes[frame, :count])
-
-
-AnyTargets = Sequence[DetectionTargets] | PaddedTargets  # of B frames
-
-
-def padded(targets: AnyTargets) -> PaddedTargets:
-    """The boxes of B frames as tensors."""
-    if isinstance(targets, PaddedTargets):
-        return targets
-    counts = tuple(len(one.labels) for one in targets)
-    labels, codes = (pad_rows([getattr(one, name) for one in targets]) for name in ("labels", "codes"))
-    exists = pad_rows([torch.ones_like(one.labels, dtype=torch.bool) for one in targets])
-    return PaddedTargets(labels, codes, exists, counts)
-
-
-def pad_rows(tensors: Sequence[Tensor]) -> Tensor:
-    """(B, G, ...) of B tensors (G_i, ...), padded with zeros to the largest of G_i, at least 1."""
-    rows = max(1, *map(len, tensors))
-    out = tensors[0].new_zeros(len(tensors), rows, *tensors[0].shape[1:])
-    for padded_rows, tensor in zip(out, tensors, strict=True):
-        padded_rows[: len(tensor)] = tensor
-    return out
-
-
-def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
-    """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
-    return box_targets(boxes_inside(boxes, config), config.classes)
-
-
-def boxes_inside(boxes: Boxes3D, config: ModelConfig) -> Boxes3D:
-    """The boxes (ground truth, bev frame) that are `detection_targets`, in their order."""
-    grid = config.bev_grid
-    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
-    return _learned(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
-
-
-def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
-    """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
-    kept = _learned(boxes, classes)
-    labels = [classes.index(name) for name in kept.classes]
-    return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
-
-
-def _learned(boxes: Boxes3D, classes: tuple[str, ...]) -> Boxes3D:
-    return boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
-
-
-def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
-    """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
-    return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
 
 
 @dataclass(frozen=True)
@@ -293,3 +206,166 @@ def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: Detec
     moving = truth[..., VELOCITY_START:].norm(dim=-1) >= MIN_MOVING_MPS
     weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)
     return errors[..., :VELOCITY_START].sum(-1) + weights * errors[..., VELOCITY_START:].sum(-1)
+
+
+@dataclass(frozen=True)
+class DenseLossConfig:
+    """The [training.dense_loss] table.
+
+    Attributes:
+        weight: of the whole loss; 0 disables it, as published.
+        reach_m: cells up to this distance from an object's centre are positives, metres.
+    """
+
+    weight: float = 0.0
+    reach_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.reach_m <= 0:
+            raise ValueError("weight must not be negative, reach_m must be positive")
+
+
+class DenseHead(nn.Module):
+    """One linear layer that predicts classes and a box from each BEV cell."""
+
+    centers: Tensor
+
+    def __init__(self, channels: int, classes: int, grid: BevGrid) -> None:
+        super().__init__()
+        self.classes = nn.Linear(channels, classes)
+        self.boxes = nn.Linear(channels, BOX_CODE_SIZE)
+        nn.init.constant_(self.classes.bias, -math.log(99))  # focal prior, as in the detection head
+        centers = torch.as_tensor(grid.cell_centers(), dtype=torch.float32).reshape(-1, 2)
+        self.register_buffer("centers", centers, persistent=False)
+
+    def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
+        """bev: (B, Y·X, C) -> class logits (B, Y·X, classes) and box codes (B, Y·X, 10).
+
+        The layer predicts a box centre as an offset from the cell's centre, metres.
+        """
+        codes = self.boxes(bev)
+        return self.classes(bev), torch.cat([codes[..., :2] + self.centers, codes[..., 2:]], dim=-1)
+
+
+def dense_loss(
+    head: DenseHead, bev: Tensor, targets: AnyTargets, config: DenseLossConfig, detection: DetectionLossConfig
+) -> dict[str, Tensor]:
+    """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
+
+    bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
+    """
+    truth = padded(targets)
+    logits, codes = head(bev)
+    objects = _objects_in_reach(head.centers, truth, config.reach_m)
+    classes, boxes = config.weight * assigned_loss(logits, codes, truth, objects, detection)
+    return {"cell classes": classes, "cell boxes": boxes}
+
+
+def _objects_in_reach(cells: Tensor, truth: PaddedTargets, reach_m: float) -> Tensor:
+    """(B, Y·X) int64 the nearest object of each cell that is within reach of it, -1 for none.
+
+    cells: (Y·X, 2) centres, metres.
+    """
+    # Not by a product of matrices, which a GPU may round.
+    distances = torch.cdist(cells, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
+    distance, nearest = distances.where(truth.exists[:, None], torch.inf).min(dim=-1)
+    return nearest.where(distance <= reach_m, -1)
+
+
+DICE_SMOOTHING = 1e-3
+
+
+@dataclass(frozen=True)
+class SegmentationLossConfig:
+    """The [training.segmentation_loss] table.
+
+    Attributes:
+        class_weight: of the focal loss of the classes.
+        location_weight: of the L1 loss of the things' locations.
+        dice_weight: of the dice loss of the masks.
+        pixel_weight: of the focal loss of the masks, averaged over the cells of a mask.
+    """
+
+    class_weight: float = 1.0
+    location_weight: float = 2.0
+    dice_weight: float = 1.0
+    pixel_weight: float = 10.0
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) < 0:
+            raise ValueError("the weights must not be negative")
+
+
+def segmentation_loss(
+    outputs: SegmentationOutputs, targets: AnyMasks, config: SegmentationLossConfig
+) -> dict[str, Tensor]:
+    """The weighted losses of all layers for B frames. Things are matched once, by the outputs of the last layer.
+
+    The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
+    so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
+    """
+    truth, first = padded_masks(targets), len(STUFF_CLASSES)
+    _, queries = hungarian_matchings(mask_matching_costs(outputs, truth, config), truth.counts)  # (B, G)
+    assigned = torch.cat([truth.stuff.any(-1), queries >= 0], 1).float()  # (B, S + G)
+    queries = queries.clamp(min=0) + first
+    stuff, things = assigned[:, :first].sum().clamp(min=1), assigned[:, first:].sum().clamp(min=1)
+    layers = outputs.class_logits.shape[0]
+
+    class_targets = torch.zeros_like(outputs.class_logits)  # (M, B, Q)
+    class_targets[..., :first] = assigned[:, :first]
+    of_things = assigned[:, first:]
+    class_targets.scatter_add_(-1, *(x.expand(layers, -1, -1) for x in (queries, of_things)))
+    class_losses = focal_loss(outputs.class_logits, class_targets)
+    of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
+    classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
+
+    logits = _chosen(outputs.mask_logits, queries)  # (M, B, G, Y·X)
+    logits = torch.cat([outputs.mask_logits[:, :, :first], logits], 2)
+    masks = torch.cat([truth.stuff, truth.things], 1).expand_as(logits)
+    losses = config.dice_weight * dice_loss(logits, masks)
+    losses = (losses + config.pixel_weight * focal_loss(logits, masks).mean(-1)) * assigned
+    errors = (_chosen(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
+    return {
+        "map classes": config.class_weight * classes,
+        "masks": losses[..., :first].sum() / stuff + losses[..., first:].sum() / things,
+        "locations": config.location_weight * errors.sum() / things,
+    }
+
+
+def _chosen(tensor: Tensor, queries: Tensor) -> Tensor:
+    """(M, B, Q, ...) -> (M, B, G, ...), those of the queries (B, G)."""
+    index = queries[None, ..., None].expand(len(tensor), -1, -1, tensor.shape[-1])
+    return tensor.gather(2, index)
+
+
+def mask_matching_costs(outputs: SegmentationOutputs, truth: PaddedMasks, config: SegmentationLossConfig) -> Tensor:
+    """(B, T, G) cost of assigning each thing query to each vehicle, by the last layer. No gradient."""
+    first = len(STUFF_CLASSES)
+    with torch.no_grad():
+        classes = focal_cost(outputs.class_logits[-1, :, first:])[..., None]
+        locations = torch.cdist(outputs.locations[-1], truth.locations, p=1)
+        dice = dice_costs(outputs.mask_logits[-1, :, first:], truth.things)
+        return config.class_weight * classes + config.location_weight * locations + config.dice_weight * dice
+
+
+def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """(...) dice loss with squared sums (V-Net), about 0 for equal masks and 1 for disjoint ones.
+
+    logits: (..., cells). targets: (..., cells), 0 or 1.
+    """
+    masks = logits.sigmoid()
+    return _dice((masks * targets).sum(-1), masks.square().sum(-1) + targets.square().sum(-1))
+
+
+def dice_costs(logits: Tensor, targets: Tensor) -> Tensor:
+    """(..., Q, G) dice loss of each predicted mask against each target mask.
+
+    logits: (..., Q, cells). targets: (..., G, cells), 0 or 1.
+    """
+    masks = logits.sigmoid()
+    sums = masks.square().sum(-1)[..., None] + targets.square().sum(-1)[..., None, :]
+    return _dice(masks @ targets.mT, sums)
+
+
+def _dice(overlap: Tensor, sums: Tensor) -> Tensor:
+    return 1 - (2 * overlap + DICE_SMOOTHING) / (sums + DICE_SMOOTHING)

@@ -1,4 +1,4 @@
-"""Compiled loops for bilinear sampling, weighted sums of samples, which they do not store, and max-pooling.
+"""Compiled loops: bilinear sampling, weighted sums of samples, which they do not store, softmax, max-pooling, pillars.
 
 The functions take arrays and no Python objects. Several threads may run one on disjoint ranges of queries or rows.
 The compiled code is cached on disk (in NUMBA_CACHE_DIR, next to this file, or in the user's cache folder).
@@ -15,14 +15,13 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from bevcli.jit import njit
-from bevcli.model.kernels.softmax import softmax_of_groups
 
 BFLOAT16_BITS = 16
 
 
 @njit(nogil=True, inline="always")
-def sum_samples(values, first, step, cells, shares, begin, end, out, place, depth):  # type: ignore[no-untyped-def]
-    """Writes the weighted sums of `depth` successive channels to out[place], out[place + 1] and so on.
+def sum_samples(values, first, step, cells, shares, begin, end, out, first_sum, depth):  # type: ignore[no-untyped-def]
+    """Writes the weighted sums of `depth` successive channels to out[first_sum], out[first_sum + 1] and so on.
 
     values: (N,) float32, or bfloat16 bits as uint16. first: index of the first channel in cell 0. step: from a cell to
     the next. cells (int32), shares: (4, T), the corners of all samples and their weights; samples begin to end - 1 are
@@ -30,20 +29,20 @@ def sum_samples(values, first, step, cells, shares, begin, end, out, place, dept
     """
     if depth % 32 == 0:
         for c in range(0, depth, 32):
-            _sum_channels(32, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(32, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     elif depth % 16 == 0:
         for c in range(0, depth, 16):
-            _sum_channels(16, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(16, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     elif depth % 8 == 0:
         for c in range(0, depth, 8):
-            _sum_channels(8, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(8, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
     else:
         for c in range(depth):
-            _sum_channels(1, values, first + c, step, cells, shares, begin, end, out, place + c)
+            _sum_channels(1, values, first + c, step, cells, shares, begin, end, out, first_sum + c)
 
 
 @intrinsic(prefer_literal=True)
-def _sum_channels(typing, width, values, first, step, cells, shares, begin, end, out, place):  # type: ignore[no-untyped-def]
+def _sum_channels(typing, width, values, first, step, cells, shares, begin, end, out, first_sum):  # type: ignore[no-untyped-def]
     """The sums of `width` channels from `first` on; arguments as for `sum_samples`. The width is a constant."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -83,7 +82,7 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
         builder.store(result, pointer, align=2 if rounds else 4)
         return context.get_dummy_value()
 
-    return types.void(width, values, first, step, cells, shares, begin, end, out, place), generate
+    return types.void(width, values, first, step, cells, shares, begin, end, out, first_sum), generate
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
@@ -199,8 +198,8 @@ def _sum_heads(values, chosen_map, cells, shares, samples, out, query):  # type:
     start = chosen_map * values.shape[1] * step
     for head in range(heads):
         channel, first = head * depth, head * samples
-        place = query * step + channel
-        sum_samples(flat, start + channel, step, cells, shares, first, first + samples, sums, place, depth)
+        first_sum = query * step + channel
+        sum_samples(flat, start + channel, step, cells, shares, first, first + samples, sums, first_sum, depth)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -324,3 +323,104 @@ def max_of_windows(values, out, begin, end):  # type: ignore[no-untyped-def]
                     read = values[image, v, u]
                     for c in range(channels):
                         largest[c] = max(largest[c], read[c])
+
+
+LOG2_E = np.float32(1.44269504)
+# The logarithm of 2 as the sum of a number with few bits, whose products are exact, and a small one.
+LN_2, LN_2_REST = np.float32(0.693359375), np.float32(-2.12194440e-4)
+SMALLEST = np.float32(-87.0)  # its exponential is just a normal number
+EXPONENT_BIAS, MANTISSA_BITS = np.int32(127), np.int32(23)
+
+
+@njit(nogil=True, inline="always")
+def softmax_of_groups(numbers, count, powers):  # type: ignore[no-untyped-def]
+    """Replaces every `count` successive logits (K,) float32 by their softmax, in place. A group with NaN becomes NaN.
+
+    powers: (K,) int32, room for intermediate results.
+    """
+    # The loops over a constant count need no branches. These are the counts of the published models.
+    if count == 4:
+        _softmax(numbers, 4, powers)
+    elif count == 8:
+        _softmax(numbers, 8, powers)
+    elif count == 32:
+        _softmax(numbers, 32, powers)
+    else:
+        _softmax(numbers, count, powers)
+
+
+@njit(nogil=True, inline="always")
+def _softmax(numbers, count, powers):  # type: ignore[no-untyped-def]
+    """As `softmax_of_groups`."""
+    _subtract_largest(numbers, count)
+    _exponentials(numbers, powers)
+    _divide_by_sums(numbers, count)
+
+
+@njit(nogil=True, fastmath={"contract", "reassoc", "nsz"}, inline="always")
+def _subtract_largest(numbers, count):  # type: ignore[no-untyped-def]
+    """Subtracts from each group its largest number, in place."""
+    for first in range(0, len(numbers), count):
+        largest = numbers[first]
+        for i in range(first + 1, first + count):
+            largest = max(largest, numbers[i])
+        for i in range(first, first + count):
+            numbers[i] -= largest
+
+
+@njit(nogil=True, fastmath={"contract"}, inline="never")
+def _exponentials(numbers, powers):  # type: ignore[no-untyped-def]
+    """Replaces numbers by their exponentials: a power of 2 times that of a small rest, by its Taylor series."""
+    half, one = np.float32(0.5), np.float32(1)
+    for i in range(len(numbers)):
+        x = SMALLEST if numbers[i] < SMALLEST else numbers[i]  # NaN stays
+        power = np.floor(x * LOG2_E + half)
+        rest = x - power * LN_2 - power * LN_2_REST  # -0.35 to 0.35
+        series = np.float32(1 / 5040)
+        for divisor in (720.0, 120.0, 24.0, 6.0, 2.0):
+            series = series * rest + np.float32(1 / divisor)
+        numbers[i] = (series * rest + one) * rest + one
+        powers[i] = (np.int32(power) + EXPONENT_BIAS) << MANTISSA_BITS
+    factors = powers.view(np.float32)
+    for i in range(len(numbers)):
+        numbers[i] *= factors[i]
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"}, inline="always")
+def _divide_by_sums(numbers, count):  # type: ignore[no-untyped-def]
+    """Divides each group of numbers by its sum, in place."""
+    for first in range(0, len(numbers), count):
+        total = np.float32(0)
+        for i in range(first, first + count):
+            total += numbers[i]
+        share = np.float32(1) / total
+        for i in range(first, first + count):
+            numbers[i] *= share
+
+
+@njit(nogil=True, error_model="numpy")
+def find_hits(images_from_bev, points, has_image, image_size, min_depth, cells, reference_points, counts, begin, end):  # type: ignore[no-untyped-def]
+    """Writes the cells that cameras begin to end - 1 see, and the points of their pillars, in the order of the cells.
+
+    images_from_bev: (G, 4, 4) float32. points: (Y·X, Z, 3) float32. has_image: (G,) bool. image_size: (2,) float32
+    height, width. cells: (G, Y·X) int64. reference_points: (G, Y·X, Z, 2) float32. counts: (G,) int64, of the hits.
+    """
+    zero, one, height, width = np.float32(0), np.float32(1), image_size[0], image_size[1]
+    for camera in range(begin, end):
+        matrix, count = images_from_bev[camera], 0
+        for cell in range(len(points) if has_image[camera] else 0):
+            is_seen = False
+            for point in range(points.shape[1]):
+                x, y, z = points[cell, point, 0], points[cell, point, 1], points[cell, point, 2]
+                u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+                v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+                depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+                divisor = max(depth, min_depth)
+                column, row = u / divisor / width, v / divisor / height
+                reference_points[camera, count, point, 0], reference_points[camera, count, point, 1] = column, row
+                inside = (column > zero) & (column < one) & (row > zero) & (row < one)
+                is_seen |= inside & (depth > min_depth)
+            if is_seen:
+                cells[camera, count] = cell
+                count += 1
+        counts[camera] = count
