@@ -40,11 +40,16 @@ if TYPE_CHECKING:
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
+    from bevcli.viewer.export import export as export
     from bevcli.viewer.recording_file import show as show
     from bevcli.viewer.views import screenshot as screenshot, video as video
     from bevcli.weights.model_file import model_file_for as model_file_for
+    from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
+    from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
+    from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.synth.drive import render as render
+    from bevcli.workshop.training.train import train as train, validate as validate
 
 # The public names by the modules that define them.
 _NAMES = {
@@ -65,7 +70,12 @@ _NAMES = {
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
     "bevcli.weights.model_file": "model_file_for",
+    "bevcli.workshop.batch.batch": "batch",
+    "bevcli.workshop.engines.write_model": "export_onnx quantize",
+    "bevcli.workshop.formats.convert": "convert",
     "bevcli.workshop.synth.drive": "render",
+    "bevcli.workshop.training.train": "train validate",
+    "bevcli.viewer.export": "export",
     "bevcli.viewer.recording_file": "show",
     "bevcli.viewer.views": "screenshot video",
 }
