@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import Session as Session, run as run
     from bevcli.recording.options import RecordingOptions as RecordingOptions
+    from bevcli.recording.record import record as record
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
+    from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
 
@@ -64,6 +66,7 @@ _NAMES = {
     "bevcli.inference.load": "Model load_model",
     "bevcli.inference.run": "Session run",
     "bevcli.recording.options": "RecordingOptions",
+    "bevcli.recording.record": "record",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
@@ -73,6 +76,7 @@ _NAMES = {
     "bevcli.workshop.batch.batch": "batch",
     "bevcli.workshop.engines.write_model": "export_onnx quantize",
     "bevcli.workshop.formats.convert": "convert",
+    "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.workshop.training.train": "train validate",
     "bevcli.viewer.export": "export",

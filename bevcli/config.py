@@ -16,12 +16,11 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from bevcli.errors import ConfigError
-from bevcli.geometry.object_classes import without_meshes
+from bevcli.geometry.object_classes import ClassSettings
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.published import read_sources
 from bevcli.registry import entries, known_models, load
 
 T = TypeVar("T")
@@ -83,8 +82,9 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
 
     tracking: the dataclass of the table TRACKING; None for no such table.
     """
-    portable = replace(config, class_settings=without_meshes(config.class_settings))
-    table = {ARCHITECTURE: config.architecture, **_plain(portable)}
+    portable = {name: replace(own, mesh=None) for name, own in config.class_settings.items()}
+    stated = {name: own for name, own in portable.items() if own != ClassSettings()}
+    table = {ARCHITECTURE: config.architecture, **_plain(replace(config, class_settings=stated))}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
 
 
@@ -121,16 +121,21 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
-    known, published = known_models(), {} if name.endswith(".toml") else read_sources()
+    models, published = known_models(), {}
+    has_own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file()
+    if not name.endswith(".toml") and not has_own_weights:  # a name of the package is not in the table
+        from bevcli.published import read_sources
+
+        published = read_sources()
     of_weights = published[name].model if name in published else ""
     file = model = of_weights or name
     if model.endswith(".toml"):
         if not Path(model).is_file():
-            raise ConfigError(f"{model}: file not found; known models are {', '.join(known)}")
+            raise ConfigError(f"{model}: file not found; known models are {', '.join(models)}")
         text = read_text(Path(model), TOML_BYTES, error=ConfigError)
     else:
-        if model not in known:
-            names = ", ".join(dict.fromkeys([*known, *published]))
+        if model not in models:
+            names = ", ".join(dict.fromkeys([*models, *published]))
             raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml')
         file = f"{model}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
@@ -158,14 +163,14 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
 def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
-    kinds: dict[str, Any] = {each.kind: each for each in typing.get_args(kind) if hasattr(each, "kind")}
+    kinds: dict[str, Any] = {part.kind: part for part in typing.get_args(kind) if hasattr(part, "kind")}
     if kinds and isinstance(value, dict):
         chosen = value.get("kind", next(iter(kinds)))
         if chosen not in kinds:
             raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {chosen!r:.60}')
         return _dataclass(value, kinds[chosen], file, f"{key}.")
     if typing.get_origin(kind) is Mapping and isinstance(value, dict):
-        return {name: _value(each, typing.get_args(kind)[1], file, f"{key}.{name}") for name, each in value.items()}
+        return {name: _value(part, typing.get_args(kind)[1], file, f"{key}.{name}") for name, part in value.items()}
     try:
         if _is_finite(value):
             return msgspec.convert(value, kind)
@@ -196,6 +201,6 @@ def _describe(kind: Any) -> str:
     return names.get(kind, "a table")
 
 
-def _nearest(key: str, known: list[str]) -> str:
-    match = difflib.get_close_matches(key, known, n=1)
-    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(known)}"
+def _nearest(key: str, keys: list[str]) -> str:
+    match = difflib.get_close_matches(key, keys, n=1)
+    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(keys)}"

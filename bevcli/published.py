@@ -6,7 +6,7 @@ folder, with the hashes that were computed at their first download.
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
@@ -24,7 +24,6 @@ HASHES = "hashes.json"
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
-DownloadReport = Callable[[int, int | None, str], None]  # bytes done, of how many or None, name and URL
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -187,10 +186,10 @@ def all_weights(folder: Path | None = None) -> dict[str, NamedWeights]:
 
 def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     """A name of the table of sources. Raises WeightsError for another one."""
-    known = all_weights(folder)
-    if name not in known:
-        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(known)})')
-    return known[name]
+    weights = all_weights(folder)
+    if name not in weights:
+        raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(weights)})')
+    return weights[name]
 
 
 def _read_hashes(folder: Path) -> dict[str, Known]:

@@ -16,6 +16,7 @@ Group = Literal[
     "bevcli.box_formats",
     "bevcli.label_formats",
     "bevcli.scores",
+    "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
     "bevcli.commands",

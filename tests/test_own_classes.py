@@ -110,7 +110,7 @@ def test_attributes_gates_and_types_follow_the_class_it_is_like() -> None:
     some = boxes(*NAMES)
     assert attributes_by_speed(some, CLASSES).tolist() == ["vehicle.moving", "vehicle.moving", "pedestrian.moving", ""]
     tracker = TrackerConfig(gates_m={"deer": 6.0}).for_classes(CLASSES)
-    assert tracker.gates_of(some.classes).tolist() == [3.0, 3.0, 2.0, 6.0]
+    assert [tracker.gates_m[name] for name in some.classes] == [3.0, 3.0, 2.0, 6.0]
     with pytest.raises(ValueError, match="has no class"):
         TrackerConfig(gates_m={"cow": 6.0}).for_classes(CLASSES)
     ahead = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]], float)

@@ -227,8 +227,8 @@ def _require(value: Any, flag: _Flag) -> None:
         except OSError:
             continue
         if reads == "path or name" and not Path(text).suffix and os.sep not in text:
-            names = [text] if complete is None else list(complete(""))
-            if text not in names:
+            if complete is not None and text not in complete(""):
+                names = sorted(complete(""))
                 near = difflib.get_close_matches(text, names, n=1)
                 hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(names)}, or a file"
                 raise InputError(f"{flag.yes} {text}: is unknown: {hint}")

@@ -1,23 +1,33 @@
 """The short commands of the core: `bevcli samples`, `viz`, `project-debug`, `eval` and `export`."""
 
 import json
+import shlex
 import shutil
+import tempfile
 import textwrap
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bevcli.cli.bridge import ExtensionsOf, FormatValues, Json, Part, Steps, argument, as_flags, print_note
+from bevcli.errors import InputError
 from bevcli.evaluation import EvaluationOptions, ExportOptions, score_options
-from bevcli.options import Option
+from bevcli.options import Option, defaults
 from bevcli.printing import counted, say
+from bevcli.recording.options import RecordingOptions
 from bevcli.rig import CheckOptions
+from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.writing import output_errors, write_whole
+
+if TYPE_CHECKING:
+    from bevcli.frame import Frame
+
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look", "eval": "Score", "export": "Score"}
 ERRORS_FOUND = 3  # exit code of `bevcli project-debug`
@@ -51,37 +61,111 @@ def samples(
 
 
 def viz(
-    recording: Annotated[Path, argument("A recording (.rrd), or the output folder of `bevcli run`.")],
+    shown: Annotated[
+        Path,
+        argument(
+            "A recording (.rrd), the output folder of `bevcli run`, or a drive, as `bevcli run` takes it.",
+            metavar="RECORDING|DRIVE",
+        ),
+    ],
     options: ViewOptions,
+    recording: Annotated[RecordingOptions, Part(only=("score",))],
+    source: SequenceOptions,
+    format_options: FormatValues,
 ) -> None:
-    """Show a recording in the viewer, or write an image, a video or a summary.
+    """Show a recording, or a drive with labels and boxes of any model; or write an image, a video or a summary.
 
-    The viewer opens if none of --summary, --screenshot and --video is given: in a window if there is a
+    The viewer opens if none of --summary, --screenshot, --video and --out is given: in a window if there is a
     display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
-    """
-    from bevcli.viewer.recording_file import open_recording, recording_in
 
-    if options.frame is not None and options.screenshot is None:
-        raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
-    recording = recording_in(recording)
+    A drive needs no model: its labels are shown, or with --boxes those against boxes of one or two models. The input
+    options and --score are for a drive.
+    """
+    from bevcli.viewer.recording_file import is_recording, recording_in
+
+    if options.frame is not None and options.screenshot is None and (options.summary or options.video or options.out):
+        raise typer.BadParameter("is only valid with --screenshot, or for the viewer", param_hint="--frame")
+    if not is_recording(shown):
+        _record_drive(shown, options, recording, source, format_options)
+        return
+    kinds = (ViewOptions, RecordingOptions, SequenceOptions, *option_classes())
+    usual = {name: value for kind in kinds for name, value in defaults(kind).items()}
+    for_drives = {
+        "boxes": options.boxes,
+        "out": options.out,
+        "score": recording.score,
+        **vars(source),
+        **format_options,
+    }
+    if given := [name for name, value in for_drives.items() if value != usual[name]]:
+        raise InputError(f"{shown}: is a recording, and `{given[0]}` is for a drive: remove it, or pass the drive")
+    show(recording_in(shown), options)
+
+
+def show(recording: Path, options: ViewOptions, name: Path | None = None) -> None:
+    """Show a recording, or write what the options name. name: for texts, in place of that of a temporary file."""
+    from bevcli.viewer.recording_file import open_recording
+
     with open_recording(recording) as file:
         if file != recording:
             say(f"note: {recording} is incomplete (its run was stopped or is still going)")
         if options.summary or options.screenshot or options.video:
-            _write_views(recording, file, options)
+            _write_views(recording, file, options, name or recording)
         else:
             _open_viewer(file, options)
 
 
-def _write_views(recording: Path, read_from: Path, options: ViewOptions) -> None:
-    """Write what the options name. read_from: the recording, or a repaired copy of it."""
+def _record_drive(
+    path: Path, options: ViewOptions, recording: RecordingOptions, source: SequenceOptions, format_options: FormatValues
+) -> None:
+    """Record a drive and boxes, and show the recording."""
+    from bevcli.cli.progress import Progress
+    from bevcli.cli.run import input_warnings
+    from bevcli.recording.record import names_of, record
+    from bevcli.sequences.open import open_sequence
+    from bevcli.viewer.recording_file import RECORDING, check_is_drive
+
+    check_is_drive(path)
+    if options.out is not None and options.out.suffix.lower() != ".rrd":
+        raise InputError(f"{options.out}: the file must end in .rrd")
+    boxes = names_of(options.boxes)
+    drive = open_sequence(path, source, **format_options)
+    indices = [stamp.index for stamp in drive.stamps]
+    if options.frame is not None and options.frame not in indices:
+        raise InputError(f"`frame={options.frame}`: the drive has frames {min(indices)} to {max(indices)}")
+    with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
+        file = options.out or Path(folder) / RECORDING
+        with Progress(len(drive.stamps), "frames", drive.notes) as progress:
+
+            def warn(frame: "Frame") -> None:
+                for warning in input_warnings(frame):
+                    progress.message(f"warning: {warning}")
+                progress.advance()
+
+            record(
+                drive,
+                boxes,
+                file,
+                score=recording.score,
+                class_map=source.class_map,
+                report=progress.message,
+                on_frame=warn,
+            )
+        if options.out is not None:
+            say(f"{file}: {counted(len(drive.stamps), 'frames')}; next: bevcli viz {shlex.quote(str(file))}")
+        if options.out is None or options.summary or options.screenshot or options.video:
+            show(file, options, path if options.out is None else file)
+
+
+def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: Path) -> None:
+    """Write what the options name. read_from: the recording, or a repaired copy of it. name: for texts."""
     from bevcli.cli.progress import Progress
     from bevcli.viewer.native import take_screenshot
     from bevcli.viewer.recording_reader import summarise
     from bevcli.viewer.video import frame_rate, write_video
 
     if options.summary:
-        say(summarise(recording, read_from))
+        say(summarise(recording, read_from).replace(str(recording), str(name), 1))
     if options.screenshot is not None:
         views = take_screenshot(read_from, options.screenshot, options.frame)
         say(f"{options.screenshot}: {len(views)} views")
@@ -97,9 +181,11 @@ def _open_viewer(recording: Path, options: ViewOptions) -> None:
     from bevcli.viewer.web import WebViewer, web_viewer_assets
 
     if display_is_there() and not options.web:
-        if show_window(recording):
+        if show_window(recording, options.frame):
             return
         say("note: the viewer's window did not open; use the browser instead")
+    if options.frame is not None:
+        say(f"note: in the browser, set the timeline to frame {options.frame}")
     viewer = WebViewer(web_viewer_assets(), recording, options.host, options.port)
     say(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
     viewer.serve()
@@ -151,7 +237,12 @@ def project_debug(
 
 
 def evaluate(
-    predictions: Annotated[Path, argument("predictions.json, the folder of a run, or a results_nusc.json.")],
+    predictions: Annotated[
+        list[Path],
+        argument(
+            "predictions.json, the folder of a run, or a results_nusc.json. Two are compared.", metavar="PREDICTIONS"
+        ),
+    ],
     ground_truth: Annotated[
         Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
@@ -165,11 +256,19 @@ def evaluate(
 
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
     runs a model on several drives and scores them together.
-    """
-    from bevcli.evaluation.evaluate import evaluate
 
-    scores = evaluate(
-        predictions,
+    With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
+    frames.
+    """
+    from bevcli.errors import InputError
+    from bevcli.evaluation.evaluate import evaluate
+    from bevcli.registry import load
+
+    if len(predictions) > 2:
+        raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
+    score: Callable[..., Any] = evaluate if len(predictions) == 1 else load("bevcli.comparisons", "boxes")
+    scores = score(
+        *predictions,
         ground_truth,
         options.max_range,
         options.count_missing,

@@ -76,7 +76,10 @@ class PlainCommand(TyperCommand):
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The options and the arguments, without hidden ones."""
         shown = [param for param in self.get_params(ctx) if not getattr(param, "hidden", False)]
-        return ["[OPTIONS]", *(piece.strip("{}") for param in shown for piece in param.get_usage_pieces(ctx))]
+        return [
+            "[OPTIONS]",
+            *(re.sub(r"^\{(.*)\}", r"\1", piece) for param in shown for piece in param.get_usage_pieces(ctx)),
+        ]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options by panels, last those without one."""

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     import rich.progress
 
     from bevcli.inference.load import Model
-    from bevcli.published import DownloadReport, NamedWeights
+    from bevcli.published import NamedWeights
+    from bevcli.weights import DownloadReport
     from bevcli.weights.fetch import FetchedWeights
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run

@@ -113,15 +113,22 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     return notes
 
 
-def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
-    """Warnings on missing images, results that are not finite, and gaps in time; the recording logs its own events."""
-    from bevcli.frame import StartReason
+def input_warnings(frame: "Frame") -> list[str]:
+    """Warnings on missing images and true boxes that were left out; the recording logs its own events."""
     from bevcli.geometry.boxes import IMPOSSIBLE
 
     where = f"frame {frame.stamp.index}"
     warnings = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if frame.impossible_boxes:
         warnings.append(f"{where}: {counted(frame.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
+    return warnings
+
+
+def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
+    """Those of the input, and warnings on results that are not finite and gaps in time."""
+    from bevcli.frame import StartReason
+
+    where, warnings = f"frame {frame.stamp.index}", input_warnings(frame)
     if prediction.failure:
         warnings.append(f"{where}: {prediction.failure}")
     if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:

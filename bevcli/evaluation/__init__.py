@@ -76,7 +76,7 @@ class Scorer:
     """What computes the scores of further results of a model, such as tracks, registered under `bevcli.scores`.
 
     Attributes:
-        options: a dataclass of options, which are False by default. One that is True turns the scorer on.
+        options: a dataclass of options, which are False or None by default. One with another value turns the scorer on.
         function: "module:function", imported when it is used. It takes the options and a `Compared`, and returns
             `ResultScores`. It raises InputError where a side lacks what is scored.
     """

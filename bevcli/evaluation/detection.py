@@ -116,11 +116,14 @@ class RecallCurve:
         above = self.precision[round(100 * config.min_recall) + 1 :] - config.min_precision
         return float(np.mean(np.maximum(above, 0))) / (1 - config.min_precision)
 
-    def mean_error(self, config: DetectionConfig, scores: Array, errors: Array) -> float:
+    def mean_error(self, config: DetectionConfig, scores: Array, errors: Array | None) -> float:
         """The running mean of an error, averaged over recalls from min_recall to the largest reached; 1 if none.
 
-        scores: (M,), of the M true positives, descending. errors: (M,), their errors; NaN is ignored.
+        scores: (M,), of the M true positives, descending. errors: (M,), their errors; NaN is ignored. None for an error
+        that is not defined, whose mean is NaN.
         """
+        if errors is None:
+            return math.nan
         first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
         if last < first:
             return 1.0
@@ -322,25 +325,32 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     }
     row = config.error_row
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
-    truths = part.ground_truth[part.matched[row][hits]]
-    kind = config.classes[part.name]
-    errors = _true_positive_errors(truths, part.predictions[hits], symmetric=kind.symmetric)
-    curve = curves[config.error_distance_m]
-    undefined = {*kind.undefined_errors, *unmeasured}
+    errors, curve = true_positive_errors(part, hits, config, unmeasured), curves[config.error_distance_m]
     return ClassScores(
         ground_truth_count=truth_count,
         prediction_count=int(part.counts[row].sum()),
         recall=len(hits) / truth_count if truth_count else float("nan"),
         aps={distance: curve.average_precision(config) for distance, curve in curves.items()},
-        errors={
-            name: float("nan") if name in undefined else curve.mean_error(config, scores[hits], values)
-            for name, values in errors.items()
-        },
+        errors={name: curve.mean_error(config, scores[hits], values) for name, values in errors.items()},
         curves=curves,
     )
 
 
-def _true_positive_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bool) -> dict[str, Array]:
+def true_positive_errors(
+    part: ClassMatches, hits: NDArray[np.int64], config: DetectionConfig, unmeasured: Iterable[str]
+) -> dict[str, Array | None]:
+    """The errors of the true positives of one class by the devkit's names, each (M,); None where not defined.
+
+    hits: (M,), indices of predictions that match a ground truth at the error distance. unmeasured: as in
+    `DetectionScores`.
+    """
+    kind = config.classes[part.name]
+    truths = part.ground_truth[part.matched[config.error_row][hits]]
+    errors = _pair_errors(truths, part.predictions[hits], symmetric=kind.symmetric)
+    return dict(errors) | dict.fromkeys((*kind.undefined_errors, *unmeasured))
+
+
+def _pair_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bool) -> dict[str, Array]:
     """The five errors of M matched pairs of one class, each (M,), by the devkit's names.
 
     trans_err: distance of the centres on the ground, metres.

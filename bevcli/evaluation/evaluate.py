@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pkgutil import resolve_name
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -141,7 +142,7 @@ def evaluate(
     version: str | None = None,
     split: str | None = None,
     class_map: Mapping[str, str] | None = None,
-    **results: bool,
+    **results: int | None,
 ) -> Scores:
     """Score predictions with the nuScenes detection metrics, and maps with IoU where both sides have them.
 
@@ -158,6 +159,7 @@ def evaluate(
         class_map: class names in the files -> the classes of the model, such as {"Lorry": "truck"}.
         results: further results to score. tracking=True: AMOTA and the metrics that come with it; both sides need
             identities ("instance"). map=True, motion=True and plan=True: lines of the map, forecasts and planned paths.
+            worst=5: the five frames with most missed, and those with most invented, boxes.
 
     Returns:
         The scores. Predictions without attributes get them from class and speed.
@@ -168,18 +170,45 @@ def evaluate(
         ConfigError: max_range is not positive.
         TypeError: `results` has an option that no scorer has.
     """
+    compared = read(
+        predictions, ground_truth, count_missing, scene=scene, version=version, split=split, class_map=class_map
+    )
+    return score(replace(compared, max_range_m=max_range), results)
+
+
+def read(
+    predictions: Path | str,
+    ground_truth: Path | str,
+    count_missing: bool = False,
+    *,
+    scene: str | None = None,
+    version: str | None = None,
+    split: str | None = None,
+    class_map: Mapping[str, str] | None = None,
+) -> inputs.Compared:
+    """Read predictions and ground truth, and match their frames. Arguments and errors are those of `evaluate`."""
     predicted = inputs.open_predictions(Path(predictions), class_map)
     classes = predicted.boxes.classes or NUSCENES_CLASSES
     truth = inputs.open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
     pairs = inputs.pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
     pairs = inputs.without_cycles_in_racks(pairs, truth.bicycle_racks)
+    selection = {key: value for key, value in (("scene", scene), ("version", version), ("split", split)) if value}
+    return inputs.Compared(pairs, classes, None, predicted, truth, selection=selection)
+
+
+def score(compared: inputs.Compared, results: Mapping[str, int | None] = MappingProxyType({})) -> Scores:
+    """Score what was read. results: those of `evaluate`, whose default range holds for a `max_range_m` of None."""
+    pairs, classes, max_range = compared.pairs, compared.classes, compared.max_range_m
+    predicted, truth = compared.predictions, compared.truth
+    assert predicted is not None
+    assert truth is not None
     model_range = _model_range_m(predicted, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     predicted_boxes, true_boxes = pairs.boxes
     detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(predicted, truth, pairs)
-    others = score_results(results, inputs.Compared(pairs, classes, limit, predicted, truth))
+    others = score_results(results, replace(compared, max_range_m=limit, detection=detection))
     notes = (
         *pairs.notes,
         *map_notes,
@@ -193,7 +222,7 @@ def evaluate(
     return Scores(detection, segmentation, others, notes, pairs=pairs)
 
 
-def score_results(values: Mapping[str, bool], compared: inputs.Compared) -> dict[str, ResultScores]:
+def score_results(values: Mapping[str, int | None], compared: inputs.Compared) -> dict[str, ResultScores]:
     """The scores that options ask for, by the name of their scorer. Raises InputError as `Scorer` says.
 
     values: by option.
@@ -292,11 +321,8 @@ def _model_range_m(
     predictions: inputs.ScoredInput, pairs: inputs.FramePairs, classes: Mapping[str, ObjectClass]
 ) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
-    stated = predictions.boxes.extras.get("range_m")
-    farthest = max(kind.range_m for kind in classes.values())
-    if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
-        return None
-    return float(stated)
+    stated, farthest = predictions.range_m, max(kind.range_m for kind in classes.values())
+    return stated if pairs.ego_pose_known and stated is not None and stated < farthest else None
 
 
 def _class_notes(

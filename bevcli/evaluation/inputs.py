@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.detection import DetectionScores
 from bevcli.evaluation.submission import is_submission, read_submission
-from bevcli.frame import FrameStamp, Sequence as Drive
+from bevcli.frame import Frame, FrameStamp, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
@@ -43,6 +44,12 @@ class ScoredInput:
     open_drive: Callable[[], Drive] | None = None
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
     impossible_boxes: int = 0
+
+    @property
+    def range_m(self) -> float | None:
+        """Distance to the end of the BEV grid of the model that made the predictions, metres; None if not stated."""
+        stated = self.boxes.extras.get("range_m")
+        return float(stated) if isinstance(stated, (int, float)) and stated > 0 else None
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
@@ -117,12 +124,30 @@ def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     frames, impossible = [], 0
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if frame.ground_truth is not None:
-            token = {"sample_token": frame.sample_token} if frame.sample_token else {}
-            frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
+            frames.append(_true_boxes(frame))
             impossible += frame.impossible_boxes
     if not frames:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
     return ScoredInput(BoxesFile("world", tuple(frames)), path, None, lambda: drive, impossible_boxes=impossible)
+
+
+def _true_boxes(frame: Frame) -> FrameBoxes:
+    token = {"sample_token": frame.sample_token} if frame.sample_token else {}
+    return FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth or Boxes3D.empty(), token)
+
+
+def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D | None], str]:
+    """The predictions for each frame of a drive in its world frame, and the key by which frames are matched.
+
+    Frames are matched as for scoring, and need no ground truth. None where the predictions lack a frame. Raises
+    InputError as `pair_frames`, and for boxes in the world frame where the drive has no poses.
+    """
+    if predictions.frame_of_reference == "world" and not drive.has_ego_motion:
+        raise InputError("the boxes are in the world frame, and the drive has no ego-motion (expected boxes in ego)")
+    frames = tuple(_true_boxes(drive.ground_truth_frame(place)) for place in range(len(drive.stamps)))
+    pairs = pair_frames(predictions, BoxesFile("world", frames))
+    found = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
+    return [found.get(stamp) for stamp in drive.stamps], pairs.matched_by
 
 
 @dataclass(frozen=True)
@@ -319,6 +344,8 @@ class Compared:
         classes: of the predictions, by name.
         max_range_m: distance from the ego vehicle beyond which nothing is scored; None for the range of each class.
         predictions, truth: with all their frames, and where they come from; None of frames in memory.
+        detection: the scores of the boxes; None where they are not computed.
+        selection: what was read of the ground truth: "scene", "version" and "split", where given.
     """
 
     pairs: FramePairs
@@ -326,3 +353,5 @@ class Compared:
     max_range_m: float | None
     predictions: ScoredInput | None = None
     truth: ScoredInput | None = None
+    detection: DetectionScores | None = None
+    selection: Mapping[str, str] = field(default_factory=dict)

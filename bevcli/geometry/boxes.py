@@ -258,7 +258,7 @@ def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64],
     rows = np.arange(len(centers))
     seconds = times_s[last] - times_s[first]
     longest = MAX_GAP_S * ((first != rows).astype(int) + (last != rows))
-    known = (seconds > 0) & (seconds <= longest)
+    is_short = (seconds > 0) & (seconds <= longest)
     with np.errstate(divide="ignore", invalid="ignore"):
         velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
-    return np.where(known[:, None], velocities, np.nan)
+    return np.where(is_short[:, None], velocities, np.nan)

@@ -149,12 +149,6 @@ def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) 
     return made
 
 
-def without_meshes(settings: Mapping[str, ClassSettings]) -> dict[str, ClassSettings]:
-    """The settings that mean the same on every machine; a class with none of them is left out."""
-    portable = {name: replace(own, mesh=None) for name, own in settings.items()}
-    return {name: own for name, own in portable.items() if own != ClassSettings()}
-
-
 def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
     """True for the ten classes with nuScenes' own settings: scores are then comparable to nuScenes'."""
     return {name: _scoring(kind) for name, kind in classes.items()} == {

@@ -70,7 +70,6 @@ class AttentionProbe(ExitStack):
             (temporal.attention.sampling, self._see_temporal_samples),
             (spatial.attention.sampling, self._see_spatial_samples),
             (spatial, self._see_hits),
-            (self._layer, self._see_layer),
         ):
             self.enter_context(module.register_forward_hook(see))
         # As in the plain model: faster classes compute no sampling locations.
@@ -81,6 +80,8 @@ class AttentionProbe(ExitStack):
 
     def _see_temporal_samples(self, _module: object, arguments: tuple[Any, ...], sampled: Tensor) -> None:
         cells = math.prod(arguments[1][0])  # of the one level, the BEV map
+        if arguments[4][0] > cells:  # without history both maps are the current one
+            return
         norms = sampled.detach().unflatten(0, (-1, 2, cells)).norm(dim=-1)  # (B, 2, Y·X)
         self.history_share = norms[:, 0] / norms.sum(1).clamp(min=1e-12)
 
@@ -93,10 +94,6 @@ class AttentionProbe(ExitStack):
         camera = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
         chosen = torch.isin(hits.cell, self.cells) & hits.is_seen
         self.spatial = SpatialSamples(camera[chosen], hits.cell[chosen], self._locations[chosen], self._weights[chosen])
-
-    def _see_layer(self, _module: object, arguments: tuple[Any, ...], _query: Tensor) -> None:
-        if arguments[2] is None:  # without history both maps are the current one
-            self.history_share = None
 
 
 def probe_cells(probes: tuple[tuple[float, float], ...], grid: BevGrid) -> Tensor:

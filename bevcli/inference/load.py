@@ -31,10 +31,10 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.published import DownloadReport, all_weights, named_weights, weights_folder
 from bevcli.registry import entries, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
+from bevcli.weights import DownloadReport
 
 DEFAULT_MODEL = "demo"
 WEIGHTS_SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
@@ -281,9 +281,10 @@ def load_model(
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
     tracker = tracker_of_table(contents, config, file)
-    path = chosen.weights
+    path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
-        path = _weights_of(name, chosen, report, ", or pass `untrained=True` to try the program with random weights")
+        untrained = ", or pass `untrained=True` to try the program with random weights"
+        path = bundled or _published(name, chosen, report, untrained)
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -294,7 +295,7 @@ def load_model(
         device,
         precision,
         path,
-        bundled=path is not None and chosen.weights is None and path == bundled_weights(name),
+        bundled=bundled is not None,
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
@@ -310,18 +311,21 @@ def weights_file(path_or_name: Path) -> Path:
     if path_or_name.suffix or path_or_name.is_file():
         return path_or_name
     if name not in known_models():
+        from bevcli.published import named_weights
+
         named_weights(name)  # raises WeightsError that lists the names
-    return _weights_of(name, ModelOptions(), lambda done, total, what: None)
+    return bundled_weights(name) or _published(name, ModelOptions())
 
 
-def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherwise: str = "") -> Path:
-    """The weights of a name: those of the package, downloaded ones, or with `fetch` ones that are downloaded now.
+def _published(
+    name: str, options: ModelOptions, report: DownloadReport = lambda done, total, what: None, otherwise: str = ""
+) -> Path:
+    """The published weights of a name: downloaded ones, or with `fetch` ones that are downloaded now.
 
     otherwise: ends the message of the WeightsError where there are none.
     """
-    bundled = bundled_weights(name)
-    if bundled is not None:
-        return bundled
+    from bevcli.published import all_weights, weights_folder
+
     named = all_weights(options.weights_dir).get(name)
     if named is not None and named.here is not None:
         return named.here
@@ -333,15 +337,12 @@ def _weights_of(name: str, options: ModelOptions, report: DownloadReport, otherw
         from bevcli.weights.fetch import fetch_weights
 
         return fetch_weights(named, report).path
+    elif options.weights_dir in (None, weights_folder().absolute()):
+        how = f"run `bevcli weights fetch {name}`, which downloads them"
     else:
-        how = f"run {_fetch_command(name, options)}, which downloads them"
+        folder = shlex.quote(str(options.weights_dir))
+        how = f"run `bevcli weights fetch {name} --weights-dir {folder}`, which downloads them"
     raise WeightsError(f"model {name} has no weights: {how}{otherwise}")
-
-
-def _fetch_command(name: str, options: ModelOptions) -> str:
-    if options.weights_dir in (None, weights_folder().absolute()):
-        return f"`bevcli weights fetch {name}`"
-    return f"`bevcli weights fetch {name} --weights-dir {shlex.quote(str(options.weights_dir))}`"
 
 
 def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -> TrackerConfig:

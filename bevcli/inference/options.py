@@ -1,5 +1,6 @@
 """ModelOptions: a model, its weights, and the device that it runs on."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -10,11 +11,12 @@ TORCH = "torch"  # the value of `engine` beside the registered engines
 EXPORTED_SUFFIX, FILE_ENGINE = ".onnx", "onnxruntime"  # of exported files, and the engine that runs them by default
 
 
-def complete_model(incomplete: str) -> list[str]:
-    """The known models and weights, for completion in a shell: typer keeps those that start with the text."""
+def complete_model(incomplete: str) -> Iterator[str]:
+    """The known models, then the published weights, for completion in a shell, where typer keeps those that fit."""
+    yield from known_models()
     from bevcli.published import read_sources
 
-    return sorted({*known_models(), *read_sources()})
+    yield from sorted(read_sources().keys() - set(known_models()))
 
 
 @options("Model")

@@ -56,7 +56,15 @@ class Preprocessor:
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
-        rig_facts = self._facts_of(frame.rig)
+        rig_facts = self._of_rig
+        if rig_facts is None or rig_facts.rig is not frame.rig:
+            bev_frame = self.config.bev_frame
+            model_rig = level_rig(frame.rig, bev_frame.height_m) if bev_frame.level else frame.rig
+            assignment = assign_cameras(frame.rig, self.config.cameras, self._chosen_cameras)
+            image = image_for_rig(frame.rig, self.config.image)
+            if self.pixels:
+                image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
+            rig_facts = self._of_rig = _OfRig(frame.rig, model_rig, assignment, image)
         frame = frame if frame.rig is rig_facts.model_rig else replace(frame, rig=rig_facts.model_rig)
         image, assignment = rig_facts.image, rig_facts.assignment
         names = assignment.cameras
@@ -91,18 +99,6 @@ class Preprocessor:
             has_image=torch.tensor([[name in frame.images for name in names]]),
             pixels=self.pixels,
         )
-
-    def _facts_of(self, rig: CameraRig) -> "_OfRig":
-        rig_facts = self._of_rig
-        if rig_facts is None or rig_facts.rig is not rig:
-            bev_frame = self.config.bev_frame
-            model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
-            assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
-            image = image_for_rig(rig, self.config.image)
-            if self.pixels:
-                image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
-            rig_facts = self._of_rig = _OfRig(rig, model_rig, assignment, image)
-        return rig_facts
 
 
 class _OfRig(NamedTuple):

@@ -121,14 +121,14 @@ class Runner:
                 later = self._usable(prepared, upcoming)
                 outputs, memory = self.model.step(prepared, state.memory, later)
                 last_layers, is_finite = read_back(outputs, prepared.images)
-                place = "" if is_finite else origin(self.model, lambda: self.model.step(prepared, state.memory, later))
+                part = "" if is_finite else origin(self.model, lambda: self.model.step(prepared, state.memory, later))
             if is_finite:
                 after = RunnerState(memory, frame.stamp)
                 fields = {"bev": outputs.bev[0], **self._decoded(last_layers, frame.stamp.index)}
                 fields["attention"] = None if probe is None else attention_view(probe, prepared, self.config)
                 fields["stage_seconds"] = self.clock.read()
             else:
-                after, fields = self._restarted(state), {"not_finite": place}
+                after, fields = self._restarted(state), {"not_finite": part}
         tracks, prediction = state.tracks, self._prediction(prepared, started_anew, **fields)
         if self.options.tracker is not None and not self._tracks:
             tracks, prediction = track(self.options.tracker, tracks, prediction)
@@ -279,7 +279,7 @@ def one_command(command: str, config: ModelConfig) -> Commands:
 
 
 def _known(command: str, config: ModelConfig) -> tuple[str, ...]:
-    known = next((names for kind, names in config.results.items() if kind.takes_command), ())
-    if not known:
+    commands = next((names for kind, names in config.results.items() if kind.takes_command), ())
+    if not commands:
         raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
-    return known
+    return commands

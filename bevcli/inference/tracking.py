@@ -67,11 +67,6 @@ class TrackerConfig:
             raise ValueError(f'gates_m.{min(unknown)}: the model has no class "{min(unknown)}"')
         return replace(self, gates_m={name: of_class.gate_m for name, of_class in classes.items()} | dict(self.gates_m))
 
-    def gates_of(self, classes: NDArray[np.str_]) -> Array:
-        """(N,) the gates of boxes of these classes (N,), metres."""
-        other = self.gates_m.get(OTHER, ObjectClass.gate_m)
-        return np.array([self.gates_m.get(name, other) for name in classes.tolist()], dtype=np.float64)
-
 
 @dataclass(frozen=True)
 class Tracks:
@@ -223,7 +218,9 @@ def _match(
         places = places + np.nan_to_num(tracks.velocities) * seconds[:, None]
     away = np.linalg.norm(boxes.centers[usable, None, :2] - places, axis=-1)  # (M, T)
     away[boxes.classes[usable, None] != tracks.classes] = np.inf
-    away[away > config.gates_of(boxes.classes[usable])[:, None]] = np.inf
+    other = config.gates_m.get(OTHER, ObjectClass.gate_m)
+    gates = [config.gates_m.get(name, other) for name in boxes.classes[usable].tolist()]
+    away[away > np.array(gates, dtype=np.float64)[:, None]] = np.inf
     for box, distances in zip(usable, away, strict=True):
         nearest = int(np.argmin(distances))
         if np.isfinite(distances[nearest]):

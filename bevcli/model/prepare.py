@@ -73,7 +73,12 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     if dtype != torch.float32:
         round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")
-    _check_finite(network)
+    for name, parameter in network.named_parameters():  # oneDNN's ReLU would turn NaN into zeros
+        if not torch.isfinite(parameter).all():
+            raise WeightsError(
+                f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
+                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32`"
+            )
     if device.type == "cuda":
         for name in methods_on_device(type(network)):
             network.stages = {"": "model"}  # a graph has no stages
@@ -150,16 +155,6 @@ class EfficientNetLiteByImage(EfficientNetLite):
         """As `Backbone.forward`."""
         by_image = [super(EfficientNetLiteByImage, self).forward(image) for image in images.split(1)]
         return [torch.cat(maps) for maps in zip(*by_image, strict=True)]
-
-
-def _check_finite(model: nn.Module) -> None:
-    """Raises WeightsError for a folded or cast weight with NaN or infinity: oneDNN's ReLU would turn it into zeros."""
-    for name, parameter in model.named_parameters():
-        if not torch.isfinite(parameter).all():
-            raise WeightsError(
-                f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
-                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32`"
-            )
 
 
 class RoundedLinear(nn.Module):

@@ -48,7 +48,7 @@ def rows_of_largest_images(
     rows = rows_by_yaw(yaws)
     one_row = (sum(rows, ()),)
     wide, narrow = (
-        min(width / max(map(len, each)), (height / len(each) - title_height) * aspect) for each in (one_row, rows)
+        min(width / max(map(len, layout)), (height / len(layout) - title_height) * aspect) for layout in (one_row, rows)
     )
     return one_row if wide >= narrow else rows
 
@@ -88,19 +88,10 @@ class Layout(rrb.Blueprint):
 
 def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:
     """The layout of a recording. follows: the viewer first shows the newest frame, else it plays from the first one."""
-    rig = recorded.drive.rig
-    titled = f" ({recorded.note})" if recorded.note else ""
-    middle = rrb.Horizontal(_scene(recorded, titled), _bev_tabs(recorded, titled), column_shares=[5, 3])
-    hidden = ("pillars",) if recorded.options.probes else ("pillars", "probes")
-    views_of = {}
-    for camera in rig.cameras:
-        name, sides = camera.name, ((0, camera.width), (0, camera.height))
-        overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
-        views_of[name] = flat_view(entities.camera(name), name, *sides, overrides=overrides)
-    rows = [rrb.Horizontal(*map(views_of.__getitem__, row), name="cameras") for row in camera_rows(rig)]
-    heights = camera_row_shares(rig)
-    shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
-    views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares)
+    views: rrb.Container = _views(recorded, "", ())
+    if names := tuple(recorded.layers):  # a tab for both models, and one for each
+        alone = [_views(recorded, name, tuple(other for other in names if other != name)) for name in names]
+        views = rrb.Tabs(_views(recorded, " · ".join(names), ()), *alone, active_tab=0)
     return Layout(
         rrb.Horizontal(views, _texts(recorded), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
         # Playback of "time" runs at the drive's own speed; `fps` is that of the timeline "frame".
@@ -129,11 +120,30 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
     return [min(share, LARGEST_CAMERAS_SHARE / len(rows)) for share in shares]
 
 
-def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
-    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", *entities.line_kinds())
+def _views(recorded: Recorded, title: str, hidden_layers: tuple[str, ...]) -> rrb.Vertical:
+    """The cameras above and below scene and BEV. hidden_layers: names of models whose boxes are hidden at first."""
+    rig, titled = recorded.drive.rig, f" ({recorded.note})" if recorded.note else ""
+    scene, bev = _scene(recorded, titled, hidden_layers), _bev_tabs(recorded, titled, hidden_layers)
+    hidden = ("pillars",) if recorded.options.probes else ("pillars", "probes")
+    views_of = {}
+    for camera in rig.cameras:
+        name, sides = camera.name, ((0, camera.width), (0, camera.height))
+        overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
+        overrides |= {entities.layer(entities.camera(name), layer): HIDDEN for layer in hidden_layers}
+        views_of[name] = flat_view(entities.camera(name), name, *sides, overrides=overrides)
+    rows = [rrb.Horizontal(*map(views_of.__getitem__, row), name="cameras") for row in camera_rows(rig)]
+    heights = camera_row_shares(rig)
+    shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
+    middle = rrb.Horizontal(scene, bev, column_shares=[5, 3])
+    return rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares, name=title or None)
+
+
+def _scene(recorded: Recorded, titled: str, hidden_layers: tuple[str, ...]) -> rrb.Spatial3DView:
+    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", entities.MODELS, *entities.line_kinds())
     overlays = [entities.overlay(name, kind) for name in recorded.drive.rig.names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]
+    hidden += [entities.layer(entities.WORLD, layer) for layer in hidden_layers]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
         contents=[f"/{entities.WORLD}/**", *(f"- /{overlay}/**" for overlay in overlays)],
@@ -148,19 +158,19 @@ def _scene(recorded: Recorded, titled: str) -> rrb.Spatial3DView:
     )
 
 
-def _bev_tabs(recorded: Recorded, titled: str) -> rrb.Tabs:
-    margin = min(VIEW_MARGIN_M, recorded.model.config.bev_grid.nearest_side_m)
+def _bev_tabs(recorded: Recorded, titled: str, hidden_layers: tuple[str, ...]) -> rrb.Tabs:
+    margin = min(VIEW_MARGIN_M, recorded.grid.nearest_side_m if recorded.grid else VIEW_MARGIN_M)
 
     features, history, segmentation = entities.BEV_FEATURES, entities.BEV_HISTORY, entities.BEV_SEGMENTATION
-    hidden = {
-        f"BEV{titled}": (features, history),
-        "BEV features": (history, segmentation),
-        "History weight": (features, segmentation),
-    }
+    hidden = {f"BEV{titled}": (features, history)}
+    if recorded.config is not None:
+        hidden |= {"BEV features": (history, segmentation), "History weight": (features, segmentation)}
+    overrides = {entities.layer(entities.BEV, layer): HIDDEN for layer in hidden_layers}
     tabs: list[rrb.View] = []
     for name, without in hidden.items():
         contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
-        tabs.append(flat_view(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents))
+        ranges = (-margin, margin), (-margin, margin)
+        tabs.append(flat_view(entities.BEV, name, *ranges, contents=contents, overrides=overrides))
     if recorded.drive.facts.geo_origin is not None:
         tabs.append(
             rrb.MapView(
@@ -176,11 +186,10 @@ def _bev_tabs(recorded: Recorded, titled: str) -> rrb.Tabs:
 
 def _texts(recorded: Recorded) -> rrb.Vertical:
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-    curves = {
-        "Speed": entities.SPEED_CURVE,
-        "Boxes per class": entities.BOX_CURVES,
-        "Seconds per stage": entities.STAGE_CURVES,
-    }
+    counted = "Boxes per model" if recorded.layers else "Boxes per class"
+    curves = {"Speed": entities.SPEED_CURVE, counted: entities.BOX_CURVES}
+    if recorded.config is not None:
+        curves["Seconds per stage"] = entities.STAGE_CURVES
     plots = [rrb.TimeSeriesView(origin=entity, name=name, plot_legend=corner) for name, entity in curves.items()]
     columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)

@@ -10,7 +10,6 @@ Colours are RGB, 0 to 255. rerun takes half a second to import, and is imported 
 
 import colorsys
 from collections.abc import Iterable, Mapping
-from functools import cache
 from itertools import cycle
 
 import cv2
@@ -34,6 +33,7 @@ BOXES = "world/boxes"
 VELOCITY = "world/boxes/velocity"
 FALSE_BOXES = "world/boxes/false"
 DUPLICATES = "world/boxes/duplicate"
+MODELS = "models"  # a kind of boxes: two models that are compared, by name
 TRACKS = "world/tracks"
 GROUND_TRUTH = "world/ground_truth"
 MISSED = "world/ground_truth/missed"
@@ -74,6 +74,7 @@ OTHER_COLOR: Color = (128, 132, 140)  # ground truth of a class that is not amon
 MISSED_COLOR: Color = (255, 45, 85)
 FALSE_COLOR: Color = (255, 45, 85)
 EGO_COLOR: Color = (90, 200, 250)
+LAYER_COLORS: tuple[Color, Color] = ((255, 158, 44), (178, 130, 255))  # two models: orange and violet
 STAGE_COLORS: tuple[Color, ...] = (
     (96, 165, 255), (255, 158, 44), (70, 222, 190), (240, 108, 190), (245, 222, 90), (178, 130, 255), (186, 222, 92),
 )  # fmt: skip
@@ -111,6 +112,13 @@ def track(class_name: str, identity: str) -> str:
     import rerun as rr
 
     return f"{TRACKS}/{rr.escape_entity_path_part(f'{class_name}_{identity}')}"
+
+
+def layer(root: str, name: str) -> str:
+    """The entity of the boxes of one of two models, such as "bev/models/a". root: WORLD, BEV or that of a camera."""
+    import rerun as rr
+
+    return f"{root}/{MODELS}/{rr.escape_entity_path_part(name)}"
 
 
 def class_mesh(class_name: str) -> str:
@@ -154,12 +162,6 @@ def map_colors(
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
     """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
     indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
-    return _table(name).take(indices, axis=0)
-
-
-@cache
-def _table(name: str) -> NDArray[np.uint8]:
-    """(256, 3) RGB, the colours of one of OpenCV's colour maps."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
-    colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
-    return np.ascontiguousarray(colors, dtype=np.uint8)
+    colors = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]  # (256, 3) RGB
+    return np.asarray(colors.take(indices, axis=0), dtype=np.uint8)

@@ -19,10 +19,11 @@ from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_boxes, log_cameras, log_static
 from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
-from bevcli.recording.log_cameras import PosedCamera
+from bevcli.recording.log_cameras import ImageLayer, PosedCamera
 
 Features = NDArray[np.float32]
 PosedCameras = tuple[PosedCamera, ...]
+FileBoxes = Sequence[Boxes3D | None]  # of each file, in the world frame; None where it lacks the frame
 Ranges = tuple[tuple[float, float], tuple[float, float]]  # of x and of y, bev frame, metres
 SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
 FITTED_ON = 2  # frames
@@ -32,6 +33,8 @@ GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on
 PROBE_COLOR: Color = (255, 80, 220)
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
 FUTURES_OPACITY, FUTURES_WIDTH = 230, 1.0  # of 255; points of the user interface
+# Has all columns of tracks, so that the trails of the frame before are cleared.
+NO_BOXES = replace(Boxes3D.empty(), scores=np.zeros(0), instances=np.zeros(0, np.str_))
 ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
 
 
@@ -54,6 +57,44 @@ class FrameLogState:
     tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
 
 
+@dataclass(frozen=True)
+class _Place:
+    """The frames of reference of one frame's boxes.
+
+    Attributes:
+        moved: (4, 4) from the sequence's world into the recording's world.
+        pose: of the vehicle in the sequence's world.
+        ego_from_bev: (4, 4).
+    """
+
+    moved: Array
+    pose: Pose
+    ego_from_bev: Array
+
+    @property
+    def world_from_bev(self) -> Array:
+        """(4, 4) into the recording's world."""
+        return self.moved @ self.pose.matrix @ self.ego_from_bev
+
+    def in_bev(self, boxes: Boxes3D) -> Boxes3D:
+        """Boxes of the sequence's world in the bev frame."""
+        return boxes.transformed(self.moved).transformed(inverse(self.world_from_bev))
+
+    def away(self, boxes: Boxes3D) -> Array:
+        """(N,) distances on the ground from the vehicle to boxes of the bev frame, metres."""
+        in_ego = boxes.transformed(self.pose.matrix @ self.ego_from_bev).centers[:, :2]
+        return np.asarray(np.linalg.norm(in_ego - self.pose.matrix[:2, 3], axis=-1))
+
+    def within(self, boxes: Boxes3D, ranges_m: Mapping[str, float]) -> NDArray[np.bool_]:
+        """(N,) bool, the boxes of the bev frame that are nearer than the range of their class."""
+        return np.asarray(self.away(boxes) < [ranges_m.get(name, 0.0) for name in boxes.classes.tolist()])
+
+    def labels(self, boxes: Boxes3D, texts: list[str], count: int) -> list[str]:
+        """The texts of the boxes nearest to the vehicle, at most `count`; "" for others. boxes: in the bev frame."""
+        near = set(np.argsort(self.away(boxes))[:count].tolist())
+        return [text if i in near else "" for i, text in enumerate(texts)]
+
+
 class FrameLog:
     """Logs frames into a stream of rerun, in order. resume: the state from which the log goes on."""
 
@@ -63,8 +104,7 @@ class FrameLog:
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
-        object_classes = recorded.model.config.object_classes
-        self._with_meshes = [name for name, settings in object_classes.items() if settings.mesh]
+        self._with_meshes = [name for name, settings in recorded.object_classes.items() if settings.mesh]
         self._images = log_cameras.CameraImages(stream, self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
         # Its stamps are predictions.
@@ -88,8 +128,9 @@ class FrameLog:
         for encoder in self._images.encoders.values():
             encoder.close()
 
-    def log(self, frame: Frame, prediction: Prediction) -> None:
-        """Logs one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
+    def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+        """See `Recording.log`."""
+        prediction = found if isinstance(found, Prediction) else None
         stream, is_first = self._stream, self._kept.world_from_ego is None
         if self._kept.origin is None:  # the recording's world frame has its origin at the first frame's ego position
             self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
@@ -105,20 +146,18 @@ class FrameLog:
             name = posed.camera.name
             log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
             self._images.log(name, frame.images.get(name))
-        self._log_boxes(frame, prediction, moved, cameras)
-        if self._recorded.model.config.results:
-            self._log_results(prediction, moved, cameras)
+        self._log_boxes(frame, found, moved, cameras)
         if is_first:
-            stages, classes, bright = list(prediction.stage_seconds), self._recorded.classes, entities.STAGE_COLORS
-            colors = [bright[i % len(bright)] for i in range(len(stages))]
-            stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
-            of_classes = rr.SeriesLines(names=list(classes), colors=list(classes.values()))
-            stream.log(entities.BOX_CURVES, of_classes, static=True)
+            counted = self._recorded.layers or self._recorded.classes
+            lines = rr.SeriesLines(names=list(counted), colors=list(counted.values()))
+            stream.log(entities.BOX_CURVES, lines, static=True)
             stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
-        seconds = np.array(list(prediction.stage_seconds.values()))
-        log(stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
-        self._log_events(frame, prediction)
-        if self._options.shows_internals:
+        if prediction is not None:
+            if self._recorded.results:
+                self._log_results(prediction, moved, cameras)
+            self._log_stages(prediction, is_first=is_first)
+        self._log_events(frame, found)
+        if prediction is not None and self._options.shows_internals:
             self._log_internals(frame, prediction, moved, cameras)
         self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
 
@@ -163,47 +202,100 @@ class FrameLog:
             line = components(rr.LineStrips3D, strips=way, colors=entities.EGO_COLOR, radii=0.06)
             log(stream, entities.TRAJECTORY, line)
 
-    def _log_boxes(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+    def _log_boxes(self, frame: Frame, found: Prediction | FileBoxes, moved: Array, cameras: PosedCameras) -> None:
+        """Writes the boxes and the ground truth of a frame."""
+        recorded, files = self._recorded, self._recorded.files
+        if isinstance(found, Prediction):
+            place = _Place(moved, found.world_from_ego, found.ego_from_bev)
+            sides, grid = [found.boxes], found.grid
+        else:
+            place = _Place(moved, frame.world_from_ego, frame.rig.ego_from_bev)
+            sides, grid = [place.in_bev(boxes) if boxes else NO_BOXES for boxes in found], None
+        sides = [boxes.scored(self._options.score) for boxes in sides]
+        truth = None if frame.ground_truth is None else place.in_bev(frame.ground_truth)
+        truth = None if truth is None else log_boxes.detectable(truth, grid)
+        if files is not None and not files.names:  # labels alone are drawn as boxes
+            sides, truth = [truth or NO_BOXES], None
+        marks = log_boxes.false_and_duplicate(sides[0], None)
+        missed = np.zeros(0 if truth is None else len(truth), dtype=bool)
+        is_known = isinstance(found, Prediction) or all(boxes is not None for boxes in found)
+        # Random boxes match nothing: a scene all in red would be useless.
+        if truth is not None and is_known and not recorded.layers and not recorded.model.untrained:
+            marks = self._marks(sides[0], truth, place)
+            missed = ~marks.found & ~log_boxes.other_classes(truth, recorded.classes)
+        if recorded.layers:
+            drawn = [self._log_layer(*layer, place) for layer in zip(recorded.layers.items(), sides, strict=True)]
+            none = log_boxes.false_and_duplicate(NO_BOXES, None)
+            log_boxes.log_boxes_3d(self._stream, NO_BOXES, np.zeros((0, 8, 3)), none, {}, [])
+            counts = list(map(len, sides))
+        else:
+            drawn = [self._log_shown(frame.stamp, sides[0], marks, place)]
+            counts = [(sides[0].classes == name).sum() for name in recorded.classes]
+        if truth is not None:
+            drawn.append(self._log_truth(truth, missed, place))
+        log_cameras.log_boxes_in_images(self._stream, cameras, drawn)
+        log(self._stream, entities.BOX_CURVES, components(rr.Scalars, scalars=np.array(counts)))
+
+    def _marks(self, shown: Boxes3D, truth: Boxes3D, place: _Place) -> log_boxes.Marks:
+        """The marks of boxes, both in the bev frame: of a model all over its grid, of a file where it is scored."""
+        files = self._recorded.files
+        if files is None:
+            return log_boxes.false_and_duplicate(shown, truth)
+        return log_boxes.marks_within(shown, truth, *(place.within(side, files.ranges_m) for side in (shown, truth)))
+
+    def _log_truth(self, truth: Boxes3D, missed: NDArray[np.bool_], place: _Place) -> ImageLayer:
+        """Writes ground truth (M, bev frame) into the scene and the BEV view; returns its drawing in the images."""
+        other = log_boxes.other_classes(truth, self._recorded.classes)
+        in_world, colors = truth.transformed(place.world_from_bev), log_boxes.ground_truth_colors(~missed, other)
+        log_boxes.log_ground_truth(self._stream, in_world, truth.corners(), ~missed, colors)
+        return ImageLayer("ground_truth", in_world.corners(), colors, width=0.6, order=20)
+
+    def _log_layer(self, layer: tuple[str, Color], shown: Boxes3D, place: _Place) -> ImageLayer:
+        """Writes the boxes of one of two models, a name and a colour; returns their drawing in the images."""
+        (name, color), in_world = layer, shown.transformed(place.world_from_bev)
+        texts = log_cameras.box_labels(shown)
+        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE // 2)
+        log_boxes.log_layer(self._stream, name, in_world, shown.corners(), color, labels)
+        colors = np.tile(np.array(color, np.uint8), (len(shown), 1))
+        return ImageLayer(entities.layer("", name)[1:], in_world.corners(), colors, texts)
+
+    def _log_shown(self, stamp: FrameStamp, shown: Boxes3D, marks: log_boxes.Marks, place: _Place) -> ImageLayer:
+        """Writes the boxes (N, bev frame) of one model, or labels alone; returns their drawing in the images."""
         stream, classes = self._stream, self._recorded.classes
-        shown = prediction.boxes.scored(self._options.score)
-        moved_from_ego = moved @ prediction.world_from_ego.matrix
-        world_from_bev = moved_from_ego @ prediction.ego_from_bev
-        bev_from_world = inverse(world_from_bev)
-        marks, drawn_truth = log_boxes.false_and_duplicate(shown, None), None
-        if frame.ground_truth is not None:
-            truth = frame.ground_truth.transformed(moved).transformed(bev_from_world)
-            truth = log_boxes.detectable(truth, prediction.grid)
-            other = log_boxes.other_classes(truth, classes)
-            found = np.ones(len(truth), dtype=bool)
-            if not self._recorded.model.untrained:  # random boxes match nothing: a scene all in red would be useless
-                marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | other
-            in_world, colors = truth.transformed(world_from_bev), log_boxes.ground_truth_colors(found, other)
-            log_boxes.log_ground_truth(stream, in_world, truth.corners(), found, colors)
-            drawn_truth = in_world.corners(), colors
-        in_world, colors = shown.transformed(world_from_bev), log_boxes.box_colors(shown, classes)
-        corners, texts = in_world.corners(), log_cameras.box_labels(shown)
-        away = np.linalg.norm(in_world.centers[:, :2] - moved_from_ego[:2, 3], axis=-1)
-        near = set(np.argsort(away)[: log_boxes.LABELS_IN_SCENE].tolist())
-        labels = [text if i in near else "" for i, text in enumerate(texts)]
+        in_world, colors = shown.transformed(place.world_from_bev), log_boxes.box_colors(shown, classes)
+        files = self._recorded.files
+        is_label = files is not None and not files.names  # the names of labelled objects are long
+        corners, texts = (
+            in_world.corners(),
+            log_cameras.box_labels(replace(shown, instances=None) if is_label else shown),
+        )
+        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE)
         log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
         for name in self._with_meshes:
             log_boxes.log_class_mesh(stream, name, in_world[in_world.classes == name])
         log_boxes.log_boxes_bev(stream, shown, shown.corners(), marks, colors)
-        log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, frame.stamp, bev_from_world)
+        bev_from_world = inverse(place.world_from_bev)
+        log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, stamp, bev_from_world)
         if self._geo_origin is not None:
-            centers = apply(prediction.world_from_ego.matrix @ prediction.ego_from_bev, shown.centers)
+            centers = apply(place.pose.matrix @ place.ego_from_bev, shown.centers)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, centers, colors if len(shown) else None)
-        log_cameras.log_boxes_in_images(stream, cameras, corners, colors, texts, drawn_truth)
-        counts = np.array([(shown.classes == name).sum() for name in classes])
-        log(stream, entities.BOX_CURVES, components(rr.Scalars, scalars=counts))
+        return ImageLayer("boxes", corners, colors, texts)
+
+    def _log_stages(self, prediction: Prediction, *, is_first: bool) -> None:
+        """Writes the seconds of each stage of the model."""
+        if is_first:
+            stages, bright = list(prediction.stage_seconds), entities.STAGE_COLORS
+            colors = [bright[i % len(bright)] for i in range(len(stages))]
+            self._stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
+        seconds = np.array(list(prediction.stage_seconds.values()))
+        log(self._stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
 
     def _log_results(self, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
         """Writes the results and futures of a model that has further results."""
         score, moved_from_ego = self._options.score, moved @ prediction.world_from_ego.matrix
         world_from_bev = moved_from_ego @ prediction.ego_from_bev
         ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(moved_from_ego))
-        for kind, names in self._recorded.model.config.results.items():
+        for kind, names in self._recorded.results.items():
             result = result_of(kind, prediction.results)
             lines = GroundLines() if result is None else result.drawn(ground, names, score)
             log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
@@ -211,19 +303,24 @@ class FrameLog:
         futures = future_lines(shown, self._recorded.classes)
         log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
-    def _log_events(self, frame: Frame, prediction: Prediction) -> None:
+    def _log_events(self, frame: Frame, found: Prediction | FileBoxes) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
             self.event(log_static.WARNINGS[self._recorded.note], "WARN")
         where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
-        if prediction.started_anew:
+        if isinstance(found, Prediction) and found.started_anew:
             scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
-            self.event(f"{where}: no history: {prediction.started_anew}{scene}")
+            self.event(f"{where}: no history: {found.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
             self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
-        if prediction.failure:
-            self.event(f"{where}: {prediction.failure}", "ERROR" if prediction.not_finite else "WARN")
+        if isinstance(found, Prediction):
+            if found.failure:
+                self.event(f"{where}: {found.failure}", "ERROR" if found.not_finite else "WARN")
+            return
+        for name, boxes in zip(self._recorded.files.names if self._recorded.files else (), found, strict=True):
+            if boxes is None:
+                self.event(f"{where}: {name} does not have this frame", "WARN")
 
     def _log_internals(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
         """Writes pillars, segmentation, BEV features, history weights and probes."""

@@ -33,11 +33,15 @@ ABOVE_GROUND_M = 0.05
 TRAIL_WIDTH = ui_points(1.2)
 
 
-def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
-    """The ground-truth boxes, in the bev frame, that a model can find: inside its grid, with sensor points if known."""
-    inside = (grid.cell_of(ground_truth.centers[:, :2]) >= 0).all(-1)
+def detectable(ground_truth: Boxes3D, grid: BevGrid | None) -> Boxes3D:
+    """The ground-truth boxes, in the bev frame, that a model can find: inside its grid, with sensor points if known.
+
+    grid: None where no model is known.
+    """
+    everywhere = np.ones(len(ground_truth), dtype=bool)
+    inside = everywhere if grid is None else (grid.cell_of(ground_truth.centers[:, :2]) >= 0).all(-1)
     points = ground_truth.num_points
-    seen = np.ones(len(ground_truth), dtype=bool) if points is None else points != 0
+    seen = everywhere if points is None else points != 0
     return ground_truth[inside & seen]
 
 
@@ -71,6 +75,16 @@ def false_and_duplicate(predictions: Boxes3D, ground_truth: Boxes3D | None) -> M
     near = (away < MATCH_DISTANCE_M) & (predictions.classes[:, None] == truths.classes)
     duplicate = ~true & (marked | near.any(-1))
     return Marks(~true & ~duplicate, duplicate, found)
+
+
+def marks_within(
+    predictions: Boxes3D, ground_truth: Boxes3D, near: NDArray[np.bool_], near_truth: NDArray[np.bool_]
+) -> Marks:
+    """The marks of the boxes that are scored, near (N,) and near_truth (M,); ground truth beyond counts as found."""
+    inside = false_and_duplicate(predictions[near], ground_truth[near_truth])
+    marks = Marks(np.zeros_like(near), np.zeros_like(near), np.ones_like(near_truth))
+    marks.false[near], marks.duplicate[near], marks.found[near_truth] = inside
+    return marks
 
 
 def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -160,6 +174,19 @@ def log_boxes_bev(
     ):
         flat = (strips[..., :2] * (1, -1)).astype(np.float32)
         log(stream, entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
+
+
+def log_layer(
+    stream: rr.RecordingStream, name: str, boxes: Boxes3D, corners_bev: Array, color: Color, labels: list[str]
+) -> None:
+    """Writes the boxes of one of two models, all in its colour, into the scene and into the BEV view.
+
+    boxes: N in the recording's world. corners_bev: (N, 8, 3) in the bev frame. labels: of the N boxes, "" for none.
+    """
+    row = _solid(boxes, colors=color, labels=labels, show_labels=True, radii=THICK)
+    log(stream, entities.layer(entities.WORLD, name), row | any_values(name=boxes.classes))
+    outlines = components(rr.LineStrips2D, strips=footprints(corners_bev), colors=color, radii=THICK, draw_order=30)
+    log(stream, entities.layer(entities.BEV, name), outlines)
 
 
 def other_classes(truth: Boxes3D, classes: Iterable[str]) -> np.ndarray:

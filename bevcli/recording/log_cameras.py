@@ -49,6 +49,27 @@ class PosedCamera:
 
 
 @dataclass(frozen=True)
+class ImageLayer:
+    """Boxes that are drawn into the images.
+
+    Attributes:
+        kind: of their overlay, see `bevcli.recording.entities.overlay`.
+        corners: (N, 8, 3) in the recording's world.
+        colors: (N, 3) uint8.
+        texts: N labels; None for none.
+        width: of the lines, in points of the user interface.
+        order: boxes with a higher one are drawn above others.
+    """
+
+    kind: str
+    corners: Array
+    colors: NDArray[np.uint8]
+    texts: list[str] | None = None
+    width: float = 1.0
+    order: int = 30
+
+
+@dataclass(frozen=True)
 class ImageLines:
     """Lines in an image.
 
@@ -66,24 +87,18 @@ def lines_in_images(corners: Array, cameras: Sequence[PosedCamera]) -> list[Imag
 
     corners: (N, 8, 3) of the boxes in the recording's world.
     """
-    of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])
-    camera, before = np.nonzero((of_cameras[..., 2] >= NEAR_CLIP_M).any(-1) & ~_are_beside(of_cameras, cameras))
+    of_cameras = np.stack([apply(posed.camera_from_world, corners) for posed in cameras])  # (C, N, 8, 3)
+    # A side of an undistorted image is a plane through the camera: boxes beyond it, by a pixel at least, are left out.
+    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
+    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
+    pixels, depth = of_cameras @ intrinsics[:, None], of_cameras[..., 2:]  # pixels times depth, (C, N, 8, 2)
+    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
+    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
+    outside = beside.any(-1) & is_straight[:, None]
+    camera, before = np.nonzero((depth[..., 0] >= NEAR_CLIP_M).any(-1) & ~outside)
     edges = of_cameras[camera, before][:, _EDGES]  # (K, 14, 2, 3)
     counts = np.bincount(camera, minlength=len(cameras)) * len(_EDGES)
     return cut_to_images(edges.reshape(-1, 2, 3), np.repeat(before, len(_EDGES)), counts, cameras)
-
-
-def _are_beside(corners: Array, cameras: Sequence[PosedCamera]) -> NDArray[np.bool_]:
-    """(C, N) bool: boxes that project to one side of the image as a whole, by a pixel at least; never with distortion.
-
-    corners: (C, N, 8, 3) in the frame of each camera. A side of the image is a plane through the camera.
-    """
-    intrinsics = np.stack([posed.camera.intrinsics[:2].T for posed in cameras])
-    sizes = np.array([(posed.camera.width + 1, posed.camera.height + 1) for posed in cameras])[:, None, None]
-    pixels, depth = corners @ intrinsics[:, None], corners[..., 2:]  # pixels times depth, (C, N, 8, 2)
-    beside = (pixels < -depth).all(2) | (pixels > sizes * depth).all(2)  # (C, N, 2): left or right, above or below
-    is_straight = np.array([posed.camera.distortion is None for posed in cameras])
-    return beside.any(-1) & is_straight[:, None]
 
 
 def cut_to_images(
@@ -263,33 +278,27 @@ class CameraImages:
 
 
 def log_boxes_in_images(
-    stream: rr.RecordingStream,
-    cameras: Sequence[PosedCamera],
-    corners: Array,
-    colors: NDArray[np.uint8],
-    texts: list[str],
-    truth: tuple[Array, NDArray[np.uint8]] | None,
+    stream: rr.RecordingStream, cameras: Sequence[PosedCamera], layers: Sequence[ImageLayer]
 ) -> None:
-    """Draws predicted boxes with labels, and ground-truth boxes, into the images.
-
-    corners: (N, 8, 3) in the recording's world. colors: (N, 3). texts: N labels. truth: corners (M, 8, 3) and colours
-    (M, 3) of ground-truth boxes; None without ground truth.
-    """
-    true_corners, true_colors = (corners[:0], colors[:0]) if truth is None else truth
-    all_corners, all_colors = np.concatenate([corners, true_corners]), np.concatenate([colors, true_colors])
-    for posed, lines in zip(cameras, lines_in_images(all_corners, cameras), strict=True):
-        camera, count = posed.camera, int(np.searchsorted(lines.owners, len(corners)))
-        parts = [("boxes", slice(0, count), 1.0, 30)]
-        if truth is not None:
-            parts.append(("ground_truth", slice(count, None), 0.6, 20))
-        for kind, part, width, order in parts:
-            segments, own, radii = lines.segments[part], all_colors[lines.owners[part]], ui_points(width)
-            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=order)
-            log(stream, entities.overlay(camera.name, kind), strips)
-        predicted = ImageLines(lines.segments[:count], lines.owners[:count])
+    """Draws boxes, and the labels of those that have some, into the images. Layers with labels come first."""
+    corners, colors = (np.concatenate([getattr(each, part) for each in layers]) for part in ("corners", "colors"))
+    texts = [text for each in layers for text in each.texts or ()]
+    starts = np.cumsum([0, *(len(each.corners) for each in layers)])
+    for posed, lines in zip(cameras, lines_in_images(corners, cameras), strict=True):
+        camera, ends = posed.camera, np.searchsorted(lines.owners, starts).tolist()
+        labelled = int(np.searchsorted(lines.owners, len(texts)))
+        predicted = ImageLines(lines.segments[:labelled], lines.owners[:labelled])
         positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
-        labels = labels_2d(positions, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
-        log(stream, entities.overlay(camera.name, "boxes/labels"), labels)
+        for i, each in enumerate(layers):
+            part, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, each.kind)
+            segments, own, radii = lines.segments[part], colors[lines.owners[part]], ui_points(each.width)
+            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=each.order)
+            log(stream, entity, strips)
+            if each.texts is not None:
+                chosen = (owners >= starts[i]) & (owners < starts[i + 1])
+                names, own = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
+                labels = labels_2d(positions[chosen], names, colors=own, draw_order=each.order + 1)
+                log(stream, f"{entity}/labels", labels)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -12,10 +12,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevcli._version import __version__
-from bevcli.frame import DriveFacts, FrameStamp
+from bevcli.frame import DriveFacts, FrameResult, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.object_classes import Color, hex_of_color
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass, hex_of_color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
@@ -34,6 +34,15 @@ RING_STEP_M = 10
 DEFAULT_RANGE_M = 50.0  # of the range rings without a model
 FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
 PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
+LABELS_ALONE = """\
+- **Labels** have the colour of their class. The front face is crossed; from above, a line points to the front.
+- **Trails** are the last 5 s of a labelled object and, fainter, the next second at its velocity.
+"""
+TWO_MODELS = """\
+- **Boxes** have the colour of their model, that of the legend. The front face is crossed; from above, a line points to
+  the front. The first tab shows both models, each further one a model alone.
+- **Ground truth** is pale.
+"""
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
 - **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
@@ -42,6 +51,8 @@ HOW_TO_READ = """\
 - **Duplicates**, a second box on an object, have one grey diagonal.
 - **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
   velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
+"""
+OF_A_MODEL = """\
 - **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
   box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
   ribbon.
@@ -108,6 +119,23 @@ class RecordedModel(Protocol):
         """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
 
 
+@dataclass(frozen=True)
+class RecordedBoxes:
+    """Boxes that are recorded in place of a model's: those of one file against the labels, of two files, or labels.
+
+    Attributes:
+        names: of the files, at most two; none for labels alone.
+        classes: by name, which are scored.
+        ranges_m: by class, the distance from the ego vehicle below which misses and false positives are marked.
+        untrained: whether random weights made the boxes.
+    """
+
+    names: tuple[str, ...] = ()
+    classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
+    ranges_m: Mapping[str, float] = field(default_factory=dict)
+    untrained: bool = False
+
+
 class RecordedDrive(Protocol):
     """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
 
@@ -123,28 +151,68 @@ class RecordedDrive(Protocol):
 
 @dataclass(frozen=True)
 class Recorded:
-    """A drive, the model that runs on it, and how much of both a recording holds."""
+    """A drive, the model that runs on it or boxes of files, and how much of both a recording holds."""
 
     drive: RecordedDrive
-    model: RecordedModel
+    model: RecordedModel | RecordedBoxes
     options: RecordingOptions
+
+    @property
+    def config(self) -> ModelConfig | None:
+        """The model's configuration; None without a model."""
+        return None if isinstance(self.model, RecordedBoxes) else self.model.config
+
+    @property
+    def files(self) -> RecordedBoxes | None:
+        """The boxes of files; None of a model."""
+        return self.model if isinstance(self.model, RecordedBoxes) else None
+
+    @property
+    def layers(self) -> Mapping[str, Color]:
+        """The names of two models that are compared, and their colours; none for one model or labels alone."""
+        names = self.files.names if self.files else ()
+        return dict(zip(names, entities.LAYER_COLORS, strict=True)) if len(names) > 1 else {}
+
+    @property
+    def title(self) -> str:
+        """The drive and the model."""
+        names = self.config.name if self.config else " · ".join(self.files.names if self.files else ()) or "labels"
+        return f"{self.drive.name} · {names}"
+
+    @property
+    def object_classes(self) -> Mapping[str, ObjectClass]:
+        """The classes of the boxes, by name."""
+        if self.config is not None:
+            return self.config.object_classes
+        return self.files.classes if self.files else {}
+
+    @property
+    def grid(self) -> BevGrid | None:
+        """The model's BEV grid; None without a model."""
+        return self.config.bev_grid if self.config else None
+
+    @property
+    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
+        """Types of the model's further results, with their names."""
+        return self.config.results if self.config else {}
 
     @property
     def note(self) -> str:
         """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
         if self.model.untrained:
             return UNTRAINED
-        return FROM_RENDERED if self.model.bundled and not self.drive.facts.rendered else ""
+        is_bundled = not isinstance(self.model, RecordedBoxes) and self.model.bundled
+        return FROM_RENDERED if is_bundled and not self.drive.facts.rendered else ""
 
     @cached_property
     def classes(self) -> Mapping[str, Color]:
-        """The model's classes and their colours."""
-        return entities.class_colors(self.model.config.object_classes.values())
+        """The classes of the boxes and their colours."""
+        return entities.class_colors(self.object_classes.values())
 
     @property
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that is written; none without a map."""
-        return tuple(self.model.config.map_classes) if self.options.shows_internals else ()
+        return tuple(self.config.map_classes) if self.config and self.options.shows_internals else ()
 
 
 def log_scene(
@@ -230,14 +298,13 @@ def _prism(outline: Array, height: float) -> Array:
 
 
 def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
-    """Writes the page "About", and the facts of the run that readers of the file need."""
+    """Writes the page "About", the legend in columns, and the facts of the run that readers of the file need."""
     cameras, untrained = recorded.drive.rig.names, recorded.model.untrained
-    title = f"{recorded.drive.name} · {recorded.model.config.name}"
-    maps, lines = recorded.map_classes, line_entries(recorded.model.config)
+    title, maps = recorded.title, recorded.map_classes
     of_map: dict[str, Any] = {"map_classes": list(maps)} if maps else {}
-    if lines:
-        names, colors = zip(*lines, strict=True)
-        of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
+    for kind, entries in (("line", dict(line_entries(recorded.config))), ("layer", recorded.layers)):
+        if entries:
+            of_map |= {f"{kind}_names": list(entries), f"{kind}_colors": list(map(hex_of_color, entries.values()))}
     facts = rr.AnyValues(
         title=title,
         untrained=untrained,
@@ -249,12 +316,23 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
         **of_map,
     )
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
-    summary = (
-        f"bevcli {__version__}; {counted(len(cameras), 'cameras')}: {', '.join(cameras)}. "
-        f"Boxes with a score of {recorded.options.score:g} or more are shown.\n"
-    )
-    page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{HOW_TO_READ}", media_type="text/markdown")
+    files = recorded.files
+    is_scored = files is None or bool(files.names)
+    scores = f" Boxes with a score of {recorded.options.score:g} or more are shown." if is_scored else ""
+    summary = f"bevcli {__version__}; {counted(len(cameras), 'cameras')}: {', '.join(cameras)}.{scores}\n"
+    how = HOW_TO_READ + (OF_A_MODEL if files is None else "")
+    if files is not None and len(files.names) != 1:
+        how = TWO_MODELS if files.names else LABELS_ALONE
+    page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{how}", media_type="text/markdown")
     stream.log(entities.RUN, page, facts, static=True)
+    legend = legend_entries(recorded)
+    rows = -(-len(legend) // LEGEND_COLUMNS)
+    spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(legend))])
+    texts, colors_of_entries = zip(*legend, strict=True)
+    circles = rr.Points2D(spots + (0.7, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
+    stream.log(f"{entities.LEGEND}/colors", circles, static=True)
+    labels = labels_2d(spots + (5.0, -0.25), list(texts), colors=TEXT_COLOR)  # a label is drawn below its point
+    log(stream, f"{entities.LEGEND}/texts", labels, static=True)
 
 
 def log_pillars(
@@ -313,30 +391,26 @@ def bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
 
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
+    truth = ("ground truth", entities.GROUND_TRUTH_COLOR)
+    if recorded.layers:
+        return [*recorded.layers.items(), truth]
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
+    if recorded.files and not recorded.files.names:
+        return of_classes
     states = [
-        ("ground truth", entities.GROUND_TRUTH_COLOR),
+        truth,
         ("missed, false", entities.MISSED_COLOR),
         ("duplicate", entities.DUPLICATE_COLOR),
     ]
     maps = [
         (f"map: {name.replace('_', ' ')}", color) for name, color in entities.map_colors(recorded.map_classes).items()
     ]
-    return [*of_classes, *states, *maps, *line_entries(recorded.model.config)]
+    return [*of_classes, *states, *maps, *line_entries(recorded.config)]
 
 
-def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
-    """The texts and colours of the lines on the ground that a model finds."""
+def line_entries(config: ModelConfig | None) -> list[tuple[str, Color]]:
+    """The texts and colours of the lines on the ground that a model finds; none without a model."""
+    if config is None:
+        return []
     of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
     return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
-
-
-def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
-    """Writes the legend: a filled circle and a text for each entry, in columns."""
-    rows = -(-len(entries) // LEGEND_COLUMNS)
-    places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
-    texts, colors = [text for text, _ in entries], [color for _, color in entries]
-    circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))
-    stream.log(f"{entities.LEGEND}/colors", circles, static=True)
-    labels = labels_2d(places + (5.0, -0.25), texts, colors=TEXT_COLOR)  # a label is drawn below its point
-    log(stream, f"{entities.LEGEND}/texts", labels, static=True)

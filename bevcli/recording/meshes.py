@@ -3,8 +3,6 @@
 trimesh reads them, in a process of its own with limits of memory and time.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess
@@ -47,7 +45,7 @@ MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
 FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 
 
-def load_vehicle(path: Path) -> VehicleMesh:
+def load_vehicle(path: Path) -> "VehicleMesh":
     """The vehicle from a mesh file: .glb, .gltf, .ply, .obj, .stl or .off, read by trimesh.
 
     The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
@@ -75,7 +73,7 @@ def load_vehicle(path: Path) -> VehicleMesh:
     return VehicleMesh(mesh, (outline, arrow + (x1, middle)))  # from above: a rectangle, and an arrow at its front
 
 
-def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
+def read_class_meshes(classes: Mapping[str, ObjectClass]) -> "dict[str, Mesh]":
     """The meshes of the classes that have one, by class, scaled to a cube of 1 m around the origin.
 
     Parts of a mesh without a colour have that of the class. A file that did not change is read once in a process.
@@ -85,7 +83,7 @@ def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
     return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
 
 
-def _read(name: str, path: Path, color: Color) -> Mesh:
+def _read(name: str, path: Path, color: Color) -> "Mesh":
     try:
         with open_regular(path) as file:
             changed_ns = os.fstat(file.fileno()).st_mtime_ns
@@ -95,7 +93,7 @@ def _read(name: str, path: Path, color: Color) -> Mesh:
 
 
 @lru_cache(maxsize=16)
-def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
+def _unit_cube(path: Path, color: Color, changed_ns: int) -> "Mesh":
     """changed_ns: time of the file's last change; a file that has changed is read again."""
     mesh = read_mesh(path, color)
     if len(mesh.faces) > MOST_TRIANGLES:
@@ -109,7 +107,7 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
     return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
 
 
-def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
+def read_mesh(path: Path, color: Color = EGO_COLOR) -> "Mesh":
     """All triangles of a mesh file, with the axes of the ego frame. color: of the parts that have none.
 
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.

@@ -1,7 +1,5 @@
 """RecordingOptions: how much a recording holds, and how it is drawn."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Literal

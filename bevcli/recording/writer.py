@@ -8,6 +8,7 @@ import select
 import threading
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -18,8 +19,8 @@ from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, Prediction
 from bevcli.recording import entities, log_static
 from bevcli.recording.blueprint import Layout, recording_blueprint
-from bevcli.recording.frame_log import FrameLog, FrameLogState
-from bevcli.recording.log_static import Recorded, RecordedDrive, RecordedModel
+from bevcli.recording.frame_log import FileBoxes, FrameLog, FrameLogState
+from bevcli.recording.log_static import Recorded, RecordedBoxes, RecordedDrive, RecordedModel
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.incremental_json import GrowingFile
 
@@ -41,8 +42,8 @@ class RrdFile(GrowingFile):
     index.
 
         file = RrdFile(path)
-        stream.set_sinks(file.sink())
-        file.opened()
+        with file.sink() as sink:
+            stream.set_sinks(sink)
 
     Attributes:
         synced: bytes in the file at the last `sync`; all frames up to then are readable.
@@ -58,8 +59,9 @@ class RrdFile(GrowingFile):
         self._busy = threading.Lock()
         self._block = memoryview(bytearray(BLOCK))  # allocated here, where a lack of memory can be told
 
-    def sink(self) -> rr.FileSink:
-        """The sink that rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
+    @contextlib.contextmanager
+    def sink(self) -> Iterator[rr.FileSink]:
+        """`with` the sink that rerun is to open in the block and writes to from then on; it ends when rerun closes it.
 
         Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
         """
@@ -71,11 +73,10 @@ class RrdFile(GrowingFile):
             self._pipe = pipe
         self._thread = threading.Thread(target=self._move_all, args=(pipe,), name="rrd-file", daemon=True)
         self._thread.start()
-        return rr.FileSink(f"/dev/fd/{self._pipe_in}")
-
-    def opened(self) -> None:
-        """Says that rerun has opened the sink: the file ends when rerun closes it."""
-        os.close(self._pipe_in)
+        try:
+            yield rr.FileSink(f"/dev/fd/{self._pipe_in}")
+        finally:
+            os.close(self._pipe_in)
 
     def sync(self) -> None:
         """Waits until all that rerun has flushed is in the file.
@@ -178,7 +179,7 @@ class Recording:
     Args:
         path: the .rrd file to write; an existing one is replaced.
         sequence: the drive, or a `Session`; the rig and the name are taken from it.
-        model: the class names, the name and whether it is trained are taken from it.
+        model: the class names, the name and whether it is trained are taken from it; `RecordedBoxes` without a model.
         options: how much is written; the defaults of RecordingOptions if None.
         live: a viewer that follows the recording; None for no viewer.
         resume: `state()` of the recording that was interrupted; the file is cut to its size and goes on from there.
@@ -190,7 +191,7 @@ class Recording:
         self,
         path: str | Path,
         sequence: RecordedDrive,
-        model: RecordedModel,
+        model: RecordedModel | RecordedBoxes,
         options: RecordingOptions | None = None,
         live: LiveSink | None = None,
         resume: RecordingState | None = None,
@@ -209,34 +210,33 @@ class Recording:
         self._frame_log = FrameLog(self._stream, self._recorded, frames)
 
     def __enter__(self) -> Recording:
-        recorded, config = self._recorded, self._recorded.model.config
+        recorded, object_classes = self._recorded, self._recorded.object_classes
         vehicle, of_classes = None, {}
         path = recorded.options.vehicle_mesh
-        if path is not None or any(settings.mesh for settings in config.object_classes.values()):
+        if path is not None or any(settings.mesh for settings in object_classes.values()):
             from bevcli.recording import meshes
 
             vehicle = None if path is None else meshes.load_vehicle(path)
-            of_classes = meshes.read_class_meshes(config.object_classes)
+            of_classes = meshes.read_class_meshes(object_classes)
         self._layout = recording_blueprint(recorded)
-        self._file = RrdFile(self.path, self._size)
+        self.file = RrdFile(self.path, self._size)
         self._connect(recording_blueprint(recorded, follows=self._live is not None))
         if self._live is not None:
             self._live.open(self.path)
-        log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, config.bev_grid)
+        log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, recorded.grid)
         for name, mesh in of_classes.items():
             log_static.log_mesh(self._stream, entities.class_mesh(name), mesh)
         log_static.log_about(self._stream, recorded)
-        log_static.log_legend(self._stream, log_static.legend_entries(recorded))
         return self
 
     def _connect(self, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            self._stream.set_sinks(self._file.sink(), default_blueprint=layout)
+            with self.file.sink() as sink:
+                self._stream.set_sinks(sink, default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
         finally:
-            self._file.opened()
             if layout is not None:
                 layout.free()
 
@@ -248,29 +248,28 @@ class Recording:
                 self._layout.free()
             self._flush()
         finally:
-            self._file.leave_out_index()
+            self.file.leave_out_index()
             # rerun itself waits without a limit.
             closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
             closing.start()
             closing.join(FLUSH_TIMEOUT_S)
             if closing.is_alive():
                 raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
-            self._file.close()
+            self.file.close()
             if self._live is not None:
                 self._live.close()
 
     def state(self) -> RecordingState | None:
         """The state from which a later Recording goes on; None as long as it cannot be resumed."""
         frames = self._frame_log.state()
-        return None if frames is None else RecordingState(self._recording_id, self._file.synced, frames)
+        return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
 
-    def is_deleted(self) -> bool:
-        """True if somebody has deleted the file that is being written."""
-        return self._file.is_deleted()
+    def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+        """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals.
 
-    def log(self, frame: Frame, prediction: Prediction) -> None:
-        """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
-        self._frame_log.log(frame, prediction)
+        found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the frame.
+        """
+        self._frame_log.log(frame, found)
         self._flush()
         self._frames += 1
         if self._frames % INDEXED_FRAMES == 0:
@@ -286,6 +285,6 @@ class Recording:
     def _flush(self) -> None:
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
-            self._file.sync()
+            self.file.sync()
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error

@@ -119,20 +119,7 @@ def side_of(yaw_deg: float) -> str:
 
 def check_names(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     """Find copied poses, swapped names, and an ego frame whose x axis is not forward; at most one error per camera."""
-    copies = _copied_poses(cameras)
-    copied = {name for names, _ in copies for name in names}
-    findings = tuple(finding for _, finding in copies)
-    yaws = {camera.name: mounting_of(camera.ego_from_camera).yaw_deg for camera in cameras}
-    stated = {name: direction_of_name(name) for name in yaws if name not in copied}
-    named = {name: direction for name, direction in stated.items() if direction is not None}
-    if sum(turn_deg(direction, yaws[name]) for name, direction in named.items()) < SWAP_GAIN_DEG:
-        return findings
-    turned = _turned_ego_frame(named, yaws)
-    return findings + ((turned,) if turned else _swapped_names(named, yaws))
-
-
-def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Finding]]:
-    copies = []
+    findings, copied = list[Finding](), set[str]()
     for a, b in combinations(cameras, 2):
         distance = float(np.linalg.norm(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]))
         cosine = np.clip((np.trace(a.ego_from_camera[:3, :3].T @ b.ego_from_camera[:3, :3]) - 1) / 2, -1, 1)
@@ -140,13 +127,19 @@ def _copied_poses(cameras: Sequence[Camera]) -> list[tuple[tuple[str, str], Find
         fov_a, fov_b = seen_fov_deg(a)[0], seen_fov_deg(b)[0]
         same_fov = abs(fov_a - fov_b) <= SAME_FOV * max(fov_a, fov_b)
         if distance < SAME_PLACE_M and turn < SAME_DIRECTION_DEG and same_fov:
-            finding = Finding(
+            copied |= {a.name, b.name}
+            findings.append(Finding(
                 "same-pose", "error", b.name, f"has the same pose as {a.name}",
                 f"{distance:.3f} m and {turn:.2f}° apart", "different positions or viewing directions",
                 "one pose is a copy of the other: give each camera its own",
-            )  # fmt: skip
-            copies.append(((a.name, b.name), finding))
-    return copies
+            ))  # fmt: skip
+    yaws = {camera.name: mounting_of(camera.ego_from_camera).yaw_deg for camera in cameras}
+    stated = {name: direction_of_name(name) for name in yaws if name not in copied}
+    named = {name: direction for name, direction in stated.items() if direction is not None}
+    if sum(turn_deg(direction, yaws[name]) for name, direction in named.items()) < SWAP_GAIN_DEG:
+        return tuple(findings)
+    turned = _turned_ego_frame(named, yaws)
+    return (*findings, *((turned,) if turned else _swapped_names(named, yaws)))
 
 
 def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> Finding | None:

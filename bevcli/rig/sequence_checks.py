@@ -3,8 +3,6 @@
 `CheckedDrive` runs the cheap ones before a run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -35,35 +33,28 @@ CHECKED_POSES = 5000  # before a run: of a longer drive, every second, third, â€
 
 
 class CheckedDrive(DerivedSequence):
-    """A drive that was checked once. source: see `input_errors`.
+    """A drive that was checked once: the errors of `check_calibration` that need no images and no BEV grid.
+
+    source: the drive's path, for the command that each line names.
 
     Attributes:
-        input_errors: one line for each mistake.
+        input_errors: one line for each mistake in the drive's rig and ego-motion; none where they are plausible.
     """
 
     def __init__(self, drive: Drive, source: str = "SEQUENCE") -> None:
         super().__init__(drive)
-        self.input_errors = input_errors(drive, source)
-
-
-def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
-    """One line for each mistake in a drive's rig and ego-motion; none where they are plausible.
-
-    These are the errors of `check_calibration` that need neither images nor the coverage of the BEV grid. source: the
-    drive's path, for the command that each line names.
-    """
-    findings = errors_of(rig_findings(drive.rig))
-    motion = drive.ego_motion
-    if motion is not None and drive.stamps:
-        times, stamps = motion.timestamps_ns, drive.stamps
-        during = np.flatnonzero((times >= stamps[0].timestamp_ns) & (times <= stamps[-1].timestamp_ns))
-        checked = during[:: 1 + len(during) // CHECKED_POSES]
-        findings += errors_of(check_scenes(motion.of_rows(checked), stamps))
-    first = {(finding.code, finding.camera): finding for finding in reversed(findings)}  # scenes repeat a mistake
-    return tuple(
-        f"error in the input: {finding.line}; `bevcli project-debug {source}` says more"
-        for finding in reversed(first.values())
-    )
+        findings = errors_of(rig_findings(drive.rig))
+        motion, stamps = drive.ego_motion, drive.stamps
+        if motion is not None and stamps:
+            times = motion.timestamps_ns
+            during = np.flatnonzero((times >= stamps[0].timestamp_ns) & (times <= stamps[-1].timestamp_ns))
+            checked = during[:: 1 + len(during) // CHECKED_POSES]
+            findings += errors_of(check_scenes(motion.of_rows(checked), stamps))
+        first = {(finding.code, finding.camera): finding for finding in reversed(findings)}  # scenes repeat a mistake
+        self.input_errors = tuple(
+            f"error in the input: {finding.line}; `bevcli project-debug {source}` says more"
+            for finding in reversed(first.values())
+        )
 
 
 def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[Finding]:
@@ -129,7 +120,7 @@ class _Drive:
     is_plausible: bool  # the vehicle is level, not too fast, and drives forward in most steps
 
     @classmethod
-    def of(cls, ego_motion: EgoMotion) -> _Drive:
+    def of(cls, ego_motion: EgoMotion) -> "_Drive":
         """The poses of ego-motion."""
         rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
         steps, seconds = np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9
@@ -162,8 +153,14 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
         message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
         findings.append(rig_error("ego-jump", message, found, f"at most {MAX_SPEED:g} m/s", advice))
     findings += _direction(drive)
-    if not findings and ego_motion.velocities_are_stated:
-        findings += _stated_speed(drive, ego_motion)
+    moving = speeds > MIN_MOVING_SPEED
+    if not findings and ego_motion.velocities_are_stated and moving.any():
+        stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
+        if not 1 / SPEED_FACTOR <= float(np.median(stated / speeds[moving])) <= SPEED_FACTOR:
+            found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
+            message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
+            expected = f"equal within a factor of {SPEED_FACTOR:g}"
+            findings.append(rig_error("ego-speed", message, found, expected, advice))
     return tuple(findings)
 
 
@@ -227,17 +224,3 @@ def _motion_text(drive: _Drive) -> str:
         return tilt
     middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
     return f"moves {middle:.0f}Â° from forward over {drive.distance_m:.0f} m, {tilt}"
-
-
-def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> list[Finding]:
-    """Velocities in the file that do not fit the distance between its poses."""
-    moving = drive.speeds > MIN_MOVING_SPEED
-    if not moving.any():
-        return []
-    stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
-    ratio = float(np.median(stated / drive.speeds[moving]))
-    if 1 / SPEED_FACTOR <= ratio <= SPEED_FACTOR:
-        return []
-    found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(drive.speeds[moving]):.1f} m/s"
-    message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
-    return [rig_error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)]

@@ -1,7 +1,5 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Mapping
@@ -83,7 +81,7 @@ class RunFiles:
         if resume is not None:
             self._check_files(resume)
 
-    def __enter__(self) -> RunFiles:
+    def __enter__(self) -> "RunFiles":
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
@@ -135,24 +133,6 @@ class RunFiles:
             _save_bev(self._options.save_bev, prediction, self._model)
             self._bev_frames.append(frame.stamp.index)
         self._recording.log(frame, prediction)
-        boxes = self._boxes_of(frame, prediction)
-        if self._tracks is not None:
-            instances = boxes.boxes.instances
-            tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
-            self._tracks.write(tracked, self._reference)
-        if frame.sample_token is not None:
-            self._submission = self._submission or self._open_submission()
-            self._submission.write(boxes)
-        ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
-        for kind, writer in self._results.items():
-            writer.write(ground, result_of(kind, prediction.results))
-        self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
-        if self._recording.is_deleted() or any(file.is_deleted() for file in self._files.values()):
-            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
-        self._is_complete = frame.stamp == self._sequence.stamps[-1]
-
-    def _boxes_of(self, frame: Frame, prediction: Prediction) -> FrameBoxes:
-        """A prediction as predictions.json holds it: all boxes, with attributes, in the world or the ego frame."""
         extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
         if prediction.not_finite:
             extras["not_finite"] = prediction.not_finite
@@ -160,10 +140,24 @@ class RunFiles:
             extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
         if frame.sample_token is not None:
             extras["sample_token"] = frame.sample_token
-        world = self._sequence.has_ego_motion
-        boxes = prediction.boxes_world if world else prediction.boxes_ego
+        in_world = self._sequence.has_ego_motion  # boxes are in the world frame, or else in the ego frame
+        boxes = prediction.boxes_world if in_world else prediction.boxes_ego
         boxes = replace(boxes, attributes=attributes_by_speed(boxes, self._model.config.object_classes))
-        return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
+        of_frame = FrameBoxes(frame.stamp, frame.world_from_ego if in_world else None, boxes, extras)
+        if self._tracks is not None:
+            instances = boxes.instances
+            tracked = of_frame if instances is None else replace(of_frame, boxes=boxes[instances != ""])
+            self._tracks.write(tracked, self._reference)
+        if frame.sample_token is not None:
+            self._submission = self._submission or self._open_submission()
+            self._submission.write(of_frame)
+        ground = prediction.ground if in_world else replace(prediction.ground, world_from_ego=None)
+        for kind, writer in self._results.items():
+            writer.write(ground, result_of(kind, prediction.results))
+        self._boxes.write(of_frame)  # last: a frame in predictions.json is in the other files too
+        if any(file.is_deleted() for file in (self._recording.file, *self._files.values())):
+            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
+        self._is_complete = frame.stamp == self._sequence.stamps[-1]
 
     def state(self) -> FilesState | None:
         """The state with which later RunFiles go on after the last frame; None as long as they cannot."""
@@ -193,7 +187,7 @@ class RunFiles:
         self._files[name] = self._stack.enter_context(file)
         return file
 
-    def _open_submission(self) -> SubmissionWriter:
+    def _open_submission(self) -> "SubmissionWriter":
         from bevcli.evaluation.submission import SubmissionWriter  # nuScenes drives only
 
         return self._open(SUBMISSION, SubmissionWriter)

@@ -170,10 +170,10 @@ class RunSummary:
             "frames_per_second": self._rate(),
             "stage_ms": {stage: round(1000 * s.value(), 3) for stage, s in counts.seconds.items()},
             "camera_embeddings": counts.embeddings,
-            "dropped_images": _rows(counts.dropped, "frame", "camera", "reason"),
+            "dropped_images": [{"frame": f, "camera": c, "reason": why} for f, c, why in counts.dropped],
             "skipped_frames": counts.skipped,
-            "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
-            "started_anew": _rows(counts.started_anew, "frame", "reason"),
+            "not_finite_frames": [{"frame": f, "where": where} for f, where in counts.not_finite],
+            "started_anew": [{"frame": f, "reason": why} for f, why in counts.started_anew],
             "notes": [*self._sequence.notes, *self._input_notes()],
             "files": [str(path) for path in self.files],
         }
@@ -213,7 +213,3 @@ class RunSummary:
     def _rate(self) -> float:
         whole = self.counts.whole
         return whole.count / whole.total_s if whole.total_s else 0.0
-
-
-def _rows(values: Iterable[tuple[object, ...]], *keys: str) -> list[dict[str, object]]:
-    return [dict(zip(keys, value, strict=True)) for value in values]

@@ -74,10 +74,17 @@ def stop(process: subprocess.Popen[bytes]) -> None:
                 process.wait(timeout=5)
 
 
-def show_window(recording: Path) -> bool:
-    """Open the viewer and wait until the user closes it. False if the viewer failed."""
-    process = start_viewer("--bind", LOOPBACK, "--port", "auto", str(recording))
+def show_window(recording: Path, frame: int | None = None) -> bool:
+    """Open the viewer and wait until the user closes it. False if the viewer failed.
+
+    frame: index of the one that is shown first. Raises InputError if the recording does not have it.
+    """
+    port = "auto" if frame is None else str(free_port())
+    process = start_viewer("--bind", LOOPBACK, "--port", port, str(recording))
     try:
+        if frame is not None:
+            client = _connect(process, int(port))
+            _go_to(recording, client, _wait(process, lambda: _opened(client), NO_DRIVER), frame)
         return process.wait() == 0
     finally:
         stop(process)

@@ -27,6 +27,18 @@ def parse_host(text: str) -> str:
 class ViewOptions:
     """The viewer, or what is written in its place."""
 
+    boxes: tuple[Path, ...] = option(
+        reads="path",
+        default=(),
+        help="Boxes of a model that are shown against the labels of DRIVE: what `bevcli eval` reads. Give it twice to "
+        "compare two models.",
+        metavar="FILE",
+        repeatable=True,
+        panel="Drive",
+    )
+    out: Path | None = option(
+        default=None, help="Write the recording of DRIVE to this .rrd file.", metavar="FILE.rrd", panel="Drive"
+    )
     web: bool = option(default=False, help="Show it in the browser, even if there is a display.")
     host: str = option(
         default="127.0.0.1",
@@ -45,7 +57,10 @@ class ViewOptions:
         help="Write a screenshot of the viewer. Needs a Vulkan driver, but no screen and no GPU.",
         metavar="OUT.png|.jpg",
     )
-    frame: int | None = option(default=None, help="Frame index for `screenshot`. Default: the first frame.")
+    frame: int | None = option(
+        default=None,
+        help="Frame index, where the viewer's window opens, or for `screenshot`. Default: the first frame.",
+    )
     summary: bool = option(default=False, help="Print the frames, time span, boxes per class and sizes.")
     video: Path | None = option(
         default=None,

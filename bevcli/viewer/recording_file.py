@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import rerun as rr
 
 from bevcli.errors import BevcliError, InputError, OutputError
-from bevcli.parsing.files import plain_name, run_program, run_python
+from bevcli.parsing.files import open_regular, plain_name, run_program, run_python
+from bevcli.sequences.format import drives_in, is_drive
 from bevcli.viewer.native import viewer_binary, viewer_environment
 from bevcli.writing import whole_file
 
@@ -41,6 +42,9 @@ CHECK_ENVIRONMENT = {"MIMALLOC_ARENA_RESERVE": "65536"}
 SECONDS, BYTES_PER_SECOND = 30.0, 1e6  # time limit of a process that reads a recording
 RECORDING = "recording.rrd"
 LARGEST_INDEXED = 256 << 20  # bytes; to make an index takes several times its size in memory
+PREDICTIONS = "predictions.json"
+IMAGES = ("frames.csv", "images", "videos")  # of a sequence folder, which may hold predictions too
+MAGIC_START = b"RRF"  # of all versions of rerun
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 OLDEST = (0, 23)  # version of rerun whose files are read; the bytes after MAGIC state a file's
 FILE_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")  # bytes; kind and length of a message
@@ -74,13 +78,44 @@ def open_recording(path: Path) -> Iterator[Path]:
             raise type(error)(str(error).replace(str(copy), str(path))) from None
 
 
+def is_recording(path: Path) -> bool:
+    """True for a recording, also one that is damaged or missing, and for the folder of a run that has one."""
+    if path.is_dir():
+        return (path / RECORDING).is_file()
+    if path.suffix.lower() == ".rrd" or not path.is_file():
+        return True
+    with open_regular(path) as file:
+        return file.read(len(MAGIC_START)) == MAGIC_START
+
+
+def check_is_drive(path: Path) -> None:
+    """Raise InputError for what is no recording and no drive, such as boxes alone."""
+    is_run = (path / PREDICTIONS).is_file() and not any((path / name).exists() for name in IMAGES)
+    if not is_run and (is_drive(path) or (path.is_dir() and drives_in(path))):
+        return
+    if is_run or (path.is_file() and _begins_like_json(path)):
+        raise InputError(
+            f"{path}: holds boxes (expected a recording or a drive): show them with the drive that they belong to: "
+            f"`bevcli viz DRIVE --boxes {path}`"
+        )
+    recording_in(path)  # these raise InputError
+    _is_whole(path)
+
+
+def _begins_like_json(path: Path) -> bool:
+    with open_regular(path) as file:
+        return file.read(64).lstrip()[:1] in (b"{", b"[")
+
+
 def recording_in(path: Path) -> Path:
     """The recording of a run's folder; any other path as it is. Raises InputError for a folder without a recording."""
     if not path.is_dir():
         return path
     recording = path / RECORDING
     if not recording.is_file():
-        raise InputError(f"{path}: the folder has no {RECORDING} (expected a recording, or a folder of `bevcli run`)")
+        raise InputError(
+            f"{path}: the folder has no {RECORDING} (expected a recording, a folder of `bevcli run`, or a drive)"
+        )
     return recording
 
 

@@ -202,10 +202,16 @@ def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
 
 def read_recording(recording: Path) -> BoxesFile:
     """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
-    frames = tuple(recorded_boxes(frame) for frame in RecordingReader(recording).frames())
+    frames = list[FrameBoxes]()
+    for frame in RecordingReader(recording).frames():
+        if names := frame.texts(entities.RUN, "layer_names"):
+            raise InputError(
+                f"{recording}: compares {' and '.join(names)} (expected boxes of one model): use their files"
+            )
+        frames.append(recorded_boxes(frame))
     if not frames:
         raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
-    return BoxesFile("world", frames)
+    return BoxesFile("world", tuple(frames))
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
@@ -259,6 +265,8 @@ def summarise(path: Path, read_from: Path | None = None) -> str:
     for frame in reader.frames():
         recorded = recorded_boxes(frame)
         boxes.update(recorded.boxes.classes.tolist())
+        for name in frame.texts(entities.RUN, "layer_names"):
+            boxes[name] += len(frame.texts(entities.layer(entities.WORLD, name), "name"))
         times.append(recorded.stamp.timestamp_ns)
         title = "".join(frame.texts(entities.RUN, "title"))
         untrained = any(frame.integers(entities.RUN, "untrained"))

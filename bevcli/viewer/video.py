@@ -252,8 +252,11 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     for kind in entities.line_kinds():
         draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
-    draw_strips(canvas, frame, boxes, to_canvas)
-    draw_labels(canvas, frame, f"{boxes}/labels", to_canvas, 0.36)
+    layers = [entities.layer(entities.camera(tile.camera), name) for name in _layers(frame)]
+    for each in (boxes, *layers):
+        draw_strips(canvas, frame, each, to_canvas)
+    for each in (boxes, *layers):
+        draw_labels(canvas, frame, f"{each}/labels", to_canvas, 0.36)
     draw_title(canvas, tile.camera, has_image=image is not None)
 
 
@@ -280,7 +283,8 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
         draw_faded_strips(canvas, frame, f"{entities.BEV}/{kind}", to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
-    draw_strips(canvas, frame, entities.BEV_BOXES, to_canvas, 2)
+    for entity in (entities.BEV_BOXES, *(entities.layer(entities.BEV, name) for name in _layers(frame))):
+        draw_strips(canvas, frame, entity, to_canvas, 2)
     draw_arrows(canvas, frame, entities.BEV_VELOCITY, to_canvas)
     draw_strips(canvas, frame, entities.BEV_VEHICLE, to_canvas, 2)
 
@@ -305,8 +309,10 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     if any(frame.integers(entities.RUN, "untrained")):
         note = "UNTRAINED WEIGHTS: boxes are meaningless"
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
-    counts = Counter(frame.texts(entities.BOXES, "name"))
-    for index, (name, color) in enumerate(_class_colors(frame).items()):
+    counts, layers = Counter(frame.texts(entities.BOXES, "name")), _layers(frame)
+    for name in layers:
+        counts[name] = len(frame.texts(entities.layer(entities.WORLD, name), "name"))
+    for index, (name, color) in enumerate((layers or _class_colors(frame)).items()):
         position = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
     for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
@@ -317,6 +323,11 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
         width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
         for index, (name, color) in enumerate(map_colors(classes).items()):
             draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
+
+
+def _layers(frame: RecordedFrame) -> dict[str, Color]:
+    """The names of two models that are compared, and their colours."""
+    return _named_colors(frame, "layer_names", "layer_colors")
 
 
 def _class_colors(frame: RecordedFrame) -> dict[str, Color]:

@@ -24,7 +24,8 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
-from bevcli.published import HASHES, DownloadReport, Known, NamedWeights
+from bevcli.published import HASHES, Known, NamedWeights
+from bevcli.weights import DownloadReport
 from bevcli.writing import lock, output_errors
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded

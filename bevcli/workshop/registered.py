@@ -57,8 +57,13 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.scores": {
         "tracking": "bevcli.workshop.scores:SCORER",
         "vad": "bevcli.workshop.vad:SCORER",
+        "worst": "bevcli.workshop.scores:WORST",
+    },
+    "bevcli.comparisons": {
+        "boxes": "bevcli.workshop.scores.compare:compare",
     },
     "bevcli.plots": {
+        "comparison": "bevcli.workshop.scores.plots:write_comparison",
         "scores": "bevcli.workshop.scores.plots:write_plots",
     },
     "bevcli.engines": {
@@ -81,6 +86,6 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.extensions": {
         "project-debug.motion": "bevcli.workshop.calibration.commands:CHECK_MOTION",
-        "run.calibrate": "bevcli.workshop.calibration.commands:CALIBRATE_FIRST",
+        "run.calibrate": "bevcli.workshop.calibration.run_option:CALIBRATE_FIRST",
     },
 }

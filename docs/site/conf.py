@@ -30,7 +30,7 @@ SECTIONS = {
         "docs/rendered-drives",
     ],
     "Calibrate": ["docs/calibration"],
-    "Score": ["docs/scoring", "docs/robustness"],
+    "Score": ["docs/scoring", "docs/compare", "docs/robustness"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],

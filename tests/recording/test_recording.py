@@ -282,14 +282,13 @@ def test_a_resumed_recording_can_be_read_before_it_is_closed(tmp_path, monkeypat
 def test_moving_bytes_into_the_file_needs_no_new_memory(tmp_path):
     content = np.random.default_rng(0).bytes(3 * BLOCK)
     file = RrdFile(tmp_path / "recording.rrd")
-    file.sink()
-    tracemalloc.start()
-    for start in range(0, len(content), BLOCK):
-        os.write(file._pipe_in, memoryview(content)[start : start + BLOCK])
-    file.sync()
-    grown = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    file.opened()
+    with file.sink():
+        tracemalloc.start()
+        for start in range(0, len(content), BLOCK):
+            os.write(file._pipe_in, memoryview(content)[start : start + BLOCK])
+        file.sync()
+        grown = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
     file.close()
     assert grown < BLOCK / 20
     assert (tmp_path / "recording.rrd").read_bytes() == content

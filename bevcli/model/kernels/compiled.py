@@ -110,7 +110,7 @@ class _WeightedSums(torch.autograd.Function):
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        from bevcli.model.kernels.loops import sample_maps_backward
+        from bevcli.model.kernels.other_loops import sample_maps_backward
 
         values, locations, weights = context.saved_tensors
         results = torch.zeros(values.shape), torch.empty(locations.shape), torch.empty(weights.shape)

@@ -168,7 +168,7 @@ def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, i
 
     points: (Y·X, Z, 3) on the CPU; other arguments as for `project_pillars`.
     """
-    from bevcli.model.kernels.loops import find_hits  # loads the compiler
+    from bevcli.model.kernels.other_loops import find_hits  # loads the compiler
 
     batch, cameras = has_image.shape
     (total, heights, _), images = points.shape, batch * cameras

@@ -11,19 +11,9 @@ from bevcli.errors import OutputError
 from bevcli.inference.load import Model
 from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
-from bevcli.workshop.batch import Workers
+from bevcli.workshop.batch import Workers, storage
 from bevcli.workshop.batch.job import Drive, Job, Record, read_record
 from bevcli.workshop.batch.report import write_results
-from bevcli.workshop.batch.storage import (
-    ATTEMPTS,
-    FAILED,
-    READING_THREADS,
-    RECORD,
-    RESULTS,
-    LocalFolder,
-    Storage,
-    open_storage,
-)
 from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray
 
 DESCRIPTION = "batch.json"  # says that a folder is a batch
@@ -105,18 +95,18 @@ def run_batch(
     """
     job.check_options(drives)
     read_class_meshes(model.config.object_classes)  # each drive's recording needs them
-    out, job_hash = open_storage(job.out), job.hash(model)
-    with folder_lock(out.path) if isinstance(out, LocalFolder) else contextlib.nullcontext():
+    out, job_hash = storage.open_storage(job.out), job.hash(model)
+    with folder_lock(out.path) if isinstance(out, storage.LocalFolder) else contextlib.nullcontext():
         _check_folder(out, resume)
         out.write(DESCRIPTION, json.dumps({"format": "bevcli-batch/1", "model": model.name}).encode())
         known = _known_records(out, drives, job_hash, retry_failed)
         skipped(len(known))
-        for left in [name for name in out.names(ATTEMPTS) if name.endswith(".run")]:  # of workers that died
-            out.remove(f"{ATTEMPTS}/{left}")
+        for left in [name for name in out.names(storage.ATTEMPTS) if name.endswith(".run")]:  # of workers that died
+            out.remove(f"{storage.ATTEMPTS}/{left}")
         pending = [drive for drive in drives if drive.result(job_hash) not in known]
         if retry_failed:
             for drive in pending:
-                out.remove(f"{ATTEMPTS}/{drive.result(job_hash)}.json")
+                out.remove(f"{storage.ATTEMPTS}/{drive.result(job_hash)}.json")
         records, stopped = dict(known), False
         try:
             with contextlib.closing(_run(job, job_hash, model, pending, workers, should_stop)) as running:
@@ -125,8 +115,8 @@ def run_batch(
                     after_drive(record)
         except (KeyboardInterrupt, StoppedError):
             stopped = True
-            for name in out.names(ATTEMPTS):  # an attempt that the user ended does not count
-                out.remove(f"{ATTEMPTS}/{name}")
+            for name in out.names(storage.ATTEMPTS):  # an attempt that the user ended does not count
+                out.remove(f"{storage.ATTEMPTS}/{name}")
         ordered = [records[name] for name in (drive.result(job_hash) for drive in drives) if name in records]
         files = write_results(out, ordered, model)
     return BatchSummary(tuple(ordered), len(drives), len(known), stopped, files)
@@ -152,27 +142,31 @@ def _run(
             raise StoppedError
 
 
-def _check_folder(out: Storage, resume: bool) -> None:
+def _check_folder(out: storage.Storage, resume: bool) -> None:
     """Raises OutputError unless the folder is new, or has a batch to go on with."""
     is_batch = out.read(DESCRIPTION) is not None
     found = out.names("") - {".bevcli"}
     if found and not is_batch:
         raise OutputError(f"{out.where}: is not a batch and not empty: pass `out=DIR` for another folder")
-    if is_batch and not resume and (out.names(RESULTS) or out.names(FAILED)):
+    if is_batch and not resume and (out.names(storage.RESULTS) or out.names(storage.FAILED)):
         raise OutputError(f"{out.where}: has a batch already: pass `resume=True` to go on with it, or `out=DIR`")
 
 
-def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_failed: bool) -> dict[str, Record]:
+def _known_records(
+    out: storage.Storage, drives: Sequence[Drive], job_hash: str, retry_failed: bool
+) -> dict[str, Record]:
     """The records of drives that are done or have failed, by the name of their results."""
-    done, failed = out.names(RESULTS), out.names(FAILED)
+    done, failed = out.names(storage.RESULTS), out.names(storage.FAILED)
 
     def find(result: str) -> Record | None:
-        record = read_record(out.read(f"{RESULTS}/{result}/{RECORD}"), result) if result in done else None
+        record = (
+            read_record(out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result) if result in done else None
+        )
         if record is None and not retry_failed and f"{result}.json" in failed:
-            record = read_record(out.read(f"{FAILED}/{result}.json"), result)
+            record = read_record(out.read(f"{storage.FAILED}/{result}.json"), result)
         return record
 
     results = [drive.result(job_hash) for drive in drives]
-    with ThreadPoolExecutor(READING_THREADS) as pool:
+    with ThreadPoolExecutor(storage.READING_THREADS) as pool:
         found = zip(results, pool.map(find, results), strict=True)
         return {result: record for result, record in found if record is not None}

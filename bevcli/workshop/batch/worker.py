@@ -37,19 +37,9 @@ from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.workshop.batch import Workers, ray_is_installed
+from bevcli.workshop.batch import Workers, ray_is_installed, storage
 from bevcli.workshop.batch.job import SCORE_BINS, Drive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
-from bevcli.workshop.batch.storage import (
-    ATTEMPTS,
-    FAILED,
-    RECORD,
-    RESULTS,
-    LocalFolder,
-    RemoteFolder,
-    is_url,
-    open_storage,
-)
 
 _SCRATCH = "bevcli-batch-"
 
@@ -63,7 +53,7 @@ class Worker:
 
     def __init__(self, job: Job, job_hash: str, model: Model | None = None) -> None:
         self._job, self._job_hash = job, job_hash
-        self._out = open_storage(job.out)
+        self._out = storage.open_storage(job.out)
         self._model = job.load_model() if model is None else model
         _remove_scratch_of_dead_workers()
 
@@ -75,10 +65,10 @@ class Worker:
         Raises StoppedError if `should_stop` says so after a frame; OutputError if the batch's folder cannot be written.
         """
         result = drive.result(self._job_hash)
-        done = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
+        done = read_record(self._out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result)
         if done is not None:  # Ray runs a drive again if it lost the answer of a worker
             return done
-        marker = f"{ATTEMPTS}/{result}.json"
+        marker = f"{storage.ATTEMPTS}/{result}.json"
         attempt, error = _read_marker(self._out.read(marker))
         while attempt <= self._job.retries:
             attempt += 1
@@ -99,7 +89,7 @@ class Worker:
                 self._out.remove(marker)
                 return record
         record = {**_about(drive, result), "attempts": attempt, "error": valid_text(error)}
-        self._out.write(f"{FAILED}/{result}.json", json.dumps(record).encode())
+        self._out.write(f"{storage.FAILED}/{result}.json", json.dumps(record).encode())
         self._out.remove(marker)
         return record
 
@@ -143,13 +133,13 @@ class Worker:
                 "not_scored": why_not,
                 "input_errors": "; ".join(summary.input_errors),
             }
-            _rewrite_paths(aside, f"{self._out.where}/{RESULTS}/{result}")
-            (aside / RECORD).write_text(json.dumps(record, indent=1) + "\n")
-            landed = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
+            _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")
+            (aside / storage.RECORD).write_text(json.dumps(record, indent=1) + "\n")
+            landed = read_record(self._out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result)
             if landed is not None:
                 return landed
-            self._out.remove(f"{FAILED}/{result}.json")
-            self._out.land(aside, f"{RESULTS}/{result}", RECORD)
+            self._out.remove(f"{storage.FAILED}/{result}.json")
+            self._out.land(aside, f"{storage.RESULTS}/{result}", storage.RECORD)
             return record
 
     def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
@@ -177,8 +167,8 @@ class Worker:
         """
         inputs = Path(tempfile.gettempdir()) / f"{_SCRATCH}{os.getpid()}-{uuid.uuid4().hex[:8]}"
         aside = inputs / "result"
-        if isinstance(self._out, LocalFolder):
-            attempts = self._out.path / ATTEMPTS
+        if isinstance(self._out, storage.LocalFolder):
+            attempts = self._out.path / storage.ATTEMPTS
             for left in attempts.glob(f"{result}.*.run"):  # of a worker that died
                 shutil.rmtree(left, ignore_errors=True)
             aside = attempts / f"{result}.{uuid.uuid4().hex[:8]}.run"
@@ -225,11 +215,11 @@ def _score_columns(scores: Scores) -> Record:
 
 def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:
     """A local path of a drive's input; of a URL, a copy with the same name."""
-    if not is_url(drive.source):
+    if not storage.is_url(drive.source):
         return Path(drive.source)
     local = inputs / drive.source.rpartition("/")[2]
     if drive.scene is None:
-        RemoteFolder(drive.source).fetch(local)
+        storage.RemoteFolder(drive.source).fetch(local)
     else:
         fetch_scene(drive.source, job.own_of(NuScenesOptions), drive.scene, local)
     return local

@@ -7,8 +7,6 @@ In the order of the work:
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bevcli.options import option, options
@@ -35,16 +33,6 @@ class CalibrateOptions:
         minimum=0.0001, maximum=0.2,
     )  # fmt: skip
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
-
-
-@options("Input")
-class CalibrateFirstOptions:
-    """Whether a drive is calibrated before it is used."""
-
-    calibrate: bool = option(
-        default=False,
-        help="Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.",
-    )
 
 
 @options()

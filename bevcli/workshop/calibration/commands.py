@@ -1,9 +1,7 @@
 """`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion.
 
-And its short forms: `bevcli run --calibrate`, and the check of `bevcli project-debug`.
+And its short form, the check of `bevcli project-debug`.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
-from bevcli.workshop.calibration import (
-    CalibrateFirstOptions,
-    CalibrateOptions,
-    CalibrateOutputOptions,
-    CheckMotionOptions,
-)
+from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions, CheckMotionOptions
 
 if TYPE_CHECKING:
     from bevcli.findings import Finding
@@ -55,22 +48,7 @@ def calibrate(
     say("Written: " + ", ".join(map(str, written)), err=as_json)
 
 
-def _corrected(options: CalibrateFirstOptions, drive: Sequence) -> Sequence:
-    """The drive with the rig that it shows, where this is asked for; what is corrected is printed."""
-    if not options.calibrate:
-        return drive
-    from bevcli.cli.progress import Progress
-    from bevcli.workshop.calibration import calibrate as calibration
-
-    with Progress(calibration.STEPS, "steps of the calibration") as progress:
-        result = calibration.calibrate(drive, after_step=progress.advance)
-    for camera in result.cameras:
-        reason = calibration.change_text(camera) if camera.verdict is calibration.Verdict.CORRECTED else camera.reason
-        say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return calibration.CorrectedDrive(drive, result)
-
-
-def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], Sequence]) -> tuple[Finding, ...]:
+def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Sequence"]) -> "tuple[Finding, ...]":
     """Findings of a short calibration of the drive, where it has ego-motion and is no calibration alone."""
     if not options.motion:
         return ()
@@ -84,5 +62,4 @@ def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], Seque
     return motion_findings(drive)
 
 
-CALIBRATE_FIRST = Extension(CalibrateFirstOptions, _corrected)
 CHECK_MOTION = Extension(CheckMotionOptions, _motion_findings)

@@ -9,14 +9,7 @@ from torch import Tensor
 
 from bevcli.errors import BevcliError
 from bevcli.model.bevformer.bevformer import BevHistory
-from bevcli.model.bevformer_v2.bevformer_v2 import (
-    BEVFormerV2Config,
-    FeatureWindow,
-    FrameFeatures,
-    WindowFrame,
-    frames_at,
-    kept,
-)
+from bevcli.model.bevformer_v2 import bevformer_v2
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.segmentation import STUFF_CLASSES
@@ -272,7 +265,7 @@ class WindowForm(ExportForm):
 
     step = WindowStep
 
-    def __init__(self, config: BEVFormerV2Config, cameras: int) -> None:
+    def __init__(self, config: bevformer_v2.BEVFormerV2Config, cameras: int) -> None:
         """Raises BevcliError for a model that looks at later frames."""
         if config.later_frames:
             raise BevcliError(
@@ -314,18 +307,18 @@ class WindowForm(ExportForm):
     def facts(self) -> dict[str, Any]:
         return {"window": self.frames}
 
-    def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
+    def feed(self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None) -> dict[str, Tensor]:
         """See `ExportForm`. Of a frame that does not exist no camera has an image."""
         past = self._past(prepared, memory)
         current = model_inputs(prepared, None, self.config)
         indices = [len(past) + offset for offset in self.frames[:-1]]
-        absent = WindowFrame(
+        absent = bevformer_v2.WindowFrame(
             FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),
             torch.zeros_like(current.image_from_bev),
             torch.zeros_like(current.has_image),
             current.image_size,
         )
-        earlier = [frame or absent for frame in frames_at(past, indices, prepared)]
+        earlier = [frame or absent for frame in bevformer_v2.frames_at(past, indices, prepared)]
         feed = camera_feed(current) | {
             "image_from_bev": torch.stack(
                 [*(frame.image_from_bev for frame in earlier), current.image_from_bev], dim=1
@@ -337,15 +330,17 @@ class WindowForm(ExportForm):
         return feed
 
     def memory(
-        self, prepared: PreparedFrame, memory: FeatureWindow | None, by_name: Mapping[str, Tensor]
-    ) -> FeatureWindow:
+        self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None, by_name: Mapping[str, Tensor]
+    ) -> bevformer_v2.FeatureWindow:
         past = self._past(prepared, memory)
         if "image_features" not in by_name:
-            return kept(past, len(past), -self.frames[0])
+            return bevformer_v2.kept(past, len(past), -self.frames[0])
         features = FeatureMaps(by_name["image_features"], self.config.level_shapes)
-        return kept([*past, FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
+        return bevformer_v2.kept([*past, bevformer_v2.FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
 
-    def _past(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> list[FrameFeatures]:
+    def _past(
+        self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None
+    ) -> list[bevformer_v2.FrameFeatures]:
         return [] if memory is None else memory.before(prepared.frame.stamp, -self.frames[0])
 
     @property

@@ -4,8 +4,6 @@ The plain model knows nothing of this. A step holds a copy of it, `network`, in 
 replaced by ones of standard operators with the same numbers.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -31,7 +29,9 @@ class ExportedStep(nn.Module):
     image_mean: Tensor
     image_std: Tensor
 
-    def __init__(self, model: Any, deformable_convolution: DeformableConvolution, slots: int, *, decode: bool) -> None:
+    def __init__(
+        self, model: Any, deformable_convolution: "DeformableConvolution", slots: int, *, decode: bool
+    ) -> None:
         """A copy of the model, with its parts replaced; the model itself stays unchanged.
 
         slots: K of `SlottedHits`, at most the number of cameras.
@@ -54,7 +54,7 @@ class ExportedStep(nn.Module):
             planes = planes.flip(2)
         return self.network.image_features((planes - self.image_mean) / self.image_std, camera_index)
 
-    def hits(self, image_from_bev: Tensor, has_image: Tensor) -> SlottedHits:
+    def hits(self, image_from_bev: Tensor, has_image: Tensor) -> "SlottedHits":
         """The cameras that see each cell, for a batch of one; arguments as for `Pillars.project`."""
         projection = self.network.pillars.project(image_from_bev, self.image_size, has_image)
         hit = projection.hit[0].float()  # (N, Y·X)
@@ -258,7 +258,7 @@ class DeformConvOperator(nn.Module):
         )
 
 
-def replace_parts(network: nn.Module, deformable_convolution: DeformableConvolution) -> None:
+def replace_parts(network: nn.Module, deformable_convolution: "DeformableConvolution") -> None:
     """Replaces, in place, the spatial cross-attentions and, for "operator", the deformable convolutions."""
     for name, module in list(network.named_modules()):
         if isinstance(module, SpatialCrossAttention):

@@ -1,4 +1,4 @@
-"""The nuScenes devkit's scores of tracks, and plots of detection scores."""
+"""The nuScenes devkit's scores of tracks, comparison of two models, worst frames, and plots of detection scores."""
 
 from bevcli.evaluation import Scorer
 from bevcli.options import option, options
@@ -14,3 +14,19 @@ class TrackingScoreOptions:
 
 
 SCORER = Scorer(TrackingScoreOptions, "bevcli.workshop.scores.tracking:score_tracks")
+
+
+@options()
+class WorstOptions:
+    """Whether the worst frames are listed."""
+
+    worst: int | None = option(
+        default=None,
+        help="List the N frames with most missed and most invented boxes. Default: none for one file of predictions, "
+        "3 for two.",
+        metavar="N",
+        minimum=1,
+    )
+
+
+WORST = Scorer(WorstOptions, "bevcli.workshop.scores.worst_frames:score_worst_frames")

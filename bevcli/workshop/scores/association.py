@@ -1,7 +1,5 @@
 """The boxes of many frames with their identities, and the track that each object is matched to, frame by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -41,7 +39,7 @@ class TrackedBoxes:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, selection: NDArray[Any]) -> TrackedBoxes:
+    def __getitem__(self, selection: NDArray[Any]) -> "TrackedBoxes":
         """The boxes of a mask (N,) bool or of an index array."""
         return TrackedBoxes(*(column[selection] for column in vars(self).values()))
 

@@ -1,10 +1,10 @@
 """Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,12 +12,16 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
+from numpy.typing import NDArray
 
-from bevcli.evaluation.detection import RECALLS, ClassMatches, ClassScores, DetectionScores
+from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
 from bevcli.evaluation.evaluate import Scores
 from bevcli.evaluation.inputs import FramePairs
 from bevcli.evaluation.matching import ERRORS, ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.printing import counted
+from bevcli.workshop.scores.compare import Comparison
+from bevcli.workshop.scores.worst_frames import MODELS, Outcome, best_outcome
 from bevcli.writing import whole_file
 
 # Colours of classes on a white background, in the order of the classes; the eleventh has the first again.
@@ -25,7 +29,9 @@ _PLOT_COLORS = (
     "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
 )  # fmt: skip
 GRID_COLOR = "#e6e6e6"
-BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
+# From the shortest matching distance to the longest.
+BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")
+ORANGES = ("#f8cfa8", "#f0a35e", "#d9752b", "#8f4310")
 _ERROR_TITLES = {
     "trans_err": "translation error (m)",
     "scale_err": "scale error (1 - IoU)",
@@ -43,6 +49,11 @@ def write_plots(scores: Scores, folder: Path) -> list[Path]:
         "misses_and_false_alarms.png": draw_bev_sheet(scores.detection, scores.pairs),
     }
     return save_figures(figures, folder)
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:
+    """Write the curves of two models as a PNG file into a folder; return its path. Raises OutputError."""
+    return save_figures({"precision_recall_of_both.png": draw_both(comparison)}, folder)
 
 
 def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -> Figure:
@@ -71,18 +82,56 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
     table = detection.overall
     subtitle = f"mAP {table.mean_ap:.3f}, one curve for each matching distance"
     figure = titled_figure((15, 7), "Precision and recall by class", subtitle)
-    panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True, squeeze=False)
+    panels = _class_panels(figure, len(table.classes))
     for axes, (name, scores) in zip(panels.flat, table.classes.items(), strict=False):
-        _draw_precision_recall(axes, name, scores)
-    if len(table.classes) % 2:
-        panels[-1, -1].set_axis_off()
+        axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
+        _draw_curves(axes, scores, BLUES)
+        aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
+        text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
+        _draw_remark(axes, text)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", ncols=len(labels), frameon=False, title="matching distance")
+    return figure
+
+
+def draw_both(comparison: Comparison) -> Figure:
+    """One panel for each class with ground truth, with the curves of A in blue and of B in orange."""
+    tables = [scores.detection.overall for scores in comparison.scores]
+    rows = zip(MODELS, tables, comparison.files, strict=True)
+    subtitle = "      ".join(f"{model}: mAP {table.mean_ap:.3f}, {str(file)[-60:]}" for model, table, file in rows)
+    figure = titled_figure((15, 7), "Precision and recall of two models by class", subtitle)
+    counts = {name: scores.ground_truth_count for name, scores in tables[0].classes.items()}
+    shown = [name for name, count in counts.items() if count] or list(counts)
+    panels = _class_panels(figure, len(shown))
+    for axes, name in zip(panels.flat, shown, strict=False):
+        axes.set_title(name, fontsize=11, loc="left")
+        for table, colors in zip(tables, (BLUES, ORANGES), strict=True):
+            _draw_curves(axes, table.classes[name], colors)
+        of_a, of_b = comparison.classes[name].values
+        _draw_remark(axes, f"{counted(counts[name], 'boxes')}, AP: A {of_a:.2f}, B {of_b:.2f}")
+    lines, distances = panels[0, 0].get_legend_handles_labels()
+    half = len(lines) // 2
+    order = [place for pair in zip(range(half), range(half, 2 * half), strict=True) for place in pair]  # A above B
+    labels = [f"{MODELS[place // half]}  {distances[place]}" for place in order]
+    figure.legend([lines[place] for place in order], labels, loc="upper right", ncols=half, frameon=False)
+    return figure
+
+
+def _draw_remark(axes: Axes, text: str) -> None:
+    axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
+
+
+def _class_panels(figure: Figure, count: int) -> NDArray[Any]:
+    """(2, ceil(count / 2)), axes for the curves of classes."""
+    panels: NDArray[Any] = figure.subplots(2, (count + 1) // 2, sharex=True, sharey=True, squeeze=False)
+    if count % 2:
+        panels[-1, -1].set_axis_off()
+        panels[0, -1].tick_params(labelbottom=True)
     for axes in panels[-1]:
         axes.set_xlabel("recall")
     for axes in panels[:, 0]:
         axes.set_ylabel("precision")
-    return figure
+    return panels
 
 
 def draw_errors_by_range(detection: DetectionScores) -> Figure:
@@ -109,16 +158,12 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
     return figure
 
 
-def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
-    axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
-    for (distance, curve), color in zip(scores.curves.items(), BLUES, strict=False):
+def _draw_curves(axes: Axes, scores: ClassScores, colors: Sequence[str]) -> None:
+    for (distance, curve), color in zip(scores.curves.items(), colors, strict=False):
         reached = curve.score > 0
         axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
     axes.set(xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(color=GRID_COLOR)
-    aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
-    text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
-    axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
 
 
 def _value(scores: ClassScores | None, error: str | None) -> float:
@@ -130,16 +175,8 @@ def _value(scores: ClassScores | None, error: str | None) -> float:
 
 WORST_FRAMES = 4
 MAX_DOTS = 1500
-# Colour and style of the outlines, in the order of `_Outcome`.
+# Colour and style of the outlines, in the order of `Outcome`.
 _OUTLINES = {"found": ("#3a9a4b", "-"), "missed": ("#d62728", "-"), "false positive": ("#ff9d1e", "--")}
-
-
-class _Outcome(NamedTuple):
-    """One class above the score threshold with the largest F1: ground truth found and missed, and false positives."""
-
-    found: ScoredBoxes
-    missed: ScoredBoxes
-    false: ScoredBoxes
 
 
 def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
@@ -149,7 +186,7 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     vehicle's forward direction is up.
     """
     config = detection.config
-    outcomes = {matches.name: _best_outcome(matches, config.error_row) for matches in detection.matches}
+    outcomes = {matches.name: best_outcome(matches, config.error_row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
@@ -168,17 +205,6 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     return figure
 
 
-def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
-    """Cut a class at the score with the largest F1. row: index of the matching distance."""
-    is_match = matches.matched[row] >= 0
-    f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
-    kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
-    is_found = np.zeros(len(matches.ground_truth), dtype=bool)
-    is_found[matches.matched[row][kept & is_match]] = True
-    truth = matches.ground_truth
-    return _Outcome(truth[is_found], truth[~is_found], matches.predictions[kept & ~is_match])
-
-
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
     colors = plot_colors(missed)
     dots = [
@@ -195,7 +221,7 @@ def _radius(detection: DetectionScores) -> float:
     return min(10 * np.ceil(farthest / 10), 100.0)
 
 
-def _worst_frames(outcomes: Iterable[_Outcome]) -> list[int]:
+def _worst_frames(outcomes: Iterable[Outcome]) -> list[int]:
     mistakes = [part.frames for outcome in outcomes for part in (outcome.missed, outcome.false)]
     counts = Counter(np.concatenate(mistakes).tolist())
     return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
@@ -220,7 +246,7 @@ def _draw_dots(
     axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
 
 
-def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: FramePairs, radius: float) -> None:
+def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[Outcome], pairs: FramePairs, radius: float) -> None:
     ego_from_reference = inverse(pairs.reference_from_ego[frame])
     counts = np.zeros(3, dtype=int)
     for outcome in outcomes:

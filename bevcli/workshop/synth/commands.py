@@ -35,14 +35,14 @@ def demo(options: DemoOptions) -> None:
 
     The demo model was trained on rendered drives only.
     """
-    from bevcli.cli.commands import viz
+    from bevcli.cli.commands import show
     from bevcli.cli.run import run
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
     run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
     if options.view:
-        viz(options.out / "results/recording.rrd", ViewOptions())
+        show(options.out / "results/recording.rrd", ViewOptions())
 
 
 def is_compiled(function: Any) -> bool:

@@ -6,8 +6,6 @@ first batch. A clip from a process comes through a file in memory or, where that
 files.
 """
 
-from __future__ import annotations
-
 import mmap
 import os
 import pickle
@@ -181,23 +179,23 @@ class Batch:
     inputs: tuple[ModelInputs, ...]
     world_from_bev: Tensor
     targets: tuple[Targets, ...]
-    plain: Batch | None = None
+    plain: "Batch | None" = None
     distortions: tuple[Tensor, ...] = ()
 
-    def to(self, device: torch.device) -> Batch:
+    def to(self, device: torch.device) -> "Batch":
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
         inputs = tuple(inputs.to(device) for inputs in self.inputs)
         plain = None if self.plain is None else self.plain.to(device)
         targets = tuple(targets.to(device) for targets in self.targets)
         return Batch(inputs, self.world_from_bev, targets, plain, tuple(upload(x, device) for x in self.distortions))
 
-    def pinned(self) -> Batch:
+    def pinned(self) -> "Batch":
         """A copy whose images and targets are in memory that a GPU reads by itself."""
         inputs = tuple(replace(step, images=pinned(step.images)) for step in self.inputs)
         plain = None if self.plain is None else self.plain.pinned()
         return replace(self, inputs=inputs, targets=tuple(targets.pinned() for targets in self.targets), plain=plain)
 
-    def normalised(self, image: ImageConfig) -> Batch:
+    def normalised(self, image: ImageConfig) -> "Batch":
         """The batch with its images distorted and normalised, where they are in bytes."""
         if self.inputs[0].images.dtype != torch.uint8:
             return self

@@ -3,8 +3,6 @@
 The boxes and masks of one frame are made on the CPU; a batch has them padded, so that one copy moves them to a GPU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -294,15 +292,15 @@ class Targets:
     segmentation: PaddedMasks | None
     truths: tuple[Any, ...] = ()
 
-    def to(self, device: torch.device) -> Targets:
+    def to(self, device: torch.device) -> "Targets":
         """A copy on a device."""
         return self._changed(lambda tensor: upload(tensor, device))
 
-    def pinned(self) -> Targets:
+    def pinned(self) -> "Targets":
         """A copy in memory that a GPU reads by itself."""
         return self._changed(pinned)
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> Targets:
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> "Targets":
         parts = (self.detection, self.perspective, self.segmentation)
         boxes, all_boxes, masks = exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts)))
         return Targets(boxes, all_boxes, masks, self.truths)

@@ -1,7 +1,5 @@
 """The training loop: clips in; updates of the weights, checkpoints and learning curves out."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import math

@@ -3,8 +3,6 @@
 Each has a memory of its own embeddings, and all attend to each other before the next frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -65,16 +63,16 @@ class Memories:
     is_empty: Tensor
     wait: Tensor
 
-    def changed(self, change: Callable[[Tensor], Tensor]) -> Memories:
+    def changed(self, change: Callable[[Tensor], Tensor]) -> "Memories":
         """The memories after a change of every tensor."""
         return Memories(change(self.embeddings), change(self.is_empty), change(self.wait))
 
-    def __getitem__(self, selection: Tensor) -> Memories:
+    def __getitem__(self, selection: Tensor) -> "Memories":
         """The memories of a mask (K,) bool."""
         return self.changed(lambda column: column[selection])
 
     @staticmethod
-    def empty(like: Tensor, length: int) -> Memories:
+    def empty(like: Tensor, length: int) -> "Memories":
         """The memories of K new tracks. like: (K, C), embeddings of the tracks. length: M."""
         count, channels = like.shape
         return Memories(
@@ -83,7 +81,7 @@ class Memories:
             torch.zeros(count, dtype=torch.int64, device=like.device),
         )
 
-    def followed_by(self, others: Memories) -> Memories:
+    def followed_by(self, others: "Memories") -> "Memories":
         """These memories, then the others."""
         columns = zip(vars(self).values(), vars(others).values(), strict=True)
         return Memories(*map(torch.cat, columns))
@@ -114,15 +112,15 @@ class TrackQueries:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def ended(self) -> TrackQueries:
+    def ended(self) -> "TrackQueries":
         """No track; the identities go on where they are."""
         return self._each(lambda column: column[:0])
 
-    def to(self, device: torch.device) -> TrackQueries:
+    def to(self, device: torch.device) -> "TrackQueries":
         """The same tracks on a device."""
         return self._each(lambda column: column.to(device))
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> TrackQueries:
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "TrackQueries":
         queries = change(self.position), change(self.content), change(self.box_codes)
         return TrackQueries(
             *queries, change(self.ids), change(self.misses), self.memories.changed(change), self.next_id

@@ -1,0 +1,140 @@
+"""`record`: writes a drive with its labels, and boxes of one or two models against them, into a recording."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+from bevcli.errors import InputError
+from bevcli.evaluation.inputs import ScoredInput, boxes_of_drive, open_predictions
+from bevcli.evaluation.matching import ranges_m
+from bevcli.frame import Frame, Sequence as Drive
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.printing import counted
+from bevcli.recording.log_static import RecordedBoxes
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import Recording
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, count_classes
+from bevcli.sequences.open import open_sequence
+
+MOST = 2  # models: each has a colour
+GivenBoxes = str | Path | Sequence[Boxes3D]
+
+
+def record(
+    drive: Drive | str | Path,
+    boxes: GivenBoxes | Mapping[str, GivenBoxes] | None = None,
+    path: str | Path = "recording.rrd",
+    *,
+    score: float | None = None,
+    class_map: Mapping[str, str] | None = None,
+    report: Callable[[str], object] = lambda line: None,
+    on_frame: Callable[[Frame], object] = lambda frame: None,
+) -> Path:
+    """Write a drive and its labels, without a model, into a recording, which `bevcli viz` and `bevcli.show` open.
+
+        bevcli.record(drive)  # labels, in the colours of their classes
+        bevcli.record(drive, "results_nusc.json")  # boxes of one model; labels pale; misses and false positives red
+        bevcli.record(drive, {"old": "old.json", "new": "new.json"}, "compared.rrd")  # two models, each in a colour
+
+    Args:
+        drive: of `open_sequence`, or its path.
+        boxes: of one model, or name -> boxes of one or two: a file that `bevcli.evaluate` reads, the folder of a run,
+            or boxes in the world frame for each frame of the drive. None for labels alone.
+        path: the .rrd file to write; an existing one is replaced.
+        score: boxes scored below this are left out; None for 0.25.
+        class_map: class names in the files -> the classes of the labels.
+        report: called with lines that say which frames were matched, and how, or that there are no labels.
+        on_frame: called with each frame after it was written.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: a file is missing or wrong, or has no frame of the drive.
+        OutputError: the recording cannot be written.
+    """
+    drive = open_sequence(drive, class_map=class_map or {}) if isinstance(drive, str | Path) else drive
+    given = dict(boxes) if isinstance(boxes, Mapping) else {} if boxes is None else {_name_of(boxes): boxes}
+    if len(given) > MOST:
+        raise InputError(f"`boxes`: found those of {len(given)} models (expected at most {MOST}): leave some out")
+    inputs = {name: _open(each, name, drive, class_map) for name, each in given.items()}
+    of_frames = [_by_frame(drive, name, each, report) for name, each in inputs.items()]
+    options = RecordingOptions(level="minimal") if score is None else RecordingOptions(level="minimal", score=score)
+    labelled = 0
+    with Recording(path, drive, _recorded(drive, inputs), options) as recording:
+        for place in range(len(drive.stamps)):
+            frame = drive.load(place)
+            recording.log(frame, [boxes[place] for boxes in of_frames])
+            labelled += frame.ground_truth is not None
+            on_frame(frame)
+    if labelled < len(drive.stamps):
+        report(f"{drive.name}: no labels in {len(drive.stamps) - labelled} of {counted(len(drive.stamps), 'frames')}")
+    return Path(path)
+
+
+def names_of(paths: Iterable[Path]) -> dict[str, Path]:
+    """Short names of files of boxes: that of the file, or the folder of a run, with the folder above where they agree.
+
+    Raises InputError where a file is given twice.
+    """
+    given = list(paths)
+    short = [path.resolve().parent if path.name == "predictions.json" else path for path in given]
+    names = [_name_of(path) for path in short]
+    if len(set(names)) < len(names):
+        names = [f"{path.resolve().parent.name}/{name}" for path, name in zip(short, names, strict=True)]
+    if len(set(names)) < len(names):
+        raise InputError(f"`boxes`: {given[0]} and {given[-1]} have the same name: rename one")
+    return dict(zip(names, given, strict=True))
+
+
+def _name_of(boxes: GivenBoxes) -> str:
+    """The name of a file or folder without its ending."""
+    if not isinstance(boxes, str | Path):
+        return "boxes"
+    path = Path(boxes).resolve()
+    return path.name if path.is_dir() else path.stem
+
+
+def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, str] | None) -> ScoredInput:
+    """The boxes of one model. Raises InputError."""
+    if isinstance(boxes, str | Path):
+        return open_predictions(Path(boxes), class_map)
+    if len(boxes) != len(drive.stamps):
+        raise InputError(f"`boxes`: {name}: found {len(boxes)} (expected {len(drive.stamps)}, one for each frame)")
+    frames = tuple(FrameBoxes(stamp, None, each) for stamp, each in zip(drive.stamps, boxes, strict=True))
+    return ScoredInput(BoxesFile("world" if drive.has_ego_motion else "ego", frames), Path(name))
+
+
+def _by_frame(drive: Drive, name: str, given: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
+    """The boxes of one model for each frame of the drive. Raises InputError, which names the model."""
+    try:
+        of_frames, key = boxes_of_drive(given.boxes, drive)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    found = sum(boxes is not None for boxes in of_frames)
+    rest = len(given.boxes.frames) - found
+    more = f"; not in the drive: {counted(rest, 'further frames')}" if rest else ""
+    report(f"{name}: has boxes of {found} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
+    return of_frames
+
+
+def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
+    """The classes of the boxes, and where they are scored."""
+    classes: dict[str, ObjectClass] = dict(NUSCENES_CLASSES)
+    if not inputs:  # labels alone have no class that is not theirs
+        counts = drive.class_counts or _label_counts(drive)
+        classes |= {name: ObjectClass(name) for name in sorted(counts.keys() - classes.keys())}
+        return RecordedBoxes(classes=classes)
+    first = next(iter(inputs.values()))
+    classes = dict(first.boxes.classes or classes)
+    limit = first.range_m or float("inf")
+    ranges = {name: min(range_m, limit) for name, range_m in ranges_m(classes.values()).items()}
+    untrained = any(each.boxes.extras.get("untrained") is True for each in inputs.values())
+    return RecordedBoxes(tuple(inputs), classes, ranges, untrained)
+
+
+def _label_counts(drive: Drive) -> Counter[str]:
+    """The number of labels by class."""
+    truths = (drive.ground_truth_frame(place).ground_truth for place in range(len(drive.stamps)))
+    return count_classes(boxes for boxes in truths if boxes is not None)

@@ -1,0 +1,268 @@
+"""`compare`: the scores of two models on the same frames, their differences with intervals, and the worst frames."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevcli.errors import ConfigError, InputError
+from bevcli.evaluation.detection import ScoreTable
+from bevcli.evaluation.evaluate import Scores, finite, number, read, score
+from bevcli.evaluation.inputs import Compared
+from bevcli.printing import aligned, counted
+from bevcli.registry import load
+from bevcli.workshop.scores.bootstrap import draw_frames, resampled
+from bevcli.workshop.scores.worst_frames import MODELS, WorstFrames, find_worst_frames
+
+CONFIDENCE = 0.95
+RESAMPLES = 1000
+WORST = 3
+FEW_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One score of the models A and B.
+
+    Attributes:
+        values: of A and of B.
+        interval: of the difference, 95 %, lower end first; NaN of a single frame.
+    """
+
+    values: tuple[float, float]
+    interval: tuple[float, float]
+
+    @property
+    def difference(self) -> float:
+        """B - A: above 0 where B is better."""
+        return self.values[1] - self.values[0]
+
+    @property
+    def better(self) -> str:
+        """ "A" or "B" where the interval is on one side of 0, else ""."""
+        low, high = self.interval
+        return "B" if low > 0 else "A" if high < 0 else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"values": list(self.values), "difference": self.difference, "interval": list(self.interval)}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of `compare`.
+
+    Attributes:
+        files: the predictions of A and of B.
+        scores: of A and of B, on the frames, classes and ranges that both have.
+        classes: AP by class.
+        mean_ap: mAP.
+        nd_score: NDS.
+        worst: the frames with most missed and most invented boxes, and those where A and B differ most.
+        resamples: number of resamples of the frames for the intervals.
+        notes: what was assumed or left out, one line each.
+    """
+
+    files: tuple[Path, Path]
+    scores: tuple[Scores, Scores]
+    classes: Mapping[str, Difference]
+    mean_ap: Difference
+    nd_score: Difference
+    worst: WorstFrames
+    resamples: int
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it as a dict for JSON. docs/scoring.md explains the keys."""
+        content: dict[str, Any] = {
+            "predictions": list(map(str, self.files)),
+            "frames": self.scores[0].detection.frame_count,
+            "resamples": self.resamples,
+            "confidence": CONFIDENCE,
+            "mean_ap": self.mean_ap.to_dict(),
+            "nd_score": self.nd_score.to_dict(),
+            "mean_dist_aps": {name: each.to_dict() for name, each in self.classes.items()},
+            **self.worst.to_dict(),
+            "scores": [scores.to_dict() for scores in self.scores],
+            "notes": list(self.notes),
+        }
+        return {key: finite(value) for key, value in content.items()}
+
+    def table(self) -> str:
+        """The differences and the worst frames as text for a terminal."""
+        first = self.scores[0]
+        boxes = {name: each.ground_truth_count for name, each in first.detection.overall.classes.items()}
+        rows: list[tuple[str, ...]] = [
+            ("class", "boxes", "AP A", "AP B", "B - A", f"{100 * CONFIDENCE:.0f} % interval", "better")
+        ]
+        rows += [_row(name, str(boxes[name]), each) for name, each in self.classes.items() if boxes[name]]
+        rows += [_row("mAP", str(sum(boxes.values())), self.mean_ap), _row("NDS", "", self.nd_score)]
+        files = [f"{model}: {file}" for model, file in zip(MODELS, self.files, strict=True)]
+        frames = counted(first.detection.frame_count, "frames")
+        how = f"{frames}, matched by {first.pairs.matched_by}; intervals from {self.resamples} resamples of the frames"
+        return "\n\n".join(["\n".join([*files, how]), aligned(rows), *self.worst.tables()])
+
+    def write_plots(self, folder: Path | str) -> list[Path]:
+        """Write the curves of both as a PNG file into a folder, made where it is missing. Raises OutputError.
+
+        Returns its path, in a list.
+        """
+        paths: list[Path] = load("bevcli.plots", "comparison")(self, Path(folder))
+        return paths
+
+
+def _row(name: str, boxes: str, each: Difference) -> tuple[str, ...]:
+    low, high = map(_signed, each.interval)
+    return (name, boxes, *map(number, each.values), _signed(each.difference), f"{low} to {high}", each.better)
+
+
+def _signed(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:+.3f}"
+
+
+def compare(
+    a: Path | str,
+    b: Path | str,
+    ground_truth: Path | str,
+    max_range: float | None = None,
+    count_missing: bool = False,
+    *,
+    resamples: int = RESAMPLES,
+    scene: str | None = None,
+    version: str | None = None,
+    split: str | None = None,
+    class_map: Mapping[str, str] | None = None,
+    **results: int | None,
+) -> Comparison:
+    """Compare the boxes of two models on the same frames.
+
+    A difference is the score of B minus that of A. Its interval holds the central 95 % of the differences of many
+    resamples of the frames, which are drawn with replacement and are the same for both models.
+
+    Args:
+        a, b: predictions as `bevcli.evaluate` takes them.
+        ground_truth: see `bevcli.evaluate`.
+        max_range: see there. By default the range of both ends with the smaller BEV grid.
+        count_missing: see there. Frames that only one model has are left out without it.
+        resamples: number of resamples.
+        scene, version, split, class_map: see `bevcli.evaluate`.
+        results: worst=3: length of the lists of frames.
+
+    Returns:
+        The comparison. Without another range or other frames, the scores are those of `bevcli.evaluate`.
+
+    Raises:
+        InputError: as there, or the two have no frame or class in common.
+        ConfigError: max_range or resamples is not positive.
+    """
+    worst = results.pop("worst", None)
+    if further := [name for name, value in results.items() if value]:
+        raise InputError(
+            f"`{further[0]}=True`: two files of predictions are compared by their boxes only: leave it out"
+        )
+    if resamples < 1:
+        raise ConfigError(f"`resamples` is {resamples} (expected 1 or more)")
+    which: dict[str, Any] = {"scene": scene, "version": version, "split": split, "class_map": class_map}
+    models = [read(path, ground_truth, count_missing, **which) for path in (a, b)]
+    models, notes = _on_common_ground(models, max_range)
+    scores = [score(model) for model in models]
+    models = [replace(model, detection=each.detection) for model, each in zip(models, scores, strict=True)]
+    count = scores[0].detection.frame_count
+    if count < FEW_FRAMES:
+        notes.append(f"the intervals are too narrow for {counted(count, 'frames')} (expected {FEW_FRAMES} or more)")
+    differences = _differences(scores, resamples)
+    return Comparison(
+        (Path(a), Path(b)),
+        (scores[0], scores[1]),
+        {name: differences[name] for name in scores[0].detection.overall.classes},
+        differences["mAP"],
+        differences["NDS"],
+        find_worst_frames(models, worst or WORST),
+        resamples,
+        (*notes, *_joined_notes(scores)),
+    )
+
+
+def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tuple[list[Compared], list[str]]:
+    """The frames, the classes and the range that both models have, and notes about what is left out."""
+    notes = []
+    keys = [[(true.stamp, true.extras.get("sample_token")) for true in model.pairs.ground_truth] for model in models]
+    places = [{key: place for place, key in enumerate(own)} for own in keys]
+    common = [key for key in keys[0] if key in places[1]]
+    if not common:
+        raise InputError("the two predictions have no frame of the ground truth in common: choose two of one drive")
+    if len(common) < max(map(len, keys)):
+        frames = counted(len(common), "frames")
+        notes.append(f"only the {frames} of both are compared: A has {len(keys[0])}, B has {len(keys[1])}")
+    classes = {name: kind for name, kind in models[0].classes.items() if name in models[1].classes}
+    if not classes:
+        raise InputError("the two models have no class in common: rename classes with `class_map`")
+    others = [name for model in models for name in model.classes if name not in classes]
+    if others:
+        notes.append(f"only classes of both are compared, without {', '.join(dict.fromkeys(others))}")
+    for name, kind in classes.items():
+        classes[name] = replace(kind, range_m=min(kind.range_m, models[1].classes[name].range_m))
+    ends = [model.predictions.range_m for model in models if model.predictions and model.pairs.ego_pose_known]
+    known = [end for end in ends if end is not None and end < max(kind.range_m for kind in classes.values())]
+    if max_range is None and known:
+        max_range = min(known)
+        notes.append(
+            f"nothing beyond {max_range:g} m is scored: the BEV grid of a model ends there (`max_range=M` sets another "
+            "limit)"
+        )
+    return [
+        replace(_at(model, [own[key] for key in common]), classes=classes, max_range_m=max_range)
+        for model, own in zip(models, places, strict=True)
+    ], notes
+
+
+def _at(model: Compared, places: list[int]) -> Compared:
+    """Only the frames at these places of the pairs, without maps."""
+    pairs = model.pairs
+    kept = replace(
+        pairs,
+        predictions=tuple(pairs.predictions[place] for place in places),
+        ground_truth=tuple(pairs.ground_truth[place] for place in places),
+        reference_from_ego=pairs.reference_from_ego[places],
+    )
+    assert model.predictions is not None
+    assert model.truth is not None
+    predictions, truth = replace(model.predictions, maps=None), replace(model.truth, maps=None)
+    return replace(model, pairs=kept, predictions=predictions, truth=truth)
+
+
+def _joined_notes(scores: Sequence[Scores]) -> list[str]:
+    """The notes of both, and with the name of the model those of one."""
+    of_a, of_b = (each.notes for each in scores)
+    only_a = [f"A: {note}" for note in of_a if note not in of_b]
+    only_b = [f"B: {note}" for note in of_b if note not in of_a]
+    return [*(note for note in of_a if note in of_b), *only_a, *only_b]
+
+
+def _differences(scores: Sequence[Scores], resamples: int) -> dict[str, Difference]:
+    """AP by class, "mAP" and "NDS"."""
+    detections = [each.detection for each in scores]
+    count = detections[0].frame_count
+    draws = draw_frames(count, resamples)
+    drawn = [[_numbers(table) for table in resampled(detection, draws)] for detection in detections]
+    of_a, of_b = (_numbers(detection.overall) for detection in detections)
+    found = {}
+    for name in of_a:
+        gains = [b[name] - a[name] for a, b in zip(*drawn, strict=True)]
+        found[name] = Difference((of_a[name], of_b[name]), interval(gains) if count > 1 else (math.nan, math.nan))
+    return found
+
+
+def _numbers(table: ScoreTable) -> dict[str, float]:
+    """AP by class, "mAP" and "NDS"."""
+    aps = {name: scores.mean_ap for name, scores in table.classes.items()}
+    return {**aps, "mAP": table.mean_ap, "NDS": table.nd_score}
+
+
+def interval(differences: Sequence[float]) -> tuple[float, float]:
+    """The ends between which 95 % of the values lie, as many below as above."""
+    low, high = np.quantile(differences, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return float(low), float(high)

@@ -1,0 +1,201 @@
+"""The frames with most missed and most invented boxes, of one model or of two, and those where two differ most."""
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.evaluation.detection import ClassMatches
+from bevcli.evaluation.inputs import Compared
+from bevcli.evaluation.matching import ScoredBoxes
+from bevcli.printing import aligned
+from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.sequences.format import is_drive
+from bevcli.sequences.nuscenes import is_nuscenes_root
+from bevcli.workshop.scores import WorstOptions
+
+MODELS = ("A", "B")
+
+
+class Outcome(NamedTuple):
+    """One class above the score threshold with the largest F1: ground truth found and missed, and false positives."""
+
+    found: ScoredBoxes
+    missed: ScoredBoxes
+    false: ScoredBoxes
+
+
+def best_outcome(matches: ClassMatches, row: int) -> Outcome:
+    """Cut a class at the score with the largest F1. row: index of the matching distance."""
+    is_match = matches.matched[row] >= 0
+    f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
+    kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
+    is_found = np.zeros(len(matches.ground_truth), dtype=bool)
+    is_found[matches.matched[row][kept & is_match]] = True
+    truth = matches.ground_truth
+    return Outcome(truth[is_found], truth[~is_found], matches.predictions[kept & ~is_match])
+
+
+@dataclass(frozen=True)
+class WorstFrames:
+    """The worst of F frames, for M models, which are one or two.
+
+    Attributes:
+        frames: of the ground truth.
+        boxes: (F,), number of ground truths that are scored.
+        missed: (M, F), number of ground truths that a model does not find.
+        invented: (M, F), number of its false positives.
+        count: the largest number of frames in a list.
+        distance_m: the matching distance.
+        command: the words of `bevcli viz` with the boxes; empty if the ground truth is not a drive.
+        scene_starts: index of the first frame by scene, if `bevcli viz` should open a scene whose frames count from 0.
+    """
+
+    frames: tuple[FrameBoxes, ...]
+    boxes: NDArray[np.int64]
+    missed: NDArray[np.int64]
+    invented: NDArray[np.int64]
+    count: int
+    distance_m: float
+    command: tuple[str, ...] = ()
+    scene_starts: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lists(self) -> dict[str, list[int]]:
+        """The worst frames first, as indices, by "missed" and "invented"; of two "a_missed" and so on, "difference"."""
+        if len(self.missed) == 1:
+            return {"missed": self._largest(self.missed[0]), "invented": self._largest(self.invented[0])}
+        lists = {
+            f"{model.lower()}_{kind}": self._largest(counts[place])
+            for place, model in enumerate(MODELS)
+            for kind, counts in (("missed", self.missed), ("invented", self.invented))
+        }
+        mistakes = self.missed + self.invented
+        return {"difference": self._largest(abs(mistakes[0] - mistakes[1])), **lists}
+
+    def _largest(self, counts: NDArray[np.int64]) -> list[int]:
+        """The indices of the largest counts above 0; of equal ones the earlier first."""
+        order = np.argsort(-counts, kind="stable")[: self.count]
+        return [int(index) for index in order if counts[index] > 0]
+
+    @property
+    def view(self) -> str | None:
+        """The command that shows the worst frame: where two differ most, or with most missed boxes."""
+        first = next((indices[0] for indices in self.lists.values() if indices), None)
+        if first is None or not self.command:
+            return None
+        stamp = self.frames[first].stamp
+        if stamp.scene not in self.scene_starts:
+            return shlex.join((*self.command, "--frame", str(stamp.index)))
+        index = stamp.index - self.scene_starts[stamp.scene]
+        return shlex.join((*self.command, "--scene", stamp.scene, "--frame", str(index)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The lists as dicts for JSON, and the command."""
+        lists = {name: [self._entry(index) for index in indices] for name, indices in self.lists.items()}
+        return {"worst_frames": {**lists, "view": self.view}}
+
+    def _entry(self, index: int) -> dict[str, Any]:
+        frame = self.frames[index]
+        token = {"sample_token": frame.extras["sample_token"]} if "sample_token" in frame.extras else {}
+        counts = dict(zip(self._columns(), self._counts(index), strict=True))
+        return {
+            "frame": frame.stamp.index,
+            "scene": frame.stamp.scene,
+            "timestamp_ns": frame.stamp.timestamp_ns,
+            **token,
+            "ground_truth_boxes": int(self.boxes[index]),
+            **{name.lower().replace(" ", "_"): count for name, count in counts.items()},
+        }
+
+    def _columns(self) -> list[str]:
+        models = ("",) if len(self.missed) == 1 else tuple(f"{model} " for model in MODELS)
+        return [f"{model}{kind}" for model in models for kind in ("missed", "invented")]
+
+    def _counts(self, index: int) -> list[int]:
+        pairs = zip(self.missed[:, index].tolist(), self.invented[:, index].tolist(), strict=True)
+        return [count for pair in pairs for count in pair]
+
+    def tables(self) -> Iterable[str]:
+        """One table of all lists, and the command."""
+        rows = [["worst frames", "", "boxes", *self._columns()]]
+        several = len({frame.stamp.scene for frame in self.frames}) > 1
+        for name, indices in self.lists.items():
+            for place, index in enumerate(indices):
+                stamp = self.frames[index].stamp
+                frame = f"{stamp.scene} frame {stamp.index}" if several else f"frame {stamp.index}"
+                counts = map(str, (self.boxes[index], *self._counts(index)))
+                rows.append(["" if place else _heading(name), frame, *counts])
+        yield f"{aligned(rows, left=(0, 1))}\n(scores from the largest F1 of each class at {self.distance_m:g} m on)"
+        if self.view is not None:
+            yield f"Look at it: {self.view}"
+
+
+def _heading(name: str) -> str:
+    """Such as "most missed", "A most missed" and "largest difference"."""
+    *model, kind = name.split("_")
+    return "largest difference" if kind == "difference" else " ".join([*map(str.upper, model), "most", kind])
+
+
+def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
+    """The worst frames of one model or two, whose boxes are scored. Two have the same frames."""
+    missed, invented, boxes = [], [], np.zeros(0, np.int64)
+    for model in models:
+        assert model.detection is not None
+        config, frame_count = model.detection.config, model.detection.frame_count
+        outcomes = [best_outcome(matches, config.error_row) for matches in model.detection.matches]
+        missed.append(_by_frame([outcome.missed for outcome in outcomes], frame_count))
+        invented.append(_by_frame([outcome.false for outcome in outcomes], frame_count))
+        boxes = _by_frame([part.ground_truth for part in model.detection.matches], frame_count)
+    return WorstFrames(
+        models[0].pairs.ground_truth,
+        boxes,
+        np.stack(missed),
+        np.stack(invented),
+        count,
+        config.error_distance_m,
+        _command(models),
+        _scene_starts(models[0]),
+    )
+
+
+def _by_frame(parts: Sequence[ScoredBoxes], frame_count: int) -> NDArray[np.int64]:
+    """(F,), number of boxes."""
+    return np.bincount(np.concatenate([part.frames for part in parts]), minlength=frame_count)
+
+
+def _command(models: Sequence[Compared]) -> tuple[str, ...]:
+    """The words of `bevcli viz` for the boxes on their drive; none if the ground truth is not in a drive."""
+    truth, files = models[0].truth, [model.predictions.path for model in models if model.predictions is not None]
+    drive = None if truth is None else _drive_of(truth.path)
+    if drive is None or len(files) < len(models):
+        return ()
+    boxes = [word for file in files for word in ("--boxes", str(file))]
+    selection = [word for name, value in models[0].selection.items() for word in (f"--{name}", value)]
+    return ("bevcli", "viz", str(drive), *boxes, *selection)
+
+
+def _drive_of(path: Path) -> Path | None:
+    """The drive of ground truth."""
+    folder = path.parent if path.name == "ground_truth.json" else path
+    return folder if is_drive(folder) else None
+
+
+def _scene_starts(model: Compared) -> dict[str, int]:
+    """Of a nuScenes root, whose frames count from 0 in the scene that is opened; without it, all scenes are shown."""
+    truth, starts = model.truth, dict[str, int]()
+    if truth is not None and "scene" not in model.selection and is_nuscenes_root(truth.path):
+        for frame in truth.boxes.frames:
+            starts.setdefault(frame.stamp.scene, frame.stamp.index)
+    return starts
+
+
+def score_worst_frames(options: WorstOptions, compared: Compared) -> WorstFrames:
+    """The worst frames of one model, for `Scorer`."""
+    assert options.worst
+    return find_worst_frames([compared], options.worst)

@@ -1,0 +1,222 @@
+"""A drive is recorded without a model: its labels alone, and boxes of one or two files against them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
+
+from bevcli.errors import InputError
+from bevcli.evaluation.submission import write_submission
+from bevcli.frame import Frame
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.recording import entities
+from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.record import names_of, record
+from bevcli.recording.writer import Recording
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
+from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
+from bevcli.viewer.video import CameraImages, draw_frame, tiles
+
+CAR = (255, 158, 44)
+ORANGE, VIOLET = entities.LAYER_COLORS
+
+
+class Labelled(MemorySequence):
+    """A drive with a car, and with a bicycle that `boxes_of` does not have."""
+
+    def load(self, place: int) -> Frame:
+        return replace(with_truth(super().load(place)), sample_token=f"token-{place}")
+
+
+def boxes_of(drive: MemorySequence, place: int) -> Boxes3D:
+    """The boxes of `recorded_drive` in the world frame."""
+    frame = drive.load(place)
+    return boxes_ahead().transformed(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
+
+
+def boxes_file(drive: MemorySequence, places: range) -> BoxesFile:
+    stamped = [(drive.load(place), boxes_of(drive, place)) for place in places]
+    frames = [FrameBoxes(f.stamp, f.world_from_ego, b, {"sample_token": f.sample_token}) for f, b in stamped]
+    return BoxesFile("world", tuple(frames))
+
+
+def frames_of(path: Path) -> list[RecordedFrame]:
+    return list(RecordingReader(path).frames())
+
+
+def color(frame: RecordedFrame, entity: str, component: str = "Boxes3D:colors") -> set[tuple[int, ...]]:
+    """Without opacity."""
+    return {tuple(packed.to_bytes(4, "big")[:3]) for packed in frame.integers(entity, component)}
+
+
+def numbers_of(value) -> list:
+    """The numbers and texts in lists of lists."""
+    return [number for each in value for number in numbers_of(each)] if isinstance(value, list) else [value]
+
+
+def test_labels_alone_are_boxes_in_their_colours(tmp_path):
+    lines: list[str] = []
+    first, _ = frames_of(record(Labelled(2), path=tmp_path / "r.rrd", report=lines.append))
+    assert first.texts(entities.BOXES, "name") == ["car", "bicycle"]
+    in_image = color(first, entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:colors")
+    assert CAR in in_image
+    assert len(in_image) == 2
+    assert not first.has(entities.GROUND_TRUTH, "name")
+    assert first.texts(entities.overlay("CAM_FRONT", "boxes/labels"), "Points2D:labels") == ["car", "bicycle"]
+    assert first.texts(entities.RUN, "title") == ["memory · labels"]
+    assert not lines
+
+
+def test_boxes_of_one_file_are_drawn_as_those_of_a_model(tmp_path):
+    drive = Labelled(2)
+    with Recording(tmp_path / "model.rrd", drive, NamedModel(), RecordingOptions("minimal")) as recording:
+        for frame in map(drive.load, range(2)):
+            recording.log(frame, predict(frame))
+    write_boxes(boxes_file(drive, range(2)), tmp_path / "mine.json")
+    record(drive, tmp_path / "mine.json", tmp_path / "file.rrd")
+    pairs = list(zip(frames_of(tmp_path / "model.rrd"), frames_of(tmp_path / "file.rrd"), strict=True))
+    drawn = [entity for entity in pairs[0][0].rows if entity.endswith(("boxes", "labels", "truth", "missed", "false"))]
+    assert len(drawn) > 20
+    for of_model, of_file in pairs:
+        for entity in drawn:
+            for component, value in of_model.rows[entity].items():
+                both = [numbers_of(each.as_py()) for each in (value, of_file.rows[entity][component])]
+                assert both[0] == pytest.approx(both[1], abs=1e-4), f"{entity} {component}"
+
+
+def test_beyond_the_range_of_its_class_nothing_is_missed(tmp_path):
+    """nuScenes scores barriers up to 30 m, cars up to 50 m."""
+    drive = Labelled(1)
+    far = replace(boxes_ahead()[[0, 0]], classes=np.array(["barrier", "car"]), centers=np.array([[0, 35, 0.0]] * 2))
+    frame = drive.load(0)
+    truth = far.transformed(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
+    drive.load = lambda place: replace(frame, ground_truth=truth)  # type: ignore[method-assign]
+    [missed] = frames_of(record(drive, [Boxes3D.empty()], tmp_path / "missed.rrd"))
+    assert missed.texts(entities.MISSED, "name") == ["car"]
+    assert missed.texts(entities.GROUND_TRUTH, "name") == ["barrier"]
+    drive.load = lambda place: replace(frame, ground_truth=Boxes3D.empty())  # type: ignore[method-assign]
+    [false] = frames_of(record(drive, [truth], tmp_path / "false.rrd"))
+    assert len(false.strips(entities.BEV_FALSE, "LineStrips2D:strips")) == 2  # the two diagonals of one box
+
+
+def test_frames_of_a_submission_are_matched_by_token(tmp_path):
+    """Of a frame that the file lacks, no label is missed, and no trail of the frame before stays."""
+    drive, lines = Labelled(3), list[str]()
+    write_submission(boxes_file(drive, range(2)), tmp_path / "results_nusc.json")
+    first, _, last = frames_of(record(drive, tmp_path / "results_nusc.json", tmp_path / "r.rrd", report=lines.append))
+    assert lines == ["results_nusc: has boxes of 2 of 3 frames, matched by sample_token"]
+    assert first.texts(entities.MISSED, "name") == ["bicycle"]
+    assert first.texts(entities.BOXES, "name") == ["car", "pedestrian"]  # the bus is below the score
+    assert last.texts(entities.MISSED, "name") == last.texts(entities.BOXES, "name") == []
+    assert last.texts(entities.GROUND_TRUTH, "name") == ["car", "bicycle"]
+    assert last.texts(entities.EVENTS, "TextLog:text") == ["frame 2: results_nusc does not have this frame"]
+
+
+def test_trails_end_where_a_file_lacks_a_frame(tmp_path):
+    drive = Labelled(2)
+    tracked = [replace(boxes_of(drive, 0), instances=np.array(["1", "2", "3"]))]
+    frames = BoxesFile("world", (FrameBoxes(drive.stamps[0], drive.pose(0), tracked[0]),))
+    write_boxes(frames, tmp_path / "a.json")
+    first, last = frames_of(record(drive, tmp_path / "a.json", tmp_path / "r.rrd"))
+    assert entities.track("car", "1") in first.rows
+    assert entities.track("car", "1") not in last.rows
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """Two models: the second one has one box, 1 m beside that of the first one."""
+    drive, folder = Labelled(1), tmp_path_factory.mktemp("two")
+    moved = boxes_of(drive, 0)[[0]]
+    boxes = {"a/b c": [boxes_of(drive, 0)], "new": [replace(moved, centers=moved.centers + (1, 0, 0))]}
+    return record(drive, boxes, folder / "two.rrd", score=0.0)
+
+
+def test_two_models_are_layers_in_two_colours(two):
+    [frame] = frames_of(two)
+    for name, own, count in (("a/b c", ORANGE, 3), ("new", VIOLET, 1)):
+        assert len(frame.texts(entities.layer(entities.WORLD, name), "name")) == count
+        assert color(frame, entities.layer(entities.WORLD, name)) == {own}
+        assert color(frame, entities.layer(entities.BEV, name), "LineStrips2D:colors") == {own}
+        in_image = entities.layer(entities.camera("CAM_FRONT"), name)
+        assert color(frame, in_image, "LineStrips2D:colors") == {own}
+        assert color(frame, f"{in_image}/labels", "Points2D:colors") <= {own}
+    assert frame.texts(entities.GROUND_TRUTH, "name") == ["car", "bicycle"]
+    assert not frame.texts(entities.MISSED, "name")
+    assert frame.values(entities.BOX_CURVES, "Scalars:scalars") == [3, 1]
+
+
+def test_no_label_of_two_models_covers_another(two):
+    [frame] = frames_of(two)
+    parts = [f"{entities.layer(entities.camera('CAM_FRONT'), name)}/labels" for name in ("a/b c", "new")]
+    heights = np.concatenate([frame.array(part, "Points2D:positions", 2) for part in parts])
+    assert len(heights) > 1
+    apart = np.abs(heights[:, None] - heights)[~np.eye(len(heights), dtype=bool)]
+    assert ((apart[:, 0] > 30) | (apart[:, 1] > 14)).all()
+
+
+def test_the_summary_and_the_video_name_both_models(two):
+    [frame] = frames_of(two)
+    assert "memory · a/b c · new" in summarise(two)
+    assert "  boxes     4\n          3 a/b c\n          1 new\n" in summarise(two)
+    canvas = draw_frame(frame, tiles(frame), CameraImages()).astype(int)
+    for own in (ORANGE, VIOLET):
+        near = np.abs(canvas - own[::-1]).sum(-1) < 30
+        assert near[:500, :1280].any()
+        assert near[:, 1280:].any()
+        assert near[500:, :1280].sum() > 150  # the legend
+    with pytest.raises(InputError, match="compares a/b c and new"):
+        read_recording(two)
+
+
+def test_the_legend_names_what_is_drawn():
+    def legend(boxes):
+        return [text for text, _ in legend_entries(Recorded(MemorySequence(1), boxes, RecordingOptions()))]
+
+    assert legend(RecordedBoxes(("a", "b"))) == ["a", "b", "ground truth"]
+    assert {"car", "ground truth", "missed, false"} <= set(legend(RecordedBoxes(("a",))))
+    assert "ground truth" not in legend(RecordedBoxes())
+
+
+def test_labels_of_any_class_have_a_colour(tmp_path):
+    drive = Labelled(1)
+    frame = drive.load(0)
+    truth = replace(frame.ground_truth, classes=np.array(["Straßenbahn", "car"]))
+    drive.load = lambda place: replace(frame, ground_truth=truth)  # type: ignore[method-assign]
+    [read] = frames_of(record(drive, path=tmp_path / "r.rrd"))
+    assert read.texts(entities.RUN, "class_names")[-1] == "Straßenbahn"
+    assert read.integers(entities.BOXES, "Boxes3D:class_ids") == [11, 1]
+
+
+def test_wrong_boxes_get_one_line(tmp_path):
+    drive = Labelled(2)
+    with pytest.raises(InputError, match=r"of 3 models \(expected at most 2\)"):
+        record(drive, dict.fromkeys("abc", [Boxes3D.empty()] * 2))
+    with pytest.raises(InputError, match=r"found 1 \(expected 2, one for each frame\)"):
+        record(drive, [Boxes3D.empty()])
+    write_boxes(boxes_file(drive, range(2)), tmp_path / "a.json")
+    other = json.loads((tmp_path / "a.json").read_text())
+    for frame in other["frames"]:
+        frame |= {"sample_token": "x" + frame["sample_token"], "frame": frame["frame"] + 90, "timestamp_ns": 1}
+    other["frames"].pop()
+    (tmp_path / "b.json").write_text(json.dumps(other))
+    with pytest.raises(InputError, match=r"^b: predictions and ground truth have no frame in common"):
+        record(drive, tmp_path / "b.json", tmp_path / "r.rrd")
+    drive.has_ego_motion = False
+    with pytest.raises(InputError, match="the boxes are in the world frame, and the drive has no ego-motion"):
+        record(drive, tmp_path / "a.json", tmp_path / "r.rrd")
+
+
+def test_files_have_short_names(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    runs = [tmp_path / "a" / "predictions.json", tmp_path / "b"]
+    assert list(names_of(runs)) == ["a", "b"]
+    assert list(names_of([tmp_path / "old.json", tmp_path / "new.json"])) == ["old", "new"]
+    assert list(names_of([tmp_path / "a" / "x.json", tmp_path / "b" / "x.json"])) == ["a/x", "b/x"]
+    with pytest.raises(InputError, match="have the same name"):
+        names_of([tmp_path / "x.json", tmp_path / "x.json"])
