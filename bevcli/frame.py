@@ -399,6 +399,7 @@ class Prediction:
         results: further results of the model, each of another type.
         object_classes: of the model, by name.
         frame: that it is for, with its images, which `plot` draws; None where it was left out.
+        untrained: whether the weights are random: boxes and maps are meaningless.
     """
 
     stamp: FrameStamp
@@ -417,6 +418,7 @@ class Prediction:
     results: tuple[FrameResult, ...] = ()
     object_classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     frame: Frame | None = None
+    untrained: bool = False
 
     def __repr__(self) -> str:
         found = self.failure or f"{len(self.boxes)} boxes"

@@ -221,8 +221,8 @@ class Model:
 
     def runner(self, *, track: bool, **asked: Any) -> Runner:
         """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
-        tracker = self.tracker if track else None
-        return Runner(self.prepared, self.device, StepOptions(tracker=tracker, takes_pixels=self.is_exported, **asked))
+        asked |= {"tracker": self.tracker if track else None, "untrained": self.untrained}
+        return Runner(self.prepared, self.device, StepOptions(takes_pixels=self.is_exported, **asked))
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:

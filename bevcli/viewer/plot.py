@@ -37,6 +37,7 @@ from bevcli.viewer.video import (
 )
 
 TOP = (4, 5, 6, 7, 4)  # corners of a box, around its top
+UNTRAINED = "UNTRAINED WEIGHTS: boxes are meaningless"
 LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
 
 
@@ -95,6 +96,8 @@ def _camera_image(
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
         draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own[box]), size, centered=True)
     draw_title(canvas, camera.name, has_image=image is not None)
+    if prediction.untrained:
+        draw_text(canvas, UNTRAINED, (width // 2, height - 14), WARNING, 0.42, centered=True)
     return canvas
 
 

@@ -29,6 +29,7 @@ def test_a_call_equals_the_first_step_of_a_vehicle_that_stands(model, images):
     assert str(called.started_anew) == "first frame"
     assert called.frame.images.keys() == set(DRIVE.rig.names)
     assert called.boxes.instances is None
+    assert called.untrained
     turned = {name: pixels[..., ::-1] for name, pixels in images.items()}
     assert np.array_equal(model(turned, DRIVE.rig, color_order="rgb").boxes.centers, called.boxes.centers)
 

@@ -63,6 +63,14 @@ def test_the_map_from_above_shows_boxes_and_areas(prediction):
     assert tuple(above[20, 20]) != (75, 64, 58)
 
 
+def test_images_of_an_untrained_model_say_so(prediction):
+    trained, random = prediction.plot("CAM_BACK"), replace(prediction, untrained=True).plot("CAM_BACK")
+    assert np.array_equal(trained[:150], random[:150])
+    warning = (random == (85, 70, 255)).all(-1)
+    assert warning[150:].sum() > 20
+    assert not (trained == (85, 70, 255)).all(-1).any()
+
+
 def test_a_plot_in_rgb_has_the_channels_reversed(prediction):
     assert np.array_equal(prediction.plot(color_order="rgb"), prediction.plot()[..., ::-1])
 
