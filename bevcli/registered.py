@@ -11,6 +11,7 @@ Group = Literal[
     "bevcli.results",
     "bevcli.model_uses",
     "bevcli.sequences",
+    "bevcli.poses",
     "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",

@@ -194,7 +194,15 @@ def _open_viewer(recording: Path, options: ViewOptions) -> None:
 def project_debug(
     calibration: Annotated[Path, argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
-    format_options: Annotated[FormatValues, Part(only=("topics", "topics_file"))],
+    format_options: Annotated[
+        FormatValues,
+        Part(
+            only=(
+                *("topics", "topics_file", "times", "image_rate_hz", "start_ns"),
+                *("ego_motion_file", "pose_times", "pose_angles", "poses_of"),
+            )
+        ),
+    ],
     options: CheckOptions,
     further: Annotated[Steps, ExtensionsOf("project-debug")],
     as_json: Json = False,

@@ -46,6 +46,7 @@ def run(
         from bevcli.cli.progress import Progress, load_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.rig.sequence_checks import CheckedDrive
+        from bevcli.rig.standing_check import IMAGES_MOVE, StandingCheck
         from bevcli.runs.run_into_folder import run_into_folder
         from bevcli.sequences.open import open_sequence
 
@@ -65,9 +66,14 @@ def run(
 
         view = LiveView()
 
+    standing = StandingCheck() if source.ego_motion == "static" and run_options.temporal else None
+    images_move = as_flags(IMAGES_MOVE)  # here, as frames are shown in another thread, which does not know the flags
+
     def show(frame: "Frame", prediction: "Prediction") -> None:
         for warning in _frame_warnings(frame, prediction):
             progress.message(f"warning: {warning}")
+        if standing is not None and prediction.started_anew is None and standing.images_move(frame):
+            progress.message(f"warning: frame {frame.stamp.index}: {images_move}")
         progress.advance()
 
     notes = [*drive.input_errors, *_run_notes(loaded, drive, live=output.live)]

@@ -136,20 +136,6 @@ def _true_boxes(frame: Frame) -> FrameBoxes:
     return FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth or Boxes3D.empty(), token)
 
 
-def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D | None], str]:
-    """The predictions for each frame of a drive in its world frame, and the key by which frames are matched.
-
-    Frames are matched as for scoring, and need no ground truth. None where the predictions lack a frame. Raises
-    InputError as `pair_frames`, and for boxes in the world frame where the drive has no poses.
-    """
-    if predictions.frame_of_reference == "world" and not drive.has_ego_motion:
-        raise InputError("the boxes are in the world frame, and the drive has no ego-motion (expected boxes in ego)")
-    frames = tuple(_true_boxes(drive.ground_truth_frame(place)) for place in range(len(drive.stamps)))
-    pairs = pair_frames(predictions, BoxesFile("world", frames))
-    found = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
-    return [found.get(stamp) for stamp in drive.stamps], pairs.matched_by
-
-
 @dataclass(frozen=True)
 class FramePairs:
     """F frames that are scored, in the order of the predictions.
@@ -192,7 +178,7 @@ _KEYS: dict[str, Callable[[FrameBoxes], Hashable]] = {
     "scene and frame index": lambda frame: (frame.stamp.scene, frame.stamp.index),
     "frame index": lambda frame: frame.stamp.index,
 }
-_RELIABLE = ("sample_token", "scene and timestamp_ns")
+RELIABLE = ("sample_token", "scene and timestamp_ns")
 
 
 def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
@@ -226,6 +212,20 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         matched_by=key,
         notes=notes,
     )
+
+
+def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D | None], FramePairs]:
+    """The predictions for each frame of a drive in its world frame, and the pairs of frames.
+
+    Frames are matched as for scoring, and need no ground truth. None where the predictions lack a frame. Raises
+    InputError as `pair_frames`, and for boxes in the world frame where the drive has no poses.
+    """
+    if predictions.frame_of_reference == "world" and not drive.has_ego_motion:
+        raise InputError("the boxes are in the world frame, and the drive has no ego-motion (expected boxes in ego)")
+    frames = tuple(_true_boxes(drive.ground_truth_frame(place)) for place in range(len(drive.stamps)))
+    pairs = pair_frames(predictions, BoxesFile("world", frames))
+    found = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
+    return [found.get(stamp) for stamp in drive.stamps], pairs
 
 
 def _common_frames(
@@ -298,7 +298,7 @@ def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_be
 
 def _notes(key: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
     notes = []
-    if key not in _RELIABLE:
+    if key not in RELIABLE:
         notes.append(f"timestamps or scenes differ between the files: frames are matched by {key}")
     if pairs < ground_truth:
         left_out = "left out (`count_missing=True` counts them)"

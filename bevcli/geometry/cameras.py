@@ -103,6 +103,10 @@ class Camera:
             inside = (p > 0).all(-1) & (p[..., 0] < self.width) & (p[..., 1] < self.height)
         return inside & (np.asarray(depth) > NEAR_M)
 
+    def sees(self, points_ego: ArrayLike) -> NDArray[np.bool_]:
+        """(...,) bool: whether points (..., 3) in the ego frame at the camera's time are inside the image."""
+        return self.contains(*self.project_ego(points_ego))
+
     def scaled(self, factor_x: float, factor_y: float | None = None) -> "Camera":
         """The camera of the resized image. Pixel coordinates are multiplied by the factors, without a half-pixel shift.
 

@@ -167,13 +167,23 @@ class GeoOrigin:
         20 cm.
         """
         points = np.asarray(points_world, dtype=np.float64)
+        steps = points[..., :2] @ self._north_east_from_world.T / self._metres_per_radian
+        return np.array([self.latitude_deg, self.longitude_deg]) + np.degrees(steps)
+
+    def points(self, latitude_longitude: ArrayLike) -> Array:
+        """Latitude and longitude (..., 2), degrees -> x and y (..., 2) in the world frame, metres; the inverse."""
+        degrees = np.asarray(latitude_longitude, dtype=np.float64) - [self.latitude_deg, self.longitude_deg]
+        return np.radians(degrees) * self._metres_per_radian @ self._north_east_from_world
+
+    @property
+    def _north_east_from_world(self) -> Array:
         heading = np.radians(self.heading_deg)
-        x, y = points[..., 0], points[..., 1]
-        east = x * np.sin(heading) - y * np.cos(heading)
-        north = x * np.cos(heading) + y * np.sin(heading)
+        return np.array([[np.cos(heading), np.sin(heading)], [np.sin(heading), -np.cos(heading)]])
+
+    @property
+    def _metres_per_radian(self) -> Array:
+        """Along the meridian, and along the parallel."""
         latitude = np.radians(self.latitude_deg)
         bend = 1 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
-        along_meridian = EQUATOR_RADIUS_M * (1 - ECCENTRICITY_SQUARED) / bend**1.5
-        along_parallel = EQUATOR_RADIUS_M / np.sqrt(bend) * np.cos(latitude)
-        steps = np.stack([north / along_meridian, east / along_parallel], axis=-1)
-        return np.array([self.latitude_deg, self.longitude_deg]) + np.degrees(steps)
+        meridian = EQUATOR_RADIUS_M * (1 - ECCENTRICITY_SQUARED) / bend**1.5
+        return np.array([meridian, EQUATOR_RADIUS_M / np.sqrt(bend) * np.cos(latitude)])

@@ -27,6 +27,7 @@ MIB = 1 << 20
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PIXELS, _END = 0xDA, 0xD9
 _MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")  # those that have a length, and the end
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 OTHERS = ("WEBP", "TIFF", "BMP")  # formats that Pillow and OpenCV read
 # RLIMIT_DATA, and not the address space: allocators reserve more than they use.
 LIMIT_MEMORY = """

@@ -1,5 +1,6 @@
 """Writes frames and predictions into a rerun recording (.rrd).
 
+    record          `record`: a drive with its labels, and boxes of files, without a model
     writer          the class `Recording` and its file; its settings are in `options`
     entities        the entity paths and the colours, shared with the viewer
     blueprint       the layout of the views and the order of the cameras

@@ -12,7 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, GroundLines, Prediction, Probe, result_of
+from bevcli.frame import BevMap, Frame, FrameStamp, GroundLines, Prediction, Probe, result_of
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import Color
@@ -20,6 +20,7 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_boxes, log_cameras, log_static
 from bevcli.recording.components import any_values, components, line_strips, log, rgb_format, ui_points
 from bevcli.recording.log_cameras import ImageLayer, PosedCamera
+from bevcli.recording.seen_map import SeenCells
 
 Features = NDArray[np.float32]
 PosedCameras = tuple[PosedCamera, ...]
@@ -104,6 +105,7 @@ class FrameLog:
         self._kept = FrameLogState() if resume is None else deepcopy(resume)
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
+        self._seen_cells = SeenCells()
         self._with_meshes = [name for name, settings in recorded.object_classes.items() if settings.mesh]
         self._images = log_cameras.CameraImages(stream, self._options.images == "av1")
         draws_bev = self._options.bev != "none" and self._options.shows_internals
@@ -156,6 +158,8 @@ class FrameLog:
             if self._recorded.results:
                 self._log_results(prediction, moved, cameras)
             self._log_stages(prediction, is_first=is_first)
+        elif self._recorded.map_classes:
+            self._log_map(frame.ground_truth_map, frame.rig.ego_from_bev)
         self._log_events(frame, found)
         if prediction is not None and self._options.shows_internals:
             self._log_internals(frame, prediction, moved, cameras)
@@ -334,11 +338,8 @@ class FrameLog:
         for posed in cameras:
             if posed.camera.name in frame.images:
                 log_cameras.log_pillar_hits(stream, posed, points, colors)
-        if (ground_map := prediction.segmentation) is not None:
-            painted = ground_map.painted(entities.map_colors(ground_map.classes), entities.BACKGROUND)
-            of_map = ground_map.x_range_m, ground_map.y_range_m
-            log_flat_image(stream, entities.BEV_SEGMENTATION, painted, of_map, -5)
-            log_on_ground(stream, entities.SEGMENTATION_ON_GROUND, painted, of_map, ego_from_bev, 255)
+        if prediction.segmentation is not None:
+            self._log_map(self._seen_cells.of(prediction.segmentation, frame, grid), ego_from_bev)
         if self._bev_images is not None and prediction.bev is not None:
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
             self._log_bev_images(self._bev_images.push(prediction, features))
@@ -355,6 +356,18 @@ class FrameLog:
                 name = posed.camera.name
                 samples = [probe.cameras[name] for probe in attention.probes if name in probe.cameras]
                 log_cameras.log_samples(stream, posed, samples)
+
+    def _log_map(self, ground_map: BevMap | None, ego_from_bev: Array) -> None:
+        """Writes a map into the BEV view and on the ground of the scene; None clears that of the frame before."""
+        flat, on_ground = entities.BEV_SEGMENTATION, entities.SEGMENTATION_ON_GROUND
+        if ground_map is None:
+            for entity in (flat, on_ground):
+                self._stream.log(entity, rr.Clear(recursive=False))
+            return
+        painted = ground_map.painted(entities.map_colors(ground_map.classes), entities.BACKGROUND)
+        of_map = ground_map.x_range_m, ground_map.y_range_m
+        log_flat_image(self._stream, flat, painted, of_map, -5)
+        log_on_ground(self._stream, on_ground, painted, of_map, ego_from_bev, 255)
 
     def _log_bev_images(self, ready: list[tuple[Prediction, NDArray[np.uint8]]]) -> None:
         for prediction, image in ready:

@@ -128,12 +128,14 @@ class RecordedBoxes:
         classes: by name, which are scored.
         ranges_m: by class, the distance from the ego vehicle below which misses and false positives are marked.
         untrained: whether random weights made the boxes.
+        map_classes: of the map that is part of the labels.
     """
 
     names: tuple[str, ...] = ()
     classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     ranges_m: Mapping[str, float] = field(default_factory=dict)
     untrained: bool = False
+    map_classes: tuple[str, ...] = ()
 
 
 class RecordedDrive(Protocol):
@@ -212,6 +214,8 @@ class Recorded:
     @property
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that is written; none without a map."""
+        if self.files is not None:
+            return self.files.map_classes
         return tuple(self.config.map_classes) if self.config and self.options.shows_internals else ()
 
 
@@ -392,18 +396,18 @@ def bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
 def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     truth = ("ground truth", entities.GROUND_TRUTH_COLOR)
+    maps = [
+        (f"map: {name.replace('_', ' ')}", color) for name, color in entities.map_colors(recorded.map_classes).items()
+    ]
     if recorded.layers:
-        return [*recorded.layers.items(), truth]
+        return [*recorded.layers.items(), truth, *maps]
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
     if recorded.files and not recorded.files.names:
-        return of_classes
+        return [*of_classes, *maps]
     states = [
         truth,
         ("missed, false", entities.MISSED_COLOR),
         ("duplicate", entities.DUPLICATE_COLOR),
-    ]
-    maps = [
-        (f"map: {name.replace('_', ' ')}", color) for name, color in entities.map_colors(recorded.map_classes).items()
     ]
     return [*of_classes, *states, *maps, *line_entries(recorded.config)]
 

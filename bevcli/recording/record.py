@@ -4,8 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from bevcli.errors import InputError
-from bevcli.evaluation.inputs import ScoredInput, boxes_of_drive, open_predictions
+from bevcli.evaluation.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 from bevcli.evaluation.matching import ranges_m
 from bevcli.frame import Frame, Sequence as Drive
 from bevcli.geometry.boxes import Boxes3D
@@ -18,7 +20,8 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, count_class
 from bevcli.sequences.open import open_sequence
 
 MOST = 2  # models: each has a colour
-GivenBoxes = str | Path | Sequence[Boxes3D]
+FAR_M = 150.0  # boxes that are all farther away are of another drive, or in another frame of reference
+GivenBoxes = str | Path | Sequence[Boxes3D | None]
 
 
 def record(
@@ -40,7 +43,7 @@ def record(
     Args:
         drive: of `open_sequence`, or its path.
         boxes: of one model, or name -> boxes of one or two: a file that `bevcli.evaluate` reads, the folder of a run,
-            or boxes in the world frame for each frame of the drive. None for labels alone.
+            or boxes in the world frame for each frame of the drive, None where it has none. None for labels alone.
         path: the .rrd file to write; an existing one is replaced.
         score: boxes scored below this are left out; None for 0.25.
         class_map: class names in the files -> the classes of the labels.
@@ -100,38 +103,53 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
     """The boxes of one model. Raises InputError."""
     if isinstance(boxes, str | Path):
         return open_predictions(Path(boxes), class_map)
+    wrong: list[object] = [each for each in boxes if each is not None and not isinstance(each, Boxes3D)]
+    if isinstance(boxes, Boxes3D) or wrong:
+        found = f"a {type(wrong[0]).__name__}" if wrong else "those of one frame"
+        raise InputError(
+            f"`boxes`: {name}: found {found} (expected a file, or a list with the Boxes3D of each frame in the world "
+            "frame)"
+        )
     if len(boxes) != len(drive.stamps):
         raise InputError(f"`boxes`: {name}: found {len(boxes)} (expected {len(drive.stamps)}, one for each frame)")
-    frames = tuple(FrameBoxes(stamp, None, each) for stamp, each in zip(drive.stamps, boxes, strict=True))
+    pairs = zip(drive.stamps, boxes, strict=True)
+    frames = tuple(FrameBoxes(stamp, None, each) for stamp, each in pairs if each is not None)
     return ScoredInput(BoxesFile("world" if drive.has_ego_motion else "ego", frames), Path(name))
 
 
 def _by_frame(drive: Drive, name: str, given: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
     """The boxes of one model for each frame of the drive. Raises InputError, which names the model."""
     try:
-        of_frames, key = boxes_of_drive(given.boxes, drive)
+        of_frames, pairs = boxes_of_drive(given.boxes, drive)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    found = sum(boxes is not None for boxes in of_frames)
+    found = len(pairs.predictions)
     rest = len(given.boxes.frames) - found
     more = f"; not in the drive: {counted(rest, 'further frames')}" if rest else ""
+    key = pairs.matched_by if pairs.matched_by in RELIABLE else f"{pairs.matched_by}, as scenes or times differ"
     report(f"{name}: has boxes of {found} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
+    sides = zip(pairs.predictions, pairs.ego_xy, strict=True)
+    away = np.concatenate([np.linalg.norm(frame.boxes.centers[:, :2] - ego, axis=1) for frame, ego in sides])
+    if len(away) and away.min() > FAR_M:
+        report(f"warning: {name}: the nearest box is {away.min():.0f} m from the vehicle: is it of this drive?")
     return of_frames
 
 
 def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
     """The classes of the boxes, and where they are scored."""
     classes: dict[str, ObjectClass] = dict(NUSCENES_CLASSES)
+    first_map = drive.ground_truth_frame(0).ground_truth_map
+    of_map = () if first_map is None else tuple(first_map.classes)
     if not inputs:  # labels alone have no class that is not theirs
         counts = drive.class_counts or _label_counts(drive)
         classes |= {name: ObjectClass(name) for name in sorted(counts.keys() - classes.keys())}
-        return RecordedBoxes(classes=classes)
+        return RecordedBoxes(classes=classes, map_classes=of_map)
     first = next(iter(inputs.values()))
     classes = dict(first.boxes.classes or classes)
     limit = first.range_m or float("inf")
     ranges = {name: min(range_m, limit) for name, range_m in ranges_m(classes.values()).items()}
     untrained = any(each.boxes.extras.get("untrained") is True for each in inputs.values())
-    return RecordedBoxes(tuple(inputs), classes, ranges, untrained)
+    return RecordedBoxes(tuple(inputs), classes, ranges, untrained, of_map)
 
 
 def _label_counts(drive: Drive) -> Counter[str]:

@@ -17,13 +17,13 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.parsing.files import is_there
 from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FORMAT as NATIVE
 from bevcli.sequences.native.folder import FolderSequence, read_frames_table
+from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.writing import write_whole
@@ -31,6 +31,8 @@ from bevcli.writing import write_whole
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
 OFFSET_ERROR_S = 0.5
 JITTER_WARNING_S = 0.05
+# Options that tell how the names of images and the poses are read.
+NAMES = {"times", "image_rate_hz", "start_ns", "ego_motion_file", "pose_times", "pose_angles", "poses_of"}
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ def check_calibration(
         path: a calibration.json, a sequence folder that contains one, a nuScenes root, or a ROS bag.
         sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
-        options: of `open_sequence`, such as allow_outside, or topics for a bag. A native folder takes allow_outside.
+        options: of `open_sequence`, such as allow_outside, or topics for a bag. A native folder takes
+            allow_outside, and those of images without a table and of poses.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
@@ -117,7 +120,7 @@ def check_calibration(
     of_drive: tuple[Finding, ...] = ()
     images: Mapping[str, NDArray[np.uint8]] = {}
     if folder is not None and draft.rig.cameras:
-        of_drive, images = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
+        of_drive, images = _read_folder(folder, draft.rig, frame, options)
     name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
     return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), of_drive), images)
 
@@ -148,23 +151,29 @@ def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) ->
 
 
 def _read_folder(
-    folder: Path, rig: CameraRig, frame: int, allow_outside: bool
+    folder: Path, rig: CameraRig, frame: int, given: Mapping[str, Any]
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images by camera of one of its frames."""
     findings: list[Finding] = []
-    options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=allow_outside)
+    outside, own = (
+        bool(given.get("allow_outside")),
+        FolderOptions(**{name: given[name] for name in NAMES & given.keys()}),
+    )
+    options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
-        sequence = FolderSequence(folder, options, rig=rig)
+        sequence = FolderSequence(folder, options, own, rig)
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderSequence(folder, replace(options, ego_motion="static"), rig=rig)
+            sequence = FolderSequence(folder, replace(options, ego_motion="static"), own, rig)
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:
         findings += check_scenes(sequence.ego_motion, sequence.stamps)
-    if is_there(folder / "frames.csv"):
+    if sequence.understood:
+        findings.append(Finding("no-frames-table", "info", None, sequence.understood))
+    else:
         findings += _check_times(folder / "frames.csv", rig)
     index = _checked_index(sequence.stamps, frame, folder)
     try:

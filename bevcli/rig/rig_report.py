@@ -60,7 +60,7 @@ def coverage_of(rig: CameraRig, grid: BevGrid = COVERAGE_GRID) -> Coverage:
     counts = np.zeros((grid.rows, grid.columns), dtype=np.int64)
     shares = {}
     for camera in rig.cameras:
-        seen = np.isfinite(pixels_in_image(camera, pillars)).all(-1).any(-1)  # (Y, X)
+        seen = camera.sees(pillars).any(-1)  # (Y, X)
         counts += seen
         shares[camera.name] = float(seen.mean())
     return Coverage(grid, counts, shares)

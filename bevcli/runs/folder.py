@@ -33,6 +33,7 @@ class RunFolder(contextlib.ExitStack):
         self._force, self._resume = force, resume
         self._written: GrowingFile | None = None
         self._names: set[str] = set()
+        self._is_new, self._is_discarded = not path.exists(), False
 
     def __enter__(self) -> "RunFolder":
         """Raises OutputError: another run uses the folder, or it holds something already, or it cannot be written."""
@@ -47,6 +48,7 @@ class RunFolder(contextlib.ExitStack):
                     f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
                     "interrupted run, or `out=DIR` for another folder"
                 )
+            stack.callback(self._remove_folders)  # once the lock is gone
             stack.enter_context(folder_lock(out))
             if written.is_file():  # the files of earlier runs
                 names = read_bytes(written, LARGEST_LIST, error=OutputError).decode(errors="replace").splitlines()
@@ -89,6 +91,19 @@ class RunFolder(contextlib.ExitStack):
                 if path.is_file() or path.is_symlink():
                     path.unlink()
         self._names = set()
+
+    def discard(self) -> None:
+        """Remove what this run wrote, and on exit the folder if this run made it. Raises OutputError."""
+        if self._written is not None:
+            self._written.close()
+            self._written = None
+        self.remove_written()
+        self._is_discarded = True
+
+    def _remove_folders(self) -> None:
+        for folder in (self.path / OWN, self.path) if self._is_new and self._is_discarded else ():
+            with contextlib.suppress(OSError):  # it holds something else
+                folder.rmdir()
 
     def _holds(self, path: Path) -> bool:
         """The folder of a file is in this one after all links are followed."""

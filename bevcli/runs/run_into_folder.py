@@ -39,8 +39,9 @@ def run_into_folder(
     """Run a model over a sequence and write recording, boxes, tracks, maps and summary.json into a folder.
 
     Whatever ends the run: the files hold all finished frames, summary.json is written, and the state is saved, so that
-    `resume` can go on. The files of a killed process hold all finished frames too, predictions.json as
-    predictions.json.partial; its run goes on from the last saved state.
+    `resume` can go on. A run that an error ends before its first frame with images leaves no files. The files of a
+    killed process hold all finished frames too, predictions.json as predictions.json.partial; its run goes on from the
+    last saved state.
 
     Args:
         model: of `load_model`.
@@ -95,7 +96,11 @@ def run_into_folder(
                 raise no_image_error(sequence.name, (image[1:] for image in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
-                summary.write(out, files.written())
+                is_mistake = isinstance(error, BevcliError) and not isinstance(error, OutputError)
+                if is_mistake and summary.frames == len(summary.counts.skipped):
+                    folder.discard()  # so that it does not stand in the way of the corrected run
+                else:
+                    summary.write(out, files.written())
             if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < done == summary.frames:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
                 message = f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"

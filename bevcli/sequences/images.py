@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 DECODING_THREADS = 6
 READING_TIMEOUT_S = 120.0
 LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 # The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
 DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))

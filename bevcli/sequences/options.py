@@ -156,9 +156,23 @@ class RigOptions(FormatOptions):
     ego_motion_file: Path | None = option(
         reads="path",
         default=None,
-        help="An ego_motion.csv that replaces the ego-motion of the input.",
+        help="Poses that replace the ego-motion of the input: ego_motion.csv, TUM, KITTI, EuRoC, or a table of "
+        "positions or GPS (docs/other-inputs.md).",
         flag="--ego-motion",
         metavar="FILE",
+    )
+    pose_times: Literal["s", "ms", "us", "ns"] | None = option(
+        default=None, help="Unit of the times in `ego_motion_file`. Default: the only possible one."
+    )
+    pose_angles: Literal["degrees", "radians", "compass"] | None = option(
+        default=None,
+        help="Unit of the angles in `ego_motion_file`; compass: degrees clockwise from north. Default: what fits how "
+        "the vehicle moves.",
+    )
+    poses_of: str | None = option(
+        default=None,
+        help='Camera whose poses `ego_motion_file` has, or "vehicle". Default: vehicle, and camera 0 for KITTI.',
+        metavar="CAMERA|vehicle",
     )
 
     def rig(self) -> CameraRig | None:

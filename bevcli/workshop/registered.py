@@ -40,6 +40,9 @@ OWN: dict[Group, dict[str, str]] = {
         "ros": "bevcli.workshop.formats:ROS",
         "t4": "bevcli.workshop.formats:T4",
     },
+    "bevcli.poses": {
+        "files": "bevcli.workshop.formats.poses:read_poses",
+    },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
         "native": "bevcli.workshop.formats.output:NATIVE",

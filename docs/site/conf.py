@@ -23,6 +23,7 @@ SECTIONS = {
     "Start": ["self"],
     "Run and look": [
         "docs/commands",
+        "docs/own-images",
         "docs/sequence-format",
         "docs/weights",
         "docs/other-inputs",

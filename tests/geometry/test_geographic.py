@@ -37,3 +37,9 @@ def test_y_is_left_of_x():
     latitude, longitude = GeoOrigin(10.0, 20.0, 90).latitude_longitude([0.0, 100.0])
     assert latitude > 10.0
     assert longitude == pytest.approx(20.0)
+
+
+def test_points_is_the_inverse():
+    origin = GeoOrigin(48.14, 11.5, 35)
+    points = np.array([[300.0, -40.0], [0.0, 0.0], [-1.5, 900.0]])
+    np.testing.assert_allclose(origin.points(origin.latitude_longitude(points)), points, atol=1e-6)

@@ -1,6 +1,7 @@
 """A drive is recorded without a model: its labels alone, and boxes of one or two files against them."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.errors import InputError
 from bevcli.evaluation.submission import write_submission
-from bevcli.frame import Frame
+from bevcli.frame import BevMap, Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import rigid
 from bevcli.recording import entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
 from bevcli.recording.options import RecordingOptions
@@ -117,6 +119,17 @@ def test_frames_of_a_submission_are_matched_by_token(tmp_path):
     assert last.texts(entities.EVENTS, "TextLog:text") == ["frame 2: results_nusc does not have this frame"]
 
 
+def test_boxes_of_another_drive_are_told(tmp_path):
+    drive, lines = Labelled(1), list[str]()
+    file = boxes_file(drive, range(1))
+    stamp = replace(drive.stamps[0], scene="b", timestamp_ns=7)
+    far = file.frames[0].boxes.transformed(rigid((0, -2000, 0)))
+    write_boxes(BoxesFile("world", (FrameBoxes(stamp, drive.pose(0), far),)), tmp_path / "a.json")
+    record(drive, tmp_path / "a.json", tmp_path / "r.rrd", report=lines.append)
+    assert lines[0] == "a: has boxes of 1 of 1 frame, matched by frame index, as scenes or times differ"
+    assert re.fullmatch(r"warning: a: the nearest box is 19\d\d m from the vehicle: is it of this drive\?", lines[1])
+
+
 def test_trails_end_where_a_file_lacks_a_frame(tmp_path):
     drive = Labelled(2)
     tracked = [replace(boxes_of(drive, 0), instances=np.array(["1", "2", "3"]))]
@@ -192,12 +205,26 @@ def test_labels_of_any_class_have_a_colour(tmp_path):
     assert read.integers(entities.BOXES, "Boxes3D:class_ids") == [11, 1]
 
 
+def test_a_labelled_map_lies_on_the_ground(tmp_path):
+    drive = Labelled(2)
+    frames = [drive.load(place) for place in range(2)]
+    frames[0] = replace(frames[0], ground_truth_map=BevMap(np.ones((4, 4), np.uint8), (-8, 8), (-8, 8), {"road": 1}))
+    drive.load = lambda place: frames[place]  # type: ignore[method-assign]
+    first, last = frames_of(record(drive, path=tmp_path / "r.rrd"))
+    assert first.texts(entities.RUN, "map_classes") == ["road"]
+    assert first.has(entities.BEV_SEGMENTATION, "Image:buffer")
+    assert not last.has(entities.BEV_SEGMENTATION, "Image:buffer")
+
+
 def test_wrong_boxes_get_one_line(tmp_path):
     drive = Labelled(2)
     with pytest.raises(InputError, match=r"of 3 models \(expected at most 2\)"):
         record(drive, dict.fromkeys("abc", [Boxes3D.empty()] * 2))
     with pytest.raises(InputError, match=r"found 1 \(expected 2, one for each frame\)"):
         record(drive, [Boxes3D.empty()])
+    for boxes, found in ((boxes_of(drive, 0), "those of one frame"), ([predict(drive.load(0))] * 2, "a Prediction")):
+        with pytest.raises(InputError, match=rf"found {found} \(expected a file, or a list with the Boxes3D of each"):
+            record(drive, boxes)
     write_boxes(boxes_file(drive, range(2)), tmp_path / "a.json")
     other = json.loads((tmp_path / "a.json").read_text())
     for frame in other["frames"]:

@@ -168,6 +168,24 @@ def test_the_segmentation_lies_on_the_ground(tmp_path):
     assert left_ahead[1] == pytest.approx(51.2, abs=1e-3)
 
 
+def test_a_map_is_painted_only_where_a_camera_looks(tmp_path):
+    """With cameras to the front and the back, none to the sides; and in the second frame, to the front only."""
+    drive = MemorySequence(2, rig=make_rig({"CAM_FRONT": 0, "CAM_BACK": 180}))
+    maps = BevMap(np.full((20, 20), MAP_CLASSES["vehicle"], np.uint8), GRID.x_range_m, GRID.y_range_m)
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
+        for place in range(2):
+            frame = drive.load(place)
+            images = {name: image for name, image in frame.images.items() if place == 0 or name == "CAM_FRONT"}
+            prediction = replace(predict(frame), segmentation=maps)
+            recording.log(replace(frame, images=images), prediction)
+    for frame, seen in zip(RecordingReader(tmp_path / "r.rrd").frames(), ("ahead behind", "ahead"), strict=True):
+        painted = np.frombuffer(frame.blob(entities.BEV_SEGMENTATION, "Image:buffer"), np.uint8).reshape(20, 20, 3)
+        places = {"ahead": painted[0, 9], "behind": painted[19, 9], "left": painted[9, 0], "right": painted[9, 19]}
+        vehicle = {name for name, color in places.items() if tuple(color) == MAP_COLORS["vehicle"]}
+        assert vehicle == set(seen.split())
+        assert all(tuple(color) == BACKGROUND for name, color in places.items() if name not in vehicle)
+
+
 class LaneConfig(ModelConfig):
     """The configuration of a model whose map has classes of its own; "kerb" has no colour of its own."""
 

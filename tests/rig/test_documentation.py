@@ -82,7 +82,8 @@ def bare_rigs():
 def sequence_codes(folder):
     """Findings about ego-motion, timestamps and images."""
     motion = {f.code for _, spoil in MOTION_MISTAKES.values() for f in check_ego_motion(spoil(drive()))}
-    late, missing, refused = (write_drive(folder / name) for name in ("late", "missing", "refused"))
+    names = ("late", "missing", "refused", "unlisted")
+    late, missing, refused, unlisted = drives = [write_drive(folder / name) for name in names]
     table = (late / "frames.csv").read_text().splitlines()
     rows = [row.rsplit(",", 1) for row in table[1:]]
     late_rows = [f"{row},{int(time) + 300_000_000}" for row, time in rows]
@@ -90,7 +91,8 @@ def sequence_codes(folder):
     without_back = [",".join([*row.split(",")[:3], "", ""]) for row in table[1:]]
     (missing / "frames.csv").write_text("\n".join([table[0], *without_back]))
     write_motion(refused, heading=(1, 0, 0, 0), rows=5)
-    return motion.union(*({f.code for f in check_calibration(path).findings} for path in (late, missing, refused)))
+    (unlisted / "frames.csv").unlink()
+    return motion.union(*({f.code for f in check_calibration(path).findings} for path in drives))
 
 
 def motion_codes():

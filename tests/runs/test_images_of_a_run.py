@@ -21,8 +21,34 @@ def test_a_run_without_any_image_is_an_error(mini_model, tmp_path):
     drive = WithoutImages({0: "all", 1: "all"}, count=2)
     with pytest.raises(InputError, match=r"memory: not one image could be read \(camera CAM_FRONT: missing\)"):
         run_into_folder(Model(mini_model), drive, tmp_path / "none", MINIMAL)
-    with_one = run_into_folder(Model(mini_model), WithoutImages({0: "all"}, count=2), tmp_path / "one", MINIMAL)
+    assert list(tmp_path.iterdir()) == []  # what would stand in the way of the corrected command
+    with_one = run_into_folder(Model(mini_model), WithoutImages({0: "all"}, count=2), tmp_path / "none", MINIMAL)
     assert with_one.counts.skipped == [0]
+
+
+class BreaksOff(MemorySequence):
+    """The second frame cannot be read."""
+
+    broken = 1
+
+    def load(self, place):
+        if place == self.broken:
+            raise InputError("an image has another size")
+        return super().load(place)
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_a_run_that_fails_at_once_leaves_nothing(mini_model, tmp_path, broken):
+    """Beside what was in the folder before. With a frame, there is something to resume."""
+    (tmp_path / "before").mkdir()
+    drive = BreaksOff(3)
+    drive.broken = broken
+    for name in ("new", "before"):
+        with pytest.raises(InputError, match="another size"):
+            run_into_folder(Model(mini_model), drive, tmp_path / name, MINIMAL)
+        assert (tmp_path / name / "summary.json").exists() == (broken == 1)
+    assert broken == 1 or list(tmp_path.iterdir()) == [tmp_path / "before"]
+    run_into_folder(Model(mini_model), MemorySequence(3), tmp_path / "before", MINIMAL, resume=broken == 1)
 
 
 class TwelveBitsInSixteen(MemorySequence):

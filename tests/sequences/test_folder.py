@@ -108,10 +108,10 @@ def test_images_named_by_timestamp_need_no_frames_csv(drive):
     for camera in ("CAM_FRONT", "CAM_BACK"):
         for number, stamp in enumerate(table.stamps):
             path = drive / "images" / camera / f"{number}.png"
-            path.rename(path.with_name(f"{stamp.timestamp_ns * 10**5}.png"))
+            path.rename(path.with_name(f"{10**14 + stamp.timestamp_ns}.png"))
     (drive / "frames.csv").unlink()
     sequence = open_sequence(drive, ego_motion="static")
-    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [s.timestamp_ns * 10**5 for s in table.stamps]
+    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [10**14 + s.timestamp_ns for s in table.stamps]
     assert [stamp.index for stamp in sequence.stamps] == [0, 1, 2, 3]
     np.testing.assert_array_equal(sequence.load(3).images["CAM_BACK"].pixels_bgr, last)
 

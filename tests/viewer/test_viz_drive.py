@@ -5,16 +5,23 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from command_line import command
+from recorded_drive import screenshot_or_skip
 from typer.testing import CliRunner
 
+import bevcli
 from bevcli.cli import commands
 from bevcli.cli.main import app
 from bevcli.errors import InputError
+from bevcli.evaluation.submission import write_submission
 from bevcli.recording import entities
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.viewer.recording_reader import RecordingReader
 
 ROOT = Path(__file__).parents[2]
@@ -72,6 +79,22 @@ def test_boxes_are_recorded_against_the_labels(folder):
     assert set(frame.texts(entities.BOXES, "name")) == {"car"}
     assert "pedestrian" in frame.texts(entities.MISSED, "name")
     assert "car" not in frame.texts(entities.MISSED, "name")
+    assert "lane_boundary" in frame.texts(entities.RUN, "map_classes")
+
+
+def test_a_submission_is_shown_on_a_nuscenes_root(shared, tmp_path):
+    root = shared / "data/nuscenes-mini-4"
+    drive = bevcli.open_sequence(root)
+    frames = [drive.ground_truth_frame(place) for place in range(2)]
+    stamped = [FrameBoxes(f.stamp, f.world_from_ego, f.ground_truth, {"sample_token": f.sample_token}) for f in frames]
+    scored = [replace(each, boxes=replace(each.boxes, scores=np.ones(len(each.boxes)))) for each in stamped]
+    write_submission(BoxesFile("world", tuple(scored)), tmp_path / "results_nusc.json")
+    text = viz(tmp_path, f"{root} --version v1.0-mini --frames 1: --boxes results_nusc.json --out r.rrd")
+    assert "boxes of 1 of 3 frames, matched by sample_token; not in the drive: 1 further frame" in text
+    first, later, _ = RecordingReader(tmp_path / "r.rrd").frames()
+    assert len(first.texts(entities.BOXES, "name")) > 20
+    assert first.texts(entities.MISSED, "name") == first.strips(entities.BEV_FALSE, "LineStrips2D:strips") == []
+    assert not later.texts(entities.BOXES, "name")
 
 
 def test_a_temporary_recording_is_shown_at_the_frame(folder, opened, monkeypatch):
@@ -121,3 +144,14 @@ def test_the_commands_of_the_page_run(folder, opened):
     with contextlib.chdir(folder):
         exec(example, {})
     assert (folder / "labels.rrd").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_both_models_and_a_tab_for_each(folder, tmp_path):
+    viz(folder, f"samples/street --boxes mine.json --boxes other.json --frames 0:1 --out {tmp_path}/two.rrd")
+    views = screenshot_or_skip(tmp_path / "two.rrd", tmp_path / "two.png")
+    assert views.count("BEV") == views.count("3D scene") == views.count("CAM_FRONT") == 3
+    assert "BEV features" not in views
+    image = cv2.imread(str(tmp_path / "two.png"))[:, : round(0.7 * 1920)].astype(int)
+    for own in entities.LAYER_COLORS:
+        assert (np.abs(image - own[::-1]).sum(-1) < 40).sum() > 200

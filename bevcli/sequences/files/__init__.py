@@ -1,7 +1,7 @@
 """Readers and writers of single files that several formats and commands share.
 
 calibration_file, kalibr_ros: the rig, of calibration.json and of the intrinsics of Kalibr and ROS.
-ego_motion_file: the vehicle's poses, of ego_motion.csv. A reader of another file of cameras or of poses belongs here.
+ego_motion_file: the vehicle's poses, of ego_motion.csv; other files are handed over to what is registered for them.
 boxes_file: ground_truth.json and predictions.json, and the class names of data sets.
 map_folder: BEV maps, one PNG per frame.
 incremental_json: a file that only grows, and a JSON file that is written entry by entry.

@@ -1,20 +1,95 @@
-"""ego_motion.csv: strict CSV, with error messages that name line and column."""
+"""ego_motion.csv: strict CSV, with error messages that name line and column. Other files of poses are handed over."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.parsing.documents import read_csv
+from bevcli.parsing.files import is_there, open_regular
+from bevcli.registry import entries, load
+from bevcli.sequences.options import RigOptions
 
+GROUP: Final = "bevcli.poses"
 TRANSLATION = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ACCELERATION = ("ax", "ay", "az")
 ANGULAR_RATE = ("wx", "wy", "wz")
 VELOCITY = ("vx", "vy", "vz")
 NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
+AHEAD = np.radians(45)  # largest yaw of a camera that looks ahead
+
+
+class FrameTimesNeeded(InputError):
+    """A file of poses cannot be read without the times of the frames. Raised where they were not given."""
+
+
+@dataclass(frozen=True)
+class DrivePoses:
+    """The drive that a file of poses is for, and what the user states of the file.
+
+    Attributes:
+        rig: of the drive.
+        stated: `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found.
+        times_ns: (F,) of its frames; None while they are not known.
+    """
+
+    rig: CameraRig
+    stated: RigOptions
+    times_ns: NDArray[np.int64] | None = None
+
+    @property
+    def cameras_ahead(self) -> list[Camera]:
+        """The cameras that look ahead."""
+        return [camera for camera in self.rig.cameras if abs(camera.yaw) <= AHEAD]
+
+
+@dataclass(frozen=True)
+class ReadPoses:
+    """The poses of a file.
+
+    Attributes:
+        motion: None without poses.
+        notes: for the user, such as how the file was read.
+        geo_origin: the place of their world frame on Earth, where the file says it.
+    """
+
+    motion: EgoMotion | None
+    notes: tuple[str, ...] = ()
+    geo_origin: GeoOrigin | None = None
+
+
+def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
+    """The poses of ego_motion.csv, or of a file of a kind that is registered under `bevcli.poses`.
+
+    Each entry of that group is a function of the same arguments, which returns None for a file that it does not know.
+    Raises InputError, and FrameTimesNeeded for a file whose times only those of the frames can explain.
+    """
+    if _is_own(path):
+        return ReadPoses(read_ego_motion(path))
+    for name in entries(GROUP):
+        found: ReadPoses | None = load(GROUP, name)(path, drive)
+        if found is not None:
+            return found
+    try:
+        return ReadPoses(read_ego_motion(path))
+    except InputError as error:
+        raise InputError(f"{error}; other kinds of poses are in docs/other-inputs.md#poses") from None
+
+
+def _is_own(path: Path) -> bool:
+    """True for a file with the header of ego_motion.csv; and for one that is missing, which its reader says."""
+    if not is_there(path):
+        return True
+    with open_regular(path) as file:
+        head = file.readline(1000)
+    return b"timestamp_ns" in head and b"qw" in head
 
 
 def read_ego_motion(path: Path) -> EgoMotion:

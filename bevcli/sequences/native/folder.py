@@ -6,22 +6,26 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bevcli.errors import InputError
 from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.ego_motion import TOLERANCE_NS
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
-from bevcli.sequences.files.ego_motion_file import read_ego_motion
+from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_poses
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import true_results
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
-from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
+from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -33,6 +37,7 @@ class FolderSequence(ListedSequence):
     """A native sequence folder as a `Sequence`.
 
     rig: used in place of the rig of `own` and of calibration.json, if given.
+    Attribute understood: how the images were understood without frames.csv, "" with it.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -40,7 +45,7 @@ class FolderSequence(ListedSequence):
         self,
         path: Path,
         common: SequenceOptions = SequenceOptions(),
-        own: RigOptions = RigOptions(),
+        own: FolderOptions = FolderOptions(),
         rig: CameraRig | None = None,
     ) -> None:
         if not path.is_dir():
@@ -48,19 +53,21 @@ class FolderSequence(ListedSequence):
         rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
             rig, facts = read_rig_and_facts(path / CALIBRATION)
-        table = path / "frames.csv"
-        notes: tuple[str, ...] = ()
-        if is_there(table):
-            entries = read_frames_table(table, rig.names)
-        else:
-            from bevcli.sequences.native.unlisted import find_frames
+        table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
+        entries = read_frames_table(table, rig.names) if is_there(table) else ()
+        poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
+        self.understood, advice = "", "add ego-motion, or remove the frame"
+        if not entries:
+            from bevcli.sequences.native.unlisted import covered, find_frames
 
-            entries, notes = find_frames(path, rig.names)
+            found = find_frames(path, rig.names, own, None if poses is None else poses.motion)
+            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(found[0])))
+            entries, self.understood = found if poses.motion is None else covered(found, poses.motion)
+            advice = "state the time of the first image by `start_ns`, or in timing.toml"
+        assert poses is not None
         if not common.allow_outside:
             _check_paths(path, entries)
-        file = own.ego_motion_file or path / "ego_motion.csv"
-        advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-        motion, motion_notes = _read_motion(file, common.ego_motion, entries, advice)
+        _check_covered(file, poses, entries, advice)
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
@@ -68,13 +75,13 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*bev_frame_notes(rig), *notes, *motion_notes)
+        notes = (*bev_frame_notes(rig), *filter(None, [self.understood]), *poses.notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 
             notes = (*notes, *rotation_notes(videos))
-        super().__init__(path, common, rig, entries, motion, notes=notes)
-        self.facts = facts
+        super().__init__(path, common, rig, entries, poses.motion, notes=notes)
+        self.facts = replace(facts, geo_origin=facts.geo_origin or poses.geo_origin)
 
     @property
     def class_counts(self) -> Mapping[str, int]:
@@ -124,22 +131,40 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
                 )
 
 
-def _read_motion(
-    file: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...], advice: str
-) -> tuple[EgoMotion | None, tuple[str, ...]]:
-    """The poses, None without any, and notes. advice: for frames at times that the poses do not cover."""
+def _poses_without_frames(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses | None:
+    """The poses; None where the times of the frames, which are not known yet, decide how they are read."""
+    try:
+        return _read_poses(file, use, drive)
+    except FrameTimesNeeded:
+        return None
+
+
+def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
+    """The poses, with notes. Raises FrameTimesNeeded as `read_poses`."""
     if use == "static":
         unread = f" ({file.name} is not read)" if is_there(file) else ""
-        return None, (f"the vehicle is assumed to stand still{unread}",)
+        return ReadPoses(None, (f"the vehicle is assumed to stand still{unread}",))
     if not is_there(file) and use == "required":
         raise InputError(
             f"{file}: the file is missing (expected the vehicle's poses): add it, "
             'pass `ego_motion="static"` if the vehicle stands, or pass `temporal=False` to run without history'
         )
     if not is_there(file):
-        return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
-    motion = read_ego_motion(file)
-    first, last = motion.first_ns, motion.last_ns
+        return ReadPoses(None, ("ego_motion.csv is missing: boxes are in the ego frame",))
+    return read_poses(file, drive)
+
+
+def _times_of(entries: tuple[FrameEntry, ...]) -> NDArray[np.int64] | None:
+    """The times of frames; None without frames."""
+    return np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64) if entries else None
+
+
+def _check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...], advice: str) -> None:
+    """Raise InputError for a frame or an image at a time that the poses do not cover. advice: what to do."""
+    if poses.motion is None:
+        return
+    first, last = poses.motion.first_ns, poses.motion.last_ns
+    read_as = f", read as {poses.notes[0]}" if poses.notes else ""
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
         times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
@@ -147,9 +172,8 @@ def _read_motion(
             if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
                 raise InputError(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
-                    f"outside is allowed): {advice}"
+                    f"outside is allowed{read_as}): {advice}"
                 )
-    return motion, ()
 
 
 def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:

@@ -3,6 +3,7 @@
 timing.toml states their times:
 start_ns = 1533151603547590000   # time of the first image; default 0
 rate_hz = 12.0                   # images per second; default for a video: the rate in its file
+times = "us"                     # unit of the times in image names; default: found from the numbers
 [cameras.CAM_BACK]               # where one camera differs
 offset_ns = 25000000             # its first image is this much later than start_ns
 rate_hz = 24.0
@@ -11,73 +12,80 @@ rate_hz = 24.0
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
+
+import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
+from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
-from bevcli.parsing.files import is_there, read_text
+from bevcli.parsing.files import IMAGE_SUFFIXES, is_there, read_text
 from bevcli.printing import counted
-from bevcli.sequences.images import IMAGE_SUFFIXES, FrameEntry, ImageSource
+from bevcli.sequences.images import FrameEntry, ImageSource
+from bevcli.sequences.native.camera_names import match_names, renamed
+from bevcli.sequences.native.matching import CameraImages, Matched, match, measured_periods
+from bevcli.sequences.native.name_times import NUMBER, Reading, read_names
+from bevcli.sequences.native.options import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
 from bevcli.sequences.videos import VIDEO_SUFFIXES, count_and_rate
 
 FILE_NAME = "timing.toml"
-# A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
-SMALLEST_TIMESTAMP = 10**13
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
-Found = tuple[tuple[FrameEntry, ...], tuple[str, ...]]  # frames, and a note
+Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understood
 
 
 @dataclass(frozen=True)
-class Timing:
-    """Timing of numbered images or of a video. start_ns: of the first image. rate_hz: None if not stated."""
+class CameraTiming:
+    """Timing of a camera. offset_ns: delay of its first image. rate_hz: images per second, None if not stated."""
 
-    start_ns: int
+    offset_ns: int
     rate_hz: float | None
 
 
 @dataclass(frozen=True)
-class CameraVideo:
-    """The video of a camera: number of images, time of the first, images per second."""
+class Timing:
+    """What timing.toml and the options state of images without a table.
 
-    path: Path
-    count: int
-    start_ns: int
-    rate_hz: float
+    Attributes:
+        start_ns: time of the first image, None if not stated.
+        rate_hz: images per second, None if not stated.
+        times: what the numbers in image names are, None if not stated.
+        cameras: by camera.
+    """
 
-    def image(self, number: int) -> ImageSource:
-        """An image by its number, from 0."""
-        return ImageSource(self.path, self.start_ns + round(number * 1e9 / self.rate_hz), number)
-
-    def nearest(self, time: int) -> ImageSource | None:
-        """The image nearest to a time in ns, None if it is more than half a period away."""
-        number = round((time - self.start_ns) * self.rate_hz / 1e9)
-        image = self.image(min(max(number, 0), self.count - 1))
-        return image if abs(image.timestamp_ns - time) <= 0.501e9 / self.rate_hz else None
+    start_ns: int | None
+    rate_hz: float | None
+    times: TimeKind | None
+    cameras: Mapping[str, CameraTiming]
 
 
-def read_timing(folder: Path, cameras: tuple[str, ...]) -> tuple[Timing, dict[str, Timing]]:
-    """The common timing in timing.toml, and that of each camera; the defaults if the file is missing.
+def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = FolderOptions()) -> Timing:
+    """The timing in timing.toml; the defaults if the file is missing. own: options, which replace what it states.
 
     Raises InputError for broken TOML, an unknown key or camera, or an invalid value.
     """
     path = folder / FILE_NAME
     stated = parse_toml(read_text(path, TOML_BYTES), path) if is_there(path) else {}
-    _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
-    own = stated.get("cameras", {})
-    if not isinstance(own, dict):
+    _check_keys(path, "", stated, ("start_ns", "rate_hz", "times", "cameras"))
+    of_cameras = stated.get("cameras", {})
+    if not isinstance(of_cameras, dict):
         raise InputError(f'{path}: "cameras": expected a table for each camera, such as [cameras.{cameras[0]}]')
-    _check_keys(path, "cameras.", own, cameras)
-    common = Timing(_integer(path, "", stated, "start_ns"), _rate(path, "", stated))
-    return common, {name: _camera(path, f"cameras.{name}", own.get(name, {}), common) for name in cameras}
+    _check_keys(path, "cameras.", of_cameras, cameras)
+    kinds, times = get_args(TimeKind), stated.get("times")
+    if times is not None and times not in kinds:
+        raise InputError(f"{path}: times: expected one of {', '.join(kinds)}, found {times!r}")
+    rate_hz = own.image_rate_hz or _rate(path, "", stated)
+    start_ns = _integer(path, "", stated, "start_ns") if own.start_ns is None else own.start_ns
+    made = {name: _camera(path, f"cameras.{name}", of_cameras.get(name, {}), rate_hz) for name in cameras}
+    return Timing(start_ns, rate_hz, own.times or times, made)
 
 
-def _camera(path: Path, where: str, table: Any, common: Timing) -> Timing:
+def _camera(path: Path, where: str, table: Any, rate_hz: float | None) -> CameraTiming:
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where}: expected a table, such as [{where}]")
     _check_keys(path, f"{where}.", table, ("offset_ns", "rate_hz"))
     offset_ns = _integer(path, f"{where}.", table, "offset_ns")
-    return Timing(common.start_ns + offset_ns, _rate(path, f"{where}.", table) or common.rate_hz)
+    return CameraTiming(offset_ns or 0, _rate(path, f"{where}.", table) or rate_hz)
 
 
 def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
@@ -86,9 +94,9 @@ def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[s
             raise InputError(f'{path}: unknown key "{where}{key}" (known: {", ".join(known)})')
 
 
-def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int:
-    value = table.get(key, 0)
-    if not isinstance(value, int) or isinstance(value, bool):
+def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int | None:
+    value = table.get(key)
+    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or abs(value) > LARGEST_NS):
         raise InputError(f"{path}: {where}{key}: expected an integer (nanoseconds), found {value!r}")
     return value
 
@@ -97,101 +105,199 @@ def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
     value = table.get("rate_hz")
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 10_000:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not RATES_HZ[0] <= value <= RATES_HZ[1]:
         raise InputError(f"{path}: {where}rate_hz: expected images per second, above 0, found {value!r}")
     return float(value)
 
 
-def find_frames(folder: Path, cameras: tuple[str, ...]) -> Found:
-    """The frames in `images/CAMERA/*` or `videos/CAMERA.*`, and a note that tells the user how they were found.
+def find_frames(
+    folder: Path,
+    cameras: tuple[str, ...],
+    own: FolderOptions = FolderOptions(),
+    motion: EgoMotion | None = None,
+) -> Found:
+    """The frames in `images/CAMERA/*`, `CAMERA/*` or `videos/CAMERA.*`, and a note that tells how they were understood.
 
-    Raises InputError if there is neither, or if the cameras' images do not have the same names.
+    motion: the poses, which decide where the names of images have two readings. None where they are not known yet.
+    Raises InputError if there are no images, or their times are not known.
     """
-    common, timings = read_timing(folder, cameras)
+    timing = read_timing(folder, cameras, own)
     if (folder / "images").is_dir():
-        return _from_names(folder, common, timings)
-    if (folder / "videos").is_dir():
-        return _from_videos(folder, timings)
-    raise InputError(
-        f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
-        "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
-    )
+        entries, line = _from_names(folder / "images", timing, motion)
+    elif (folder / "videos").is_dir():
+        entries, line = _from_videos(folder, timing)
+    elif match_names(cameras, _folders(folder)):
+        entries, line = _from_names(folder, timing, motion)
+    else:
+        raise InputError(
+            f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
+            "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
+        )
+    return entries, f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}"
 
 
-def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> Found:
-    images = {name: _numbered(folder / "images" / name) for name in timings}
-    numbers = _common_numbers(folder, images)
-    are_times = numbers[0] >= SMALLEST_TIMESTAMP
-    rate = common.rate_hz or ASSUMED_RATE_HZ
-    entries = []
-    for place, number in enumerate(numbers):
-        time = number if are_times else common.start_ns + round((number - numbers[0]) * 1e9 / rate)
-        sources = {
-            name: ImageSource(found[number], time + timings[name].start_ns - common.start_ns)
-            for name, found in images.items()
-        }
-        stamp = FrameStamp(place if are_times else number, "", time)
-        entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
-    how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
-    where = "" if are_times or common.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
-    return tuple(entries), (f"frames.csv is missing: found {counted(len(numbers), 'frames')}, {how}{where}",)
+def covered(found: Found, motion: EgoMotion) -> Found:
+    """The frames that the poses cover, if these are at least half of them; otherwise all, which is an error later."""
+    entries, line = found
+    first, last = motion.first_ns - TOLERANCE_NS, motion.last_ns + TOLERANCE_NS
+    kept = []
+    for entry in entries:
+        times = [entry.stamp.timestamp_ns, *(source.timestamp_ns for source in entry.sources.values())]
+        if first <= min(times) and max(times) <= last:
+            kept.append(entry)
+    if len(kept) == len(entries) or 2 * len(kept) < len(entries):
+        return found
+    return tuple(kept), f"{line}; {counted(len(entries) - len(kept), 'frames')} outside of the poses left out"
 
 
-def _numbered(folder: Path) -> dict[int, Path]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: the folder is missing (the calibration has the camera {folder.name})")
-    images: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
-            continue
-        if not (path.stem.isascii() and path.stem.isdigit()):
-            raise InputError(f"{path}: the name is not a number (expected a time or an index): list it in frames.csv")
-        if int(path.stem) in images:
-            raise InputError(f"{path}: {images[int(path.stem)].name} has the same number: remove one")
-        images[int(path.stem)] = path
+def _folders(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.is_dir())
+
+
+def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None) -> Found:
+    """Frames of image files, and what their names were understood as."""
+    found = _folders(folder)
+    matched = match_names(timing.cameras, found)
+    for camera in timing.cameras:
+        if camera not in matched:
+            others = ", ".join(name for name in found if name not in matched.values()) or "no other folder"
+            raise InputError(
+                f"{folder / camera}: the folder is missing (the calibration has the camera {camera}; found {others})"
+            )
+    paths = {camera: _image_files(folder / name) for camera, name in matched.items()}
+    names = {camera: [path.stem for path in of_camera] for camera, of_camera in paths.items()}
+    reading = read_names(folder, names, motion, timing.times)
+    if reading.kind == "index":
+        entries, line = _from_indices(folder, paths, reading, timing, motion)
+    else:
+        entries, line = _from_times(paths, reading, timing)
+    return entries, line + renamed(matched)
+
+
+def _image_files(folder: Path) -> list[Path]:
+    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES]
+    images: dict[str, Path] = {}
+    for path in (path for path in files if not path.name.startswith(".")):
+        if not NUMBER.search(path.stem):
+            raise InputError(f"{path}: the name has no number (expected a time or an index): list it in frames.csv")
+        if path.stem in images:
+            raise InputError(f"{path}: {images[path.stem].name} has the same number: remove one")
+        images[path.stem] = path
     if not images:
         raise InputError(f"{folder}: the folder has no images (expected files ending in {', '.join(IMAGE_SUFFIXES)})")
-    return images
+    return list(images.values())
 
 
-def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> list[int]:
-    """The sorted image numbers, which must be the same for every camera."""
-    everywhere = sorted(set().union(*images.values()))
-    for name, numbered in images.items():
-        missing = [number for number in everywhere if number not in numbered]
-        if missing:
+def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timing) -> Found:
+    """Frames of images whose names are times: of all cameras those that are nearest to each other."""
+    start, first = timing.start_ns, min(int(times.min()) for times in reading.values.values())
+    moved = 0 if start is None or reading.is_known_origin else start - first
+    cameras = {}
+    periods = measured_periods(reading.values)
+    for camera, of_camera in paths.items():
+        times = reading.values[camera] + moved + timing.cameras[camera].offset_ns
+        order = np.argsort(times)
+        sources = [ImageSource(of_camera[index], int(times[index])) for index in order.tolist()]
+        cameras[camera] = CameraImages(f"the folder {of_camera[0].parent.name}", times[order], periods[camera],
+                                       sources.__getitem__)  # fmt: skip
+    matched = match(cameras)
+    return matched.entries, f"times are {reading.words}, {_matched(cameras, matched)}"
+
+
+def _matched(cameras: Mapping[str, CameraImages], matched: Matched) -> str:
+    """The rates of cameras and how they were matched, in words."""
+    rates = sorted({f"{1e9 / each.period_ns:.1f}" for each in cameras.values()}, key=float)
+    parts = [f"{counted(len(cameras), 'cameras')} at {' to '.join(rates[:: max(len(rates) - 1, 1)])} Hz"]
+    if len(cameras) > 1:
+        parts.append(f"matched to {matched.leading} within {np.ceil(matched.farthest_ns / 1e6):.0f} ms")
+    return ", ".join([*parts, _missing(matched.missing, len(matched.entries) * len(cameras))])
+
+
+def _missing(missing: int, images: int) -> str:
+    return f"{missing or 'none'} of {counted(images, 'images')} missing"
+
+
+def _from_indices(
+    folder: Path, paths: Mapping[str, list[Path]], reading: Reading, timing: Timing, motion: EgoMotion | None
+) -> Found:
+    """Frames of numbered images: each has the images of one number."""
+    numbered = {camera: dict(zip(reading.values[camera].tolist(), of, strict=True)) for camera, of in paths.items()}
+    numbers = sorted(set().union(*numbered.values()))
+    _check_numbers(folder, numbered)
+    times, how = _times_of_indices(folder, numbers, timing, motion)
+    entries, missing = [], 0
+    for number, time in zip(numbers, times, strict=True):
+        there = {camera: of[number] for camera, of in numbered.items() if number in of}
+        sources = {camera: ImageSource(path, time + timing.cameras[camera].offset_ns) for camera, path in there.items()}
+        dropped = {camera: f"no image {number} in {of_camera[0].parent}" for camera, of_camera in paths.items()
+                   if camera not in there}  # fmt: skip
+        missing += len(dropped)
+        entries.append(FrameEntry(FrameStamp(number, "", time), sources, dropped, f"{folder}: image {number}"))
+    return tuple(entries), f"numbered images {how}, {_missing(missing, len(entries) * len(paths))}"
+
+
+def _check_numbers(folder: Path, numbered: Mapping[str, Mapping[int, Path]]) -> None:
+    """Raise InputError for a camera that shares less than half of its numbers with the one that has most images."""
+    fullest = max(numbered, key=lambda camera: len(numbered[camera]))
+    for camera, of_camera in numbered.items():
+        if 2 * len(of_camera.keys() & numbered[fullest].keys()) < len(of_camera):
+            spans = [f"{name} has {min(numbered[name])} to {max(numbered[name])}" for name in (camera, fullest)]
             raise InputError(
-                f"{folder / 'images' / name}: {len(missing)} images are missing that other cameras have, the first "
-                f"is {missing[0]}: add them, or list the frames in frames.csv and leave cells empty"
+                f"{folder}: the images are numbered differently: {', and '.join(spans)} (expected the same number for "
+                "images of the same time): rename them, or list the frames in frames.csv"
             )
-    return everywhere
 
 
-def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> Found:
-    """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
-    videos = {name: _video_of(folder / "videos", name, timing) for name, timing in timings.items()}
-    name, leading = min(videos.items(), key=lambda item: item[1].rate_hz)  # the first of cameras with equal rates
-    entries = []
-    for place in range(leading.count):
-        time = leading.image(place).timestamp_ns
-        nearest = {camera: video.nearest(time) for camera, video in videos.items()}
-        sources = {camera: source for camera, source in nearest.items() if source is not None}
-        dropped = {
-            camera: f"{video.path.name} has no image within {500 / video.rate_hz:.0f} ms of {time} ns"
-            for camera, video in videos.items()
-            if nearest[camera] is None
-        }
-        entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{leading.path}#{place}"))
-    has_timing = is_there(folder / FILE_NAME)
-    stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
-    note = f"frames.csv is missing: found {counted(len(entries), 'frames')} from {name}, {leading.rate_hz:g} per second"
-    return tuple(entries), (f"{note}, {stated}",)
+def _times_of_indices(
+    folder: Path, numbers: list[int], timing: Timing, motion: EgoMotion | None
+) -> tuple[list[int], str]:
+    """The time of each number, ns, and where it comes from. As many poses as numbers are the poses of the images."""
+    first, count = numbers[0], numbers[-1] - numbers[0] + 1
+    rate = timing.rate_hz
+    if rate is None and motion is not None and timing.start_ns is None and len(motion.timestamps_ns) == count > 1:
+        times = motion.timestamps_ns.tolist()
+        rate = 1e9 / float(np.median(np.diff(motion.timestamps_ns)))
+        return [times[number - first] for number in numbers], f"with the times of the {count} poses ({rate:.1f} Hz)"
+    if rate is None and motion is not None:
+        raise InputError(
+            f"{folder}: the images are numbered {first} to {numbers[-1]}, and the poses cover "
+            f"{(motion.last_ns - motion.first_ns) / 1e9:.1f} s from {motion.first_ns} ns on: state the images per "
+            "second by `image_rate_hz`, and the time of the first one by `start_ns`"
+        )
+    assumed = "" if rate else " (assumed: state `image_rate_hz`)"
+    start, rate = timing.start_ns or 0, rate or ASSUMED_RATE_HZ
+    return [start + round((number - first) * 1e9 / rate) for number in numbers], f"at {rate:g} Hz{assumed}"
 
 
-def _video_of(folder: Path, camera: str, timing: Timing) -> CameraVideo:
-    videos = [path for path in sorted(folder.glob(f"{camera}.*")) if path.suffix.lower() in VIDEO_SUFFIXES]
-    if len(videos) != 1:
-        names = ", ".join(path.name for path in videos) or "none"
-        raise InputError(f"{folder}: camera {camera}: expected one video, such as {camera}.mp4, found {names}")
-    count, rate_hz = count_and_rate(videos[0])
-    return CameraVideo(videos[0], count, timing.start_ns, timing.rate_hz or rate_hz)
+def _from_videos(folder: Path, timing: Timing) -> Found:
+    """Frames of videos, one for each image of the slowest, and what was understood."""
+    files: dict[str, list[Path]] = {}
+    for path in sorted((folder / "videos").iterdir()):
+        if path.suffix.lower() in VIDEO_SUFFIXES:
+            files.setdefault(path.stem, []).append(path)
+    names = match_names(timing.cameras, files)
+    videos = {}
+    for camera in timing.cameras:
+        of_camera = files.get(names.get(camera, ""), [])
+        if len(of_camera) != 1:
+            found = ", ".join(path.name for path in of_camera) or "none"
+            raise InputError(
+                f"{folder / 'videos'}: camera {camera}: expected one video, such as {camera}.mp4, found {found}"
+            )
+        own = timing.cameras[camera]
+        videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + own.offset_ns, own.rate_hz)
+    matched = match(videos)
+    is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
+    stated = "times as stated" if is_stated else "times from 0 on (state `start_ns`)"
+    return matched.entries, f"{stated}, {_matched(videos, matched)}{renamed(names)}"
+
+
+def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) -> CameraImages:
+    """The images of a video. start_ns: time of the first. rate_hz: default the one stated in the video.
+
+    Raises InputError.
+    """
+    count, own_rate_hz = count_and_rate(path)
+    rate_hz = rate_hz or own_rate_hz
+    times = start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
+    return CameraImages(path.name, times, 1e9 / rate_hz, lambda index: ImageSource(path, int(times[index]), index))

@@ -48,7 +48,7 @@ def batch(
     source: Annotated[SequenceOptions, Part(without=("scene",))],
     format_options: Annotated[
         FormatValues,
-        Part(without=("intrinsics", "extrinsics", "ego_motion_file")),
+        Part(without=("intrinsics", "extrinsics", "ego_motion_file", "pose_times", "pose_angles", "poses_of")),
     ],
 ) -> None:
     """Run BEVFormer on many DRIVES, each exactly as `bevcli run` does, on this machine or a Ray cluster.

@@ -25,6 +25,7 @@ from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_
 from bevcli.printing import one_line
 from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
+from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
@@ -220,9 +221,12 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     finder = TopicFinder(bag, stated, rig.names if rig else None)
     reader = VehicleReader(bag, finder, stated)
     used_rig = reader.rig() if rig is None else rig
-    motion, source, motion_notes = reader.motion(common.ego_motion, file)
+    entries = _entries(bag, finder.cameras)
+    frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
+    given = None if file is None else partial(read_poses, file, DrivePoses(used_rig, own, frame_times))
+    motion, source, motion_notes = reader.motion(common.ego_motion, given)
     geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
-    entries, gaps = _covered(_entries(bag, finder.cameras), motion, path)
+    entries, gaps = _covered(entries, motion, path)
     notes = (
         finder.table(source),
         *bag.notes,

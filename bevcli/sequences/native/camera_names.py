@@ -1,0 +1,58 @@
+"""The folders or files of cameras, whose names may differ from the calibration's in case, order and short forms."""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from bevcli.parsing.files import IMAGE_SUFFIXES
+
+SHORT = {
+    "f": "front", "forward": "front", "b": "back", "rear": "back", "l": "left", "r": "right",
+    "fl": "front left", "fr": "front right", "bl": "back left", "br": "back right", "rl": "back left",
+    "rr": "back right",
+}  # fmt: skip
+WORD = re.compile(r"camera|cam|image|img|front|forward|back|rear|left|right|[a-z]+|\d+")
+ANY = {"camera", "cam", "image", "img"}  # words that tell no camera from another
+DIRECTIONS = {"front", "back", "left", "right"}
+LOOKED_AT = 50  # entries of a folder
+
+
+def words_of(name: str) -> frozenset[str]:
+    """The words of a camera's name, without order, such as front and left for CAM_FRONT_LEFT, frontLeft and fl."""
+    words = [word.lstrip("0") or "0" if word.isdigit() else word for word in WORD.findall(name.lower())]
+    return frozenset(part for word in words for part in SHORT.get(word, word).split()) - ANY
+
+
+def match_names(cameras: Iterable[str], found: Iterable[str]) -> dict[str, str]:
+    """camera -> the found name that is equal or, if that is unambiguous, the same but for case or by its words.
+
+    A camera without one is left out. A found name belongs to one camera at most.
+    """
+    cameras, found = list(cameras), list(found)
+    matched: dict[str, str] = {}
+    for key in (str, str.lower, words_of):
+        left = [name for name in cameras if name not in matched]
+        free = [name for name in found if name not in matched.values()]
+        for camera in left:
+            fitting = [name for name in free if key(name) and key(name) == key(camera)]
+            if len(fitting) == 1 and sum(key(name) == key(camera) for name in left) == 1:
+                matched[camera] = fitting[0]
+    return {camera: matched[camera] for camera in cameras if camera in matched}
+
+
+def renamed(matched: Mapping[str, str]) -> str:
+    """The names that differ, for a note; "" where none does."""
+    pairs = [f"{name} is {camera}" for camera, name in matched.items() if name != camera]
+    return "" if not pairs else f"; {', '.join(pairs)}"
+
+
+def has_camera_folders(path: Path) -> bool:
+    """True for a folder with a folder of images that is named like a camera."""
+    return path.is_dir() and any(_is_camera_folder(folder) for folder in path.iterdir())
+
+
+def _is_camera_folder(path: Path) -> bool:
+    named = "cam" in path.name.lower() or bool(words_of(path.name) & DIRECTIONS)
+    if not named or not path.is_dir():
+        return False
+    return any(file.suffix.lower() in IMAGE_SUFFIXES for file, _ in zip(path.iterdir(), range(LOOKED_AT), strict=False))

@@ -1,0 +1,105 @@
+"""Images of cameras that do not fire together -> frames: each has the image of every camera that is nearest in time."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.frame import FrameStamp
+from bevcli.sequences.images import FrameEntry, ImageSource
+
+FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
+GAP = 1.5  # periods from an image to the next where one was lost
+MOST_LOST = 1000  # images in a row; a longer gap is a hole in the recording
+SAME_RATE = 0.1  # measured periods that differ by less are the same
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """The images of a camera.
+
+    Attributes:
+        name: of the video or the folder, for messages.
+        times_ns: (N,) int64, increasing.
+        period_ns: from one image to the next.
+        image: an image by its index.
+    """
+
+    name: str
+    times_ns: NDArray[np.int64]
+    period_ns: float
+    image: Callable[[int], ImageSource]
+
+    def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""
+        later = np.clip(np.searchsorted(self.times_ns, times_ns), 1, max(len(self.times_ns) - 1, 1))
+        earlier = later - 1
+        later = np.minimum(later, len(self.times_ns) - 1)
+        is_earlier = times_ns - self.times_ns[earlier] <= self.times_ns[later] - times_ns
+        chosen = np.where(is_earlier, earlier, later)
+        return chosen, np.abs(self.times_ns[chosen] - times_ns) <= FARTHEST * self.period_ns
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The frames of cameras.
+
+    Attributes:
+        entries: the frames.
+        leading: the camera that sets them.
+        farthest_ns: the largest time between a frame and one of its images.
+        missing: number of images that frames lack.
+    """
+
+    entries: tuple[FrameEntry, ...]
+    leading: str
+    farthest_ns: int
+    missing: int
+
+
+def measured_periods(times: Mapping[str, NDArray[np.int64]]) -> dict[str, float]:
+    """The period of each camera, ns: the median of its steps, and that of all cameras where these are about equal."""
+    steps = {camera: np.diff(np.sort(each)) for camera, each in times.items() if len(each) > 1}
+    if not steps:
+        return dict.fromkeys(times, 1e9)
+    common = float(np.median(np.concatenate(list(steps.values()))))
+    own = {camera: float(np.median(steps[camera])) if camera in steps else common for camera in times}
+    return {camera: common if abs(each / common - 1) < SAME_RATE else each for camera, each in own.items()}
+
+
+def match(cameras: Mapping[str, CameraImages]) -> Matched:
+    """One frame for each image of the camera with the lowest rate, the first of equal ones.
+
+    Where this camera lost images, the frames have those of the others.
+    """
+    leading, slowest = max(cameras.items(), key=lambda item: item[1].period_ns)
+    times = _without_gaps(slowest)
+    nearest = {camera: images.nearest(times) for camera, images in cameras.items()}
+    entries: list[FrameEntry] = []
+    farthest = missing = 0
+    for place, time in enumerate(times.tolist()):
+        there = {camera: int(chosen[place]) for camera, (chosen, is_near) in nearest.items() if is_near[place]}
+        if not there:
+            continue
+        sources = {camera: cameras[camera].image(index) for camera, index in there.items()}
+        dropped = {
+            camera: f"{images.name} has no image within {images.period_ns / 2e6:.0f} ms of {time} ns"
+            for camera, images in cameras.items()
+            if camera not in there
+        }
+        farthest = max(farthest, *(abs(source.timestamp_ns - time) for source in sources.values()))
+        missing += len(dropped)
+        label = sources.get(leading, next(iter(sources.values())))
+        entries.append(FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, str(label)))
+    return Matched(tuple(entries), leading, farthest, missing)
+
+
+def _without_gaps(images: CameraImages) -> NDArray[np.int64]:
+    """The times of a camera's images, and those of images that it lost between them."""
+    times = images.times_ns
+    steps = np.diff(times)
+    counts = np.round(steps / images.period_ns).astype(np.int64)
+    gaps = np.flatnonzero((steps > GAP * images.period_ns) & (counts <= MOST_LOST))
+    lost = [times[gap] + steps[gap] * np.arange(1, counts[gap]) // counts[gap] for gap in gaps]
+    return np.sort(np.concatenate([times, *lost]))

@@ -1,0 +1,290 @@
+"""The times of images from the numbers in their names, whose unit is found.
+
+A number that is a time since 1970 shows its unit by its size. For other numbers, at most one unit gives the rate of a
+camera, 0.5 to 240 Hz: units differ by a factor of 1000. Numbers that may be indices, too, need the poses or the user.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.sequences.native.options import TimeKind
+
+Times = NDArray[np.int64]
+Texts = Mapping[str, Sequence[str]]  # by camera, one of each image
+UNITS_NS: dict[TimeKind, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+WORDS: dict[TimeKind, str] = {
+    "s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds", "date": "dates",
+    "index": "indices",
+}  # fmt: skip
+SINCE_1970_NS = (978_307_200 * 10**9, 4_102_444_800 * 10**9)  # the years 2001 to 2099
+LONGEST_NS = 24 * 3600 * 10**9  # of a drive
+PERIODS_NS = (1e9 / 240 / 1.1, 1e9 / 0.5 * 1.1)  # of a camera, with a tenth for jitter
+JITTER, STEADY = 0.3, 0.8  # of a period; share of the steps that are whole periods
+DENSE_STEP, LARGEST_STEP, SPARSE_STEP = 5, 100, 1000  # of indices: surely, possibly, only if they are no times
+LARGEST_INDEX = 10**9
+SMALLEST_TIMESTAMP = 10**13  # of a lone image: nanoseconds from this value on (hours after 1970), an index below it
+HOURS_FROM_UTC = range(-12, 15)
+NUMBER, DECIMAL = re.compile(r"[0-9]+"), re.compile(r"[0-9]+(?:\.[0-9]+)?")
+SECONDS_AND_FRACTION = re.compile(r"(?<!\d)(\d{10})[._-](\d{9}|\d{6}|\d{3})(?!\d)", re.ASCII)
+DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_ .T]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)"
+    r"(?:[.,](\d{1,9})|[-_s]?(\d{9}|\d{6}|\d{3}))?(?!\d)",
+    re.ASCII,
+)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the names of images.
+
+    Attributes:
+        kind: the unit; "index" for numbers that are no times.
+        values: by camera, of each image: nanoseconds, or indices.
+        since: text that follows the unit: " since 1970", " in UTC", or "".
+    """
+
+    kind: TimeKind
+    values: Mapping[str, Times]
+    since: str = ""
+
+    @property
+    def words(self) -> str:
+        """The unit and its origin, such as "microseconds since 1970"."""
+        return WORDS[self.kind] + self.since
+
+    @property
+    def is_known_origin(self) -> bool:
+        """True for times since 1970 and dates."""
+        return bool(self.since)
+
+    def is_covered(self, motion: EgoMotion) -> bool:
+        """True where the poses cover at least half of the times."""
+        times = np.concatenate(list(self.values.values()))
+        inside = (times >= motion.first_ns - TOLERANCE_NS) & (times <= motion.last_ns + TOLERANCE_NS)
+        return bool(inside.mean() >= 0.5)
+
+
+def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKind | None) -> Reading:
+    """The times or indices of images, in the order of their names.
+
+    Args:
+        where: the folder, for messages.
+        names: by camera, file names without suffix, at least one; each has a number.
+        motion: the poses, which decide where two readings are possible. None without.
+        kind: what the user states.
+
+    Raises InputError where no reading is possible, or more than one.
+    """
+    columns = list(_columns(where, names))
+    if kind is not None:
+        return _stated(where, columns, names, kind)
+    dates = _dates(names)
+    if dates is not None and (_has_rate(dates.values) or not _steps(dates.values)):
+        return _in_time_zone(dates, motion)
+    found = [readings for column in columns if (readings := _readings(column))]
+    if not found:
+        first = next(iter(names.values()))
+        raise InputError(
+            f"{where}: the names {first[0]} to {first[-1]} are no times of a camera in any unit (expected 0.5 to 240 "
+            "images per second) and no different indices: state their unit by `times`, or list the images in frames.csv"
+        )
+    for known in chain.from_iterable(found):
+        if known.is_known_origin:
+            return known
+    alone = [readings[0] for readings in found if len(readings) == 1]
+    times = [reading for reading in alone if reading.kind != "index"]
+    return (times or alone or [_decided(where, found[0], motion)])[0]
+
+
+def _decided(where: Path, readings: list[Reading], motion: EgoMotion | None) -> Reading:
+    """The one of several readings that fits the poses: times that they cover, or else the indices."""
+    index = next(reading for reading in readings if reading.kind == "index")
+    times = [reading for reading in readings if reading is not index]
+    if motion is not None:
+        return next((reading for reading in times if reading.is_covered(motion)), index)
+    camera, values = next((camera, values) for camera, values in index.values.items() if len(values) > 1)
+    rates = [f"{WORDS[each.kind]} ({1e9 / np.median(_steps(each.values)[0]):.3g} Hz)" for each in times]
+    options = " or ".join(f'`times="{each.kind}"`' for each in (*times, index))
+    raise InputError(
+        f"{where}: camera {camera}: the numbers {values.min()} to {values.max()} in the image names may be "
+        f"{' or '.join(rates)}, or indices of images: pass {options}"
+    )
+
+
+def _columns(where: Path, names: Texts) -> Iterator[Texts]:
+    """The numbers of the names that differ from image to image, the last ones first; decimals before their parts."""
+    for pattern in (DECIMAL, NUMBER):
+        split = {camera: [pattern.findall(name) for name in of_camera] for camera, of_camera in names.items()}
+        counts = {camera: {len(numbers) for numbers in of_camera} for camera, of_camera in split.items()}
+        if pattern is NUMBER:
+            _check_counts(where, names, split)
+        if any(len(of_camera) > 1 for of_camera in counts.values()):
+            continue
+        columns = []
+        for place in range(-1, -1 - min(chain.from_iterable(counts.values())), -1):
+            column = {camera: [numbers[place] for numbers in of_camera] for camera, of_camera in split.items()}
+            if pattern is NUMBER or any("." in text for text in chain.from_iterable(column.values())):
+                columns.append(column)
+        varying = [column for column in columns if any(len(set(texts)) > 1 for texts in column.values())]
+        yield from varying or (columns[:1] if pattern is NUMBER else ())
+        if pattern is DECIMAL:
+            found = {camera: [SECONDS_AND_FRACTION.search(name) for name in each] for camera, each in names.items()}
+            if all(chain.from_iterable(found.values())):
+                yield {camera: [f"{m[1]}.{m[2]}" for m in each if m] for camera, each in found.items()}
+
+
+def _check_counts(where: Path, names: Texts, split: Mapping[str, list[list[str]]]) -> None:
+    for camera, numbers in split.items():
+        for name, found in zip(names[camera], numbers, strict=True):
+            if len(found) != len(numbers[0]):
+                raise InputError(
+                    f"{where}: camera {camera}: the name {name} has {len(found)} numbers, and {names[camera][0]} has "
+                    f"{len(numbers[0])}: rename one, or list the images in frames.csv"
+                )
+
+
+def _readings(column: Texts) -> list[Reading]:
+    """The possible readings of a column. One that is a time since 1970 at the rate of a camera is the only one."""
+    found, slow = [], []
+    for kind in UNITS_NS:
+        reading = _read(column, kind)
+        if reading is None:
+            continue
+        steps = _steps(reading.values)
+        if reading.is_known_origin and (_has_rate(reading.values) or not steps):
+            return [reading]
+        if reading.is_known_origin and all(np.median(each) >= PERIODS_NS[0] for each in steps):
+            slow.append(reading)  # images at long intervals, if no other unit fits
+        elif _has_rate(reading.values) and _is_steady(steps) and _extent(reading.values) <= LONGEST_NS:
+            found.append(reading)
+    found = found or slow
+    index = _read(column, "index")
+    if index is None:
+        return found
+    steps = _steps(index.values)
+    if not steps:  # each camera has one image
+        is_time = _largest(index) >= SMALLEST_TIMESTAMP
+        return [reading] if is_time and (reading := _read(column, "ns")) else [index]
+    if _largest(index) >= LARGEST_INDEX:
+        return found
+    pooled = np.concatenate(steps)
+    step = np.median(pooled)
+    if step < DENSE_STEP or (not found and step <= SPARSE_STEP):
+        return [index]
+    is_regular = (pooled % step == 0).mean() >= STEADY and step <= LARGEST_STEP
+    return [*found, index] if is_regular else found
+
+
+def _read(column: Texts, kind: TimeKind) -> Reading | None:
+    """A column in a unit; None where two images of a camera have the same number, or one is too large or a decimal."""
+    factor = UNITS_NS.get(kind)
+    values = {}
+    for camera, texts in column.items():
+        if factor is None and any("." in text for text in texts):
+            return None
+        numbers = [_scaled(text, factor or 1) for text in texts]
+        if max(numbers) >= 1 << 62 or len(set(numbers)) < len(numbers):
+            return None
+        values[camera] = np.array(numbers, dtype=np.int64)
+    first, last = SINCE_1970_NS
+    is_known = factor is not None and all(((v >= first) & (v < last)).all() for v in values.values())
+    return Reading(kind, values, " since 1970" if is_known else "")
+
+
+def _scaled(text: str, factor: int) -> int:
+    """A decimal number times a factor, rounded; without floats, which do not hold nanoseconds since 1970."""
+    whole, _, fraction = text.partition(".")
+    scale = 10 ** len(fraction)
+    return int(whole) * factor + (int(fraction or 0) * factor + scale // 2) // scale
+
+
+def _dates(names: Texts) -> Reading | None:
+    """The dates in the names, None where one has none, or two of a camera are equal."""
+    values = {}
+    for camera, of_camera in names.items():
+        numbers = [_date_ns(name) for name in of_camera]
+        if None in numbers or len(set(numbers)) < len(numbers):
+            return None
+        values[camera] = np.array(numbers, dtype=np.int64)
+    return Reading("date", values, " in UTC")
+
+
+def _date_ns(name: str) -> int | None:
+    found = DATE.search(name)
+    if found is None:
+        return None
+    try:
+        time = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[arg-type,misc]
+    except ValueError:
+        return None
+    return int(time.timestamp()) * 10**9 + int((found[7] or found[8] or "").ljust(9, "0"))
+
+
+def _in_time_zone(dates: Reading, motion: EgoMotion | None) -> Reading:
+    """Dates in UTC or, where only those of one time zone are covered by the poses, in this one."""
+    if motion is None or dates.is_covered(motion):
+        return dates
+    zones = []
+    for hours in HOURS_FROM_UTC:
+        moved = {camera: times - hours * 3600 * 10**9 for camera, times in dates.values.items()}
+        zones.append(replace(dates, values=moved, since=f" in UTC{hours:+d}, as the poses"))
+    fitting = [zone for zone in zones if zone.is_covered(motion)]
+    return fitting[0] if len(fitting) == 1 else dates
+
+
+def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
+    """The reading of the kind that the user states, of the column that fits best."""
+    made = [_dates(names)] if kind == "date" else [_read(column, kind) for column in columns]
+    possible = [reading for reading in made if reading is not None]
+    if not possible:
+        example = next(iter(names.values()))[0]
+        expected = "dates such as 20260301120000" if kind == "date" else WORDS[kind]
+        raise InputError(
+            f'{where}: `times="{kind}"`: no numbers in the names are possible (expected {expected}, different in each '
+            f"image of a camera, found {example}): pass another unit"
+        )
+    is_likely: tuple[Callable[[Reading], bool], ...] = (lambda r: r.is_known_origin, lambda r: _has_rate(r.values))
+    if kind == "index":
+        is_likely = (lambda r: all(np.median(each) <= LARGEST_STEP for each in _steps(r.values)),)
+    return next((reading for test in is_likely for reading in possible if test(reading)), possible[0])
+
+
+def _steps(values: Mapping[str, Times]) -> list[Times]:
+    """Of each camera with two or more images, the steps from one to the next."""
+    ordered = [np.sort(each) for each in values.values() if len(each) > 1]
+    return [each[1:] - each[:-1] for each in ordered]
+
+
+def _has_rate(values: Mapping[str, Times]) -> bool:
+    shortest, longest = PERIODS_NS
+    steps = _steps(values)
+    return bool(steps) and all(shortest <= np.median(each) <= longest for each in steps)
+
+
+def _is_steady(steps: list[Times]) -> bool:
+    """True where most steps are whole periods of the camera, more than one where an image was lost."""
+    for each in steps:
+        periods = each / np.median(each)
+        whole = np.maximum(np.round(periods), 1)
+        if (np.abs(periods - whole) <= JITTER).mean() < STEADY:
+            return False
+    return True
+
+
+def _extent(values: Mapping[str, Times]) -> int:
+    return int(max(each.max() for each in values.values()) - min(each.min() for each in values.values()))
+
+
+def _largest(reading: Reading) -> int:
+    return int(max(each.max() for each in reading.values.values()))

@@ -1,0 +1,41 @@
+"""The options of a native sequence folder: beside those of the rig, what the names of images do not state."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from bevcli.errors import InputError
+from bevcli.options import option, options
+from bevcli.sequences.options import RigOptions
+
+# Seconds and their parts, a date with a time of day, or the index of an image.
+TimeKind = Literal["s", "ms", "us", "ns", "date", "index"]
+RATES_HZ = (0.001, 10_000.0)
+LARGEST_NS = 1 << 61  # of a stated time, so that sums have 64 bits
+
+
+@options("Input")
+class FolderOptions(RigOptions):
+    """The rig, and the times of images that no frames.csv lists."""
+
+    times: TimeKind | None = option(
+        default=None,
+        help="What the numbers in image names are, without frames.csv. Default: found from the numbers.",
+    )
+    image_rate_hz: float | None = option(
+        default=None,
+        help="Images per second of numbered images and videos, without frames.csv; as rate_hz in timing.toml.",
+        flag="--image-rate",
+        metavar="HZ",
+    )
+    start_ns: int | None = option(
+        default=None,
+        help="Time of the first numbered image or of the videos, nanoseconds, without frames.csv; as in timing.toml.",
+    )
+
+    def __post_init__(self) -> None:
+        slowest, fastest = RATES_HZ
+        if self.image_rate_hz is not None and not slowest <= self.image_rate_hz <= fastest:
+            raise InputError(f"`image_rate_hz={self.image_rate_hz:g}`: expected images per second, {slowest:g} or more")
+        if self.start_ns is not None and abs(self.start_ns) > LARGEST_NS:
+            raise InputError(f"`start_ns={self.start_ns}`: expected nanoseconds, at most {LARGEST_NS}")

@@ -1,0 +1,380 @@
+"""The vehicle's poses in files of other programs: TUM, KITTI, EuRoC, and tables with named columns, of GPS too.
+
+The kind of a file follows from its contents: its names of columns, or their number. What its numbers mean (the unit of
+times, degrees or radians, the order of a quaternion) follows from them, from the times of the frames, and from the
+direction in which the vehicle moves: a vehicle is level and drives forward. A note says what was understood. Where two
+readings are left, an error asks.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion, derive_kinematics
+from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin, quaternion_from_rotation
+from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
+from bevcli.parsing.files import is_there, read_text
+from bevcli.printing import counted
+from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
+from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
+
+VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+MATRIX = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # world_from_camera, row by row
+TUM = ("time", *VECTOR, "qx", "qy", "qz", "qw")
+_UNIT = "(?:_(?:m|s|sec|seconds|ms|us|ns|deg|degrees|rad|radians))?"
+_OF = "(?:.*[._])?"  # such as field.pose.pose. in front of position.x
+# By quantity, the names of its column in lower case.
+NAMES = {
+    "time": rf"t|secs?|seconds|{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch){_UNIT}",
+    "seconds": rf"{_OF}secs?",
+    "nanoseconds": rf"{_OF}(?:nsecs?|nanosecs?)",
+    **{axis: rf"[pt]?_?{axis}(?:_m)?|p_\w+_{axis}|{_OF}(?:pos|pose|position|translation|location)[._]?{axis}(?:_m)?"
+       f"|{other}(?:ing)?(?:_m)?" for axis, other in zip(VECTOR, ("east", "north", "up"), strict=True)},
+    **{f"q{axis}": rf"q_?{axis}|q_\w+_{axis}|{_OF}(?:quat|quaternion|orientation|rotation|rot)[._]?{axis}"
+       for axis in "wxyz"},
+    "latitude": rf"{_OF}lat(?:itude)?{_UNIT}",
+    "longitude": rf"{_OF}(?:lon|lng|long|longitude){_UNIT}",
+    "altitude": rf"{_OF}(?:alt|altitude|elevation|ele|height){_UNIT}",
+    "roll": rf"{_OF}roll{_UNIT}",
+    "pitch": rf"{_OF}pitch{_UNIT}",
+    "yaw": rf"{_OF}yaw{_UNIT}",
+    "heading": rf"{_OF}(?:heading|course|azimuth|bearing){_UNIT}",
+}  # fmt: skip
+UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+UNIT_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
+PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
+FASTEST_M_S = 100.0
+COUNTER_CLOCKWISE, CLOCKWISE = "counter-clockwise from x", "clockwise from north"
+LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
+ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
+YEARS_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # times since 1970 are between the years 2000 and 2100
+
+
+@dataclass(frozen=True)
+class Table:
+    """The cells of a file of poses.
+
+    Attributes:
+        path: the file.
+        columns: quantity -> name of its column in the file, "" where the file has no names; in the order of the file.
+        rows: cells by quantity.
+        separator: of the columns; None for spaces.
+    """
+
+    path: Path
+    columns: dict[str, str]
+    rows: list[CsvRow]
+    separator: str | None
+
+    def has(self, *names: str) -> bool:
+        """True where it has all of these quantities."""
+        return all(name in self.columns for name in names)
+
+    def numbers(self, *names: str) -> Array:
+        """(T, N) quantities; 0 where the table lacks one. Raises InputError that names line and column."""
+        there = [name in self.columns for name in names]
+        return np.array(
+            [[row.number(name) if has else 0.0 for name, has in zip(names, there, strict=True)] for row in self.rows]
+        )
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of files of poses.
+
+    Attributes:
+        is_it: whether a table is of this kind.
+        of_camera: whether its poses are those of its first camera, and not of the vehicle.
+    """
+
+    is_it: Callable[[Table], bool]
+    of_camera: bool = False
+
+
+# By name, in the order in which they are tried.
+KINDS = {
+    "KITTI": Kind(lambda table: table.has(*MATRIX), of_camera=True),
+    "EuRoC": Kind(lambda table: table.columns.get("qw", "").startswith("q_rs_")
+                  or (table.separator == "," and table.columns.get("qw") == "")),
+    "TUM": Kind(lambda table: table.separator in (None, "\t") and tuple(table.columns) == TUM),
+    "GPS": Kind(lambda table: table.has("latitude", "longitude")),
+    "CSV": Kind(lambda table: table.has("x", "y")),
+}  # fmt: skip
+
+
+def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
+    """The poses of a file, and what was understood; None for a file of no known kind.
+
+    Raises InputError for a file that lacks something, or that can be read in two ways.
+    """
+    table = read_table(path)
+    name = None if table is None else next((name for name, kind in KINDS.items() if kind.is_it(table)), None)
+    if table is None or name is None:
+        return None
+    positions, origin = _positions(table)
+    times, time_words = _times(table, positions, drive)
+    for row, before, time in zip(table.rows[1:], times[:-1], times[1:], strict=True):
+        if time <= before:
+            raise InputError(f"{path}: line {row.line}: its time is not later than that of the row before: sort them")
+    camera, of = _camera(path, KINDS[name], drive)
+    readings, ask = _readings(table, positions, drive)
+    if camera is not None:
+        readings = [each for reading in readings for each in of_vehicle(reading, camera)]
+    chosen = best_reading(path, readings, times, ask, drive)
+    rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
+    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, chosen.words, of)
+    note = f"poses: {', '.join(word for word in words if word)}"
+    if drive.times_ns is not None:
+        covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
+        count = len(drive.times_ns)
+        note += f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
+    kinematics = derive_kinematics(times, chosen.translations, chosen.quaternions)
+    poses = (times, chosen.translations, chosen.quaternions)
+    return ReadPoses(EgoMotion(*poses, *kinematics, velocities_are_stated=False), (note,), origin)
+
+
+def read_table(path: Path) -> Table | None:
+    """The cells of a text file with columns; None where it has no rows, or not two columns that are known.
+
+    Names of columns stand in the line above the rows, which may be a comment. Raises InputError for a row with another
+    number of cells.
+    """
+    header, rows = "", list[tuple[int, str]]()
+    for number, line in enumerate(read_text(path, CSV_BYTES).removeprefix("\ufeff").splitlines(), 1):
+        text = line.strip()
+        if text.startswith(("#", "%")) or (not rows and re.match("[\"'A-Za-z_]", text)):
+            header = header if rows else text.lstrip("#% ").lower()
+        elif text:
+            rows.append((number, text))
+    if not rows:
+        return None
+    separator = next((sign for sign in (";", "\t", ",") if sign in rows[0][1]), None)
+    count = len(_cells(rows[0][1], separator))
+    names = _cells(header, separator)
+    names = names if len(names) == count else re.split(r"[,;\s]+", header)
+    places = _columns(path, names) if len(names) == count else {}
+    if len(places) < 2:
+        unnamed = {12: MATRIX, 8: TUM}.get(count, ())
+        if separator == "," and count in (8, 17):  # EuRoC's own order
+            unnamed = ("time", *VECTOR, *QUATERNION)
+        places, names = {quantity: place for place, quantity in enumerate(unnamed)}, [""] * count
+    if not places:
+        return None
+    table = Table(path, {quantity: names[place] for quantity, place in places.items()}, [], separator)
+    for number, text in rows:
+        cells = _cells(text.replace(",", ".") if separator in (";", "\t") else text, separator)
+        if len(cells) != count:
+            raise InputError(f"{path}: line {number} has {len(cells)} cells (expected {count}, as in the first row)")
+        table.rows.append(CsvRow(path, number, {quantity: cells[place] for quantity, place in places.items()}))
+    return table
+
+
+def _cells(text: str, separator: str | None) -> list[str]:
+    cells = [cell.strip().strip("\"'") for cell in text.split(separator)]
+    return cells[:-1] if cells and not cells[-1] else cells
+
+
+def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
+    """The place of each known quantity. Raises InputError where two columns have the same."""
+    places: dict[str, int] = {}
+    for place, name in enumerate(names):
+        plain = re.sub(r"\s*[\[(].*", "", name)  # without the unit
+        quantity = next((quantity for quantity, pattern in NAMES.items() if re.fullmatch(pattern, plain)), None)
+        if quantity in places:
+            both = f'"{names[places[quantity]]}" and "{name}"'
+            raise InputError(f"{path}: the columns {both} are both {quantity}: remove one")
+        if quantity is not None:
+            places[quantity] = place
+    return places
+
+
+def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
+    """(T, 3) positions in metres; those of GPS are east, north and up of the first one, which is the origin."""
+    if table.has(*MATRIX):
+        return table.numbers("m03", "m13", "m23"), None
+    if not table.has("latitude", "longitude"):
+        return table.numbers(*VECTOR), None
+    degrees, up = table.numbers("latitude", "longitude"), table.numbers("altitude")
+    for row, (latitude, longitude) in zip(table.rows, degrees, strict=True):
+        if abs(latitude) > 90 or abs(longitude) > 360:
+            raise row.error("latitude", f"{latitude:g}, {longitude:g} is no place on Earth (expected degrees)")
+    origin = GeoOrigin(float(degrees[0, 0]), float(degrees[0, 1]), EAST_DEG)
+    return np.column_stack([origin.points(degrees), up - up[0]]), origin
+
+
+def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[np.int64], str]:
+    """(T,) times in ns, and what was understood. KITTI's are in times.txt beside, or those of the frames."""
+    rows, name = table.rows, table.columns.get("time", "")
+    if table.has(*MATRIX):
+        path, count = table.path, len(rows)
+        beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
+        file = next((each for each in beside if is_there(each)), None)
+        if file is None and (drive.times_ns is None or count != len(drive.times_ns)):
+            frames = "" if drive.times_ns is None else f", and the drive has {len(drive.times_ns)} frames"
+            message = f"{path}: has {count} poses without times{frames}: put times.txt beside it, with {count} lines"
+            raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
+        if file is None:
+            assert drive.times_ns is not None
+            return drive.times_ns, "the times of the frames"
+        lines = [line for line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1) if line[1].strip()]
+        if len(lines) != count:
+            raise InputError(f"{file}: has {len(lines)} times (expected {count}, one for each line of {path.name})")
+        rows = [CsvRow(file, number, {"time": text.strip()}) for number, text in lines]
+    elif table.has("nanoseconds") and (seconds := next((each for each in ("seconds", "time") if table.has(each)), "")):
+        both = [row.integer(seconds) * 10**9 + row.integer("nanoseconds") for row in rows]
+        return np.array(both, dtype=np.int64), "seconds and nanoseconds"
+    elif not table.has("time"):
+        known = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
+        raise InputError(f"{table.path}: a column of times is missing (expected a name such as {known})")
+    values = [_decimal(row) for row in rows]
+    stated = _UNIT_OF_NAME.search(name)
+    unit = (
+        drive.stated.pose_times or (stated and (stated[1] or stated[2])) or _unit(table.path, values, positions, drive)
+    )
+    if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
+        raise InputError(f"{rows[0].path}: the times are too large for {UNIT_WORDS[unit]}: pass `pose_times`")
+    times = np.array([int((value * UNITS_NS[unit]).to_integral_value()) for value in values], dtype=np.int64)
+    return times, UNIT_WORDS[unit] + (" since 1970" if YEARS_NS[0] <= times[0] <= YEARS_NS[1] else "")
+
+
+def _decimal(row: CsvRow) -> Decimal:
+    """The time of a row: a number with all of its digits, or a date of ISO 8601, of which seconds since 1970."""
+    text = row.cells["time"]
+    try:
+        value = Decimal(text if text.isascii() and "_" not in text else "")
+    except InvalidOperation:
+        try:
+            date = datetime.fromisoformat(text)
+        except ValueError:
+            raise row.error("time", f'expected a number or a date, found "{text:.40}"') from None
+        since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+        return Decimal(since // timedelta(microseconds=1)) / 10**6
+    if not value.is_finite():
+        raise row.error("time", f'expected a time, found "{text:.24}": correct or remove the row')
+    if value.as_tuple().exponent > 0:  # type: ignore[operator]
+        raise row.error("time", f'the last digits of "{text:.24}" are lost: write the file anew from its source')
+    return value
+
+
+def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePoses) -> str:
+    """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
+    units = list(UNITS_NS)
+    steps = np.array([float(time - times[0]) for time in times])
+    durations, lengths = np.diff(steps), np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    if len(durations) and (durations > 0).any():
+        period = float(np.median(durations[durations > 0])) / 1e9
+        speed = float(np.median(lengths[durations > 0] / durations[durations > 0])) * 1e9
+        units = [
+            unit for unit, ns in UNITS_NS.items()
+            if PERIODS_S[0] <= period * ns <= PERIODS_S[1] and speed / ns <= FASTEST_M_S
+        ] or units  # fmt: skip
+    if drive.times_ns is not None:
+        ends = {unit: (times[0] * UNITS_NS[unit], times[-1] * UNITS_NS[unit]) for unit in units}
+        covered = {unit: _covered(*ends[unit], drive.times_ns) for unit in units}
+        units = [unit for unit in units if covered[unit] == max(covered.values())]
+    recent = [unit for unit in units if YEARS_NS[0] <= times[0] * UNITS_NS[unit] <= YEARS_NS[1]]
+    units = recent or units
+    if len(units) > 1:
+        words = " or ".join(UNIT_WORDS[unit] for unit in units)
+        options = " or ".join(f"`pose_times={unit}`" for unit in units)
+        message = f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}"
+        raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
+    return units[0]
+
+
+def _covered(first: Decimal | int, last: Decimal | int, times_ns: NDArray[np.int64]) -> int:
+    """Number of frames that poses from `first` to `last`, ns, cover."""
+    return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
+
+
+def _camera(path: Path, kind: Kind, drive: DrivePoses) -> tuple[Camera | None, str]:
+    """The camera whose poses the file has, None for the vehicle; and the words for that."""
+    cameras = drive.rig.cameras
+    if drive.stated.poses_of == "vehicle" or (drive.stated.poses_of is None and not kind.of_camera):
+        return None, "of the vehicle"
+    if drive.stated.poses_of is not None:
+        named = next((camera for camera in cameras if camera.name == drive.stated.poses_of), None)
+        if named is None:
+            expected = ", ".join(("vehicle", *drive.rig.names))
+            raise InputError(f"`poses_of={drive.stated.poses_of}`: is not in the rig (expected one of {expected})")
+        return named, f"of {named.name}"
+    zeroth = [camera for camera in cameras if re.search("(?<![0-9])0+$", camera.name)] or drive.cameras_ahead
+    if not zeroth:
+        raise InputError(f"{path}: KITTI's poses are those of its camera 0, and no camera looks ahead: pass `poses_of`")
+    return zeroth[0], f"of camera 0, as KITTI's are ({zeroth[0].name})"
+
+
+def _readings(table: Table, positions: Array, drive: DrivePoses) -> tuple[list[Reading], str]:
+    """The possible poses, the usual one first; and what the user may pass to choose, "" where the first is usual."""
+    if table.has(*MATRIX):
+        matrices = table.numbers(*MATRIX).reshape(-1, 3, 4)[..., :3]
+        errors = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        if errors.max() > ROTATION_TOLERANCE:
+            row = table.rows[int((errors > ROTATION_TOLERANCE).argmax())]
+            raise InputError(f"{row.path}: line {row.line}: the first three columns of its matrix are no rotation")
+        return [Reading("", positions, np.stack([quaternion_from_rotation(matrix) for matrix in matrices]))], ""
+    if table.has(*QUATERNION):
+        return _readings_of_quaternions(table, positions), ""
+    if table.has("yaw") or table.has("heading"):
+        return _readings_of_angles(table, positions, drive)
+    names = "qw, qx, qy, qz; yaw; or heading"
+    raise InputError(f"{table.path}: columns of the orientation are missing (expected {names})")
+
+
+def _readings_of_quaternions(table: Table, positions: Array) -> list[Reading]:
+    """The quaternions of a file with names, and both orders of one without."""
+    quaternions = table.numbers(*QUATERNION)
+    norms = np.linalg.norm(quaternions, axis=1)
+    wrong = np.abs(norms - 1) > NORM_TOLERANCE
+    if wrong.any():
+        row = int(wrong.argmax())
+        message = f"the quaternion's norm is {norms[row]:.6g} (expected 1): check its digits"
+        raise table.rows[row].error("qw..qz", message)
+    quaternions = quaternions / norms[:, None]
+    order = [name for name in table.columns if name in QUATERNION]
+    readings = [Reading(f"quaternion {' '.join(name[1] for name in order)}", positions, quaternions)]
+    if not table.columns["qw"]:
+        first = order[0] == "qw"
+        other = np.roll(quaternions, 1 if first else -1, axis=1)
+        readings.append(Reading(f"quaternion {'x y z w' if first else 'w x y z'}", positions, other))
+    return readings
+
+
+def _readings_of_angles(table: Table, positions: Array, drive: DrivePoses) -> tuple[list[Reading], str]:
+    """Degrees or radians, counter-clockwise from x or clockwise from y, which is north."""
+    name = "heading" if table.has("heading") else "yaw"
+    if table.has("heading", "yaw"):
+        raise InputError(f"{table.path}: has a column of yaw and one of heading: remove one")
+    angles, stated, of_gps = table.numbers("roll", "pitch", name), table.columns[name], table.has("latitude")
+    units = ["radians", "degrees"]
+    if drive.stated.pose_angles is not None:
+        units = ["degrees" if drive.stated.pose_angles == "compass" else drive.stated.pose_angles]
+    elif mark := re.search(r"[_\[( ](deg|rad)", stated):
+        units = [unit for unit in units if unit.startswith(mark[1])]
+    elif np.abs(angles).max() > LARGEST_RADIANS:
+        units = ["degrees"]
+    turns = [COUNTER_CLOCKWISE, CLOCKWISE]
+    if drive.stated.pose_angles == "compass":
+        turns = [CLOCKWISE]
+    elif name == "yaw" and not of_gps:
+        turns = [COUNTER_CLOCKWISE]
+    usual = name == "heading" and of_gps  # degrees clockwise from north
+    readings = []
+    for turn in reversed(turns) if usual else turns:
+        for unit in reversed(units) if usual else units:
+            roll, pitch, yaw = (np.radians(angles) if unit == "degrees" else angles).T
+            if turn == CLOCKWISE:
+                pitch, yaw = -pitch, np.pi / 2 - yaw
+            words = f"{name} in {unit} {turn}"
+            readings.append(Reading(words, positions, quaternions_of_angles(roll, pitch, yaw)))
+    names = ["degrees", "radians", *(["compass"] if name == "heading" or of_gps else [])]
+    return readings, "" if usual else " or ".join(f"`pose_angles={each}`" for each in names)

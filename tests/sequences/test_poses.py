@@ -1,0 +1,296 @@
+"""Files of poses of other programs: a circle, driven at a stated speed, is the same ego-motion in every format."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.transforms import Pose, inverse, rigid
+from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_ego_motion, read_poses
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import RigOptions
+
+SPEED, RADIUS = 8.0, 40.0  # m/s, metres
+START = 1_700_000_000_250_000_000
+STEP = 100_000_000
+COUNT = 60
+TIMES = START + STEP * np.arange(COUNT)
+TURN = SPEED / RADIUS * STEP * 1e-9 * np.arange(COUNT)  # radians since the start
+YAW = TURN + 0.3
+X, Y = RADIUS * np.sin(YAW), -RADIUS * np.cos(YAW)  # a turn to the left
+QW, QZ = np.cos(YAW / 2), np.sin(YAW / 2)
+# A camera that looks ahead, 10 degrees down and 5 to the left.
+LOOKS = (
+    rigid((0, 0, 0), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    @ Pose(np.zeros(3), np.array([np.cos(0.09), -np.sin(0.09), 0, 0])).matrix
+)
+LEFT = Camera("image_0", 1226, 370, np.diag([700.0, 700, 1]), rigid((1.1, 0.2, 1.6), LOOKS[:3, :3]))
+RIG = CameraRig((replace(LEFT, name="CAM_2"), LEFT), default_ego_from_bev())
+FRAMES = TIMES[5:50:5]
+
+
+def read(path: Path, text: str, rig: CameraRig = RIG, frames=FRAMES, **stated) -> ReadPoses:
+    path = path / "poses.txt"
+    path.write_text(text)
+    return read_poses(path, DrivePoses(rig, RigOptions(**stated), None if frames is None else np.asarray(frames)))
+
+
+def lines(*columns, separator=" ", header="") -> str:
+    rows = [separator.join(cell if isinstance(cell, str) else f"{cell:.9f}" for cell in row)
+            for row in zip(*columns, strict=True)]  # fmt: skip
+    return "\n".join(([header] if header else []) + rows) + "\n"
+
+
+def in_unit(unit_ns: int, times=TIMES) -> list[str]:
+    """The times as texts with all digits, as integer arithmetic makes them."""
+    return [f"{time // unit_ns}" + (f".{time % unit_ns:09d}"[: len(str(unit_ns))] if unit_ns > 1 else "")
+            for time in times.tolist()]  # fmt: skip
+
+
+ZERO = np.zeros(COUNT)
+S, MS, US, NS = (in_unit(unit) for unit in (10**9, 10**6, 10**3, 1))
+LEVEL = (ZERO, ZERO)
+
+
+def degrees_of(east, north, latitude=48.0, longitude=11.0):
+    """Latitude and longitude by the lengths of a degree in series, which tables of geography state."""
+    phi = np.radians(latitude)
+    north_m = 111132.954 - 559.822 * np.cos(2 * phi) + 1.175 * np.cos(4 * phi)
+    east_m = 111412.84 * np.cos(phi) - 93.5 * np.cos(3 * phi) + 0.118 * np.cos(5 * phi)
+    return latitude + (north - north[0]) / north_m, longitude + (east - east[0]) / east_m
+
+
+LATITUDE, LONGITUDE = ([f"{value:.12f}" for value in column] for column in degrees_of(X, Y))
+COMPASS = np.degrees(np.pi / 2 - YAW) % 360
+WRAPPED = np.degrees((YAW + np.pi) % (2 * np.pi) - np.pi)
+
+DATES = [f"{np.datetime64(time, 'ns')}Z" for time in TIMES.tolist()]
+
+FORMATS = {
+    "tum": (lines(S, X, Y, ZERO, *LEVEL, QZ, QW), "TUM, 60 rows at 10.0 Hz, seconds since 1970, quaternion x y z w"),
+    "tum, commented": (
+        lines(S, X, Y, ZERO, *LEVEL, QZ, QW, header="# ground truth\n# timestamp tx ty tz qx qy qz qw"),
+        "TUM, 60 rows at 10.0 Hz, seconds since 1970, quaternion x y z w",
+    ),
+    "tum in ns": (lines(NS, X, Y, ZERO, *LEVEL, QZ, QW), "TUM, 60 rows at 10.0 Hz, nanoseconds since 1970"),
+    "w first without names": (lines(S, X, Y, ZERO, QW, *LEVEL, QZ), "quaternion w x y z"),
+    "euroc": (
+        lines(NS, X, Y, ZERO, QW, *LEVEL, QZ, *[ZERO] * 3, separator=",", header="#timestamp, "
+              "p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+              "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]"),
+        "EuRoC, 60 rows at 10.0 Hz, nanoseconds since 1970, quaternion w x y z",
+    ),
+    "euroc without names": (lines(NS, X, Y, ZERO, QW, *LEVEL, QZ, separator=","), "EuRoC, 60 rows"),
+    "yaw": (lines(S, X, Y, YAW, separator=",", header="time,x,y,yaw"), "seconds since 1970, yaw in radians"),
+    "yaw in degrees, milliseconds": (
+        lines(MS, X, Y, WRAPPED, separator=",", header="t,pos_x,pos_y,yaw"), "milliseconds since 1970, yaw in degrees"),
+    "heading from north": (lines(US, X, Y, COMPASS, separator=",", header="stamp,x,y,heading"),
+                           "microseconds since 1970, heading in degrees clockwise from north"),
+    "angles, semicolons, decimal commas": (
+        lines(S, *LEVEL, WRAPPED, X, Y, ZERO, separator=";", header="time [s];roll [deg];pitch [deg];yaw [deg];x;y;z")
+        .replace(".", ","), "yaw in degrees"),
+    "ros": (lines(NS, X, Y, ZERO, *LEVEL, QZ, QW, separator=",", header="%time," + ",".join(
+        [f"field.pose.pose.position.{axis}" for axis in "xyz"] +
+        [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"])), "CSV, 60 rows"),
+    "seconds and nanoseconds": (
+        lines([str(time // 10**9) for time in TIMES.tolist()], [str(time % 10**9) for time in TIMES.tolist()], X, Y, QW,
+              *LEVEL, QZ, separator=",", header="sec,nanosec,x,y,qw,qx,qy,qz"), "seconds and nanoseconds"),
+    "gps": (lines(S, LATITUDE, LONGITUDE, ZERO + 520, COMPASS, separator=",", header="timestamp,lat,lon,alt,heading"),
+            "GPS, 60 rows at 10.0 Hz, seconds since 1970, heading in degrees clockwise from north"),
+    "gps, dates": (
+        lines(DATES, LATITUDE, LONGITUDE, COMPASS, separator=",", header="Timestamp,Latitude,Longitude,Bearing"),
+        "GPS, 60 rows"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def circle(tmp_path_factory):
+    """The ego-motion of the circle, by ego_motion.csv."""
+    path = tmp_path_factory.mktemp("circle") / "ego_motion.csv"
+    rows = lines(NS, X, Y, ZERO, QW, *LEVEL, QZ, separator=",", header="timestamp_ns,x,y,z,qw,qx,qy,qz")
+    path.write_text(rows)
+    return read_ego_motion(path)
+
+
+def matrices(motion) -> np.ndarray:
+    return np.stack([motion.pose_at(int(time)).matrix for time in motion.timestamps_ns])
+
+
+def relative(motion) -> np.ndarray:
+    """The poses seen from the first one, as the world of some formats is another one."""
+    poses = matrices(motion)
+    return inverse(poses[0]) @ poses
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_the_same_motion(name, circle, tmp_path):
+    text, words = FORMATS[name]
+    found = read(tmp_path, text)
+    np.testing.assert_array_equal(found.motion.timestamps_ns, TIMES)
+    tolerance = 0.005 if "gps" in name else 1e-6
+    compared = relative if "gps" in name else matrices
+    np.testing.assert_allclose(compared(found.motion), compared(circle), atol=tolerance)
+    np.testing.assert_allclose(np.linalg.norm(found.motion.velocities[1:-1], axis=1), SPEED, rtol=1e-3)
+    (note,) = found.notes
+    assert re.fullmatch(f"poses: .*{re.escape(words)}.*, of the vehicle; cover all frames", note)
+
+
+def camera_poses(first_world: bool) -> list[np.ndarray]:
+    """Poses of the camera: in a world with z up, or in the frame of the camera at the first pose."""
+    world_from_camera = [Pose(np.array([x, y, 0]), np.array([w, 0, 0, z])).matrix @ LEFT.ego_from_camera
+                         for x, y, w, z in zip(X, Y, QW, QZ, strict=True)]  # fmt: skip
+    return [inverse(world_from_camera[0]) @ pose if first_world else pose for pose in world_from_camera]
+
+
+def kitti(poses) -> str:
+    return "\n".join(" ".join(f"{value:.9e}" for value in pose[:3].ravel()) for pose in poses)
+
+
+def test_kitti_is_of_camera_0_with_times_beside_it(circle, tmp_path):
+    (tmp_path / "times.txt").write_text("\n".join(f"{STEP * place * 1e-9:.6e}" for place in range(COUNT)))
+    found = read(tmp_path, kitti(camera_poses(first_world=True)), frames=FRAMES - START)
+    np.testing.assert_array_equal(found.motion.timestamps_ns, TIMES - START)
+    np.testing.assert_allclose(relative(found.motion), relative(circle), atol=1e-6)
+    assert "KITTI, 60 rows at 10.0 Hz, seconds, of camera 0, as KITTI's are (image_0); cover all" in found.notes[0]
+
+
+def test_kitti_without_times_has_those_of_the_frames(circle, tmp_path):
+    text = kitti(camera_poses(first_world=True))
+    found = read(tmp_path, text, frames=TIMES)
+    np.testing.assert_allclose(relative(found.motion), relative(circle), atol=1e-6)
+    assert "the times of the frames" in found.notes[0]
+    with pytest.raises(InputError, match=r"60 poses without times, and the drive has 9 frames: put times.txt beside"):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize("first_world", [True, False])
+def test_poses_of_a_camera_are_asked_for(first_world, circle, tmp_path):
+    poses = [Pose.from_matrix(pose) for pose in camera_poses(first_world)]
+    columns = np.array([[*pose.translation, *np.roll(pose.quaternion, -1)] for pose in poses]).T
+    text = lines(S, *columns)
+    with pytest.raises(InputError, match=r"fit a camera that looks ahead: pass `poses_of=CAM_2`"):
+        read(tmp_path, text)
+    found = read(tmp_path, text, poses_of="image_0")
+    np.testing.assert_allclose(relative(found.motion), relative(circle), atol=1e-6)
+    assert "of image_0" in found.notes[0]
+    with pytest.raises(InputError, match=r"`poses_of=left`: is not in the rig \(expected one of vehicle, CAM"):
+        read(tmp_path, text, poses_of="left")
+
+
+def test_real_kitti_poses_are_those_of_the_folder(shared, tmp_path):
+    drive = open_sequence(shared / "data/kitti-straight", ego_motion="optional")
+    motion, camera = drive.ego_motion, drive.rig.cameras[0]
+    in_camera = [camera.camera_from_ego @ pose @ camera.ego_from_camera for pose in matrices(motion)]
+    found = read(tmp_path, kitti(in_camera), rig=drive.rig, frames=motion.timestamps_ns)
+    np.testing.assert_allclose(matrices(found.motion), matrices(motion), atol=1e-6)
+
+
+def standing(text_yaw: str) -> str:
+    return lines(S, ZERO, ZERO, [text_yaw] * 30 + ["0.5"] * 30, separator=",", header="t,x,y,yaw")
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("degrees", np.radians(0.5)), ("radians", 0.5)])
+def test_angles_that_nothing_decides_are_asked_for(unit, turn, tmp_path):
+    with pytest.raises(
+        InputError,
+        match=r"may have yaw in radians .* or yaw in degrees .*does not move.*pass `pose_angles=degrees` or ",
+    ):
+        read(tmp_path, standing("0"))
+    found = read(tmp_path, standing("0"), pose_angles=unit)
+    assert Pose(np.zeros(3), found.motion.quaternions[-1]).yaw == pytest.approx(turn)
+
+
+def test_the_angle_of_a_vehicle_that_stands_needs_no_unit(tmp_path):
+    assert read(tmp_path, standing("0.5")).motion.velocities == pytest.approx(0)
+
+
+def test_times_of_frames_that_are_not_known_are_asked_for(circle, tmp_path):
+    for name in ("tum", "yaw in degrees, milliseconds", "gps"):
+        found = read(tmp_path, FORMATS[name][0], frames=None)
+        np.testing.assert_array_equal(found.motion.timestamps_ns, TIMES)
+        assert found.notes[0].endswith(", of the vehicle")
+    for text in (kitti(camera_poses(first_world=True)), SLOW):
+        with pytest.raises(FrameTimesNeeded):
+            read(tmp_path, text, frames=None)
+
+
+# A row a second of a slow vehicle, or one a millisecond.
+SLOW = lines([f"{place}" for place in range(COUNT)], X / 1000, Y / 1000, ZERO, *LEVEL, QZ, QW)
+
+
+def test_times_with_two_readings_are_asked_for(tmp_path):
+    frames = [5_000_000, 10_000_000]
+    with pytest.raises(InputError, match=r"may be seconds or milliseconds: pass `pose_times=s` or `pose_times=ms`"):
+        read(tmp_path, SLOW, frames=frames)
+    assert read(tmp_path, SLOW, frames=frames, pose_times="ms").motion.last_ns == 59_000_000
+    assert "seconds" in read(tmp_path, SLOW, frames=[5 * 10**9, 55 * 10**9]).notes[0]  # only these cover the frames
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (lines(["1.70000E+09"] * COUNT, X, Y, ZERO, *LEVEL, QZ, QW), 'line 1, column time: the last digits of "1.7'),
+        (lines(S[::-1], X, Y, ZERO, *LEVEL, QZ, QW), "line 2: its time is not later"),
+        (lines(S, X, Y, ZERO, *LEVEL, QZ, QW + 0.01), "quaternion's norm is .*expected 1"),
+        (lines(S, X, Y, separator=",", header="t,x,y"), "columns of the orientation are missing"),
+        (lines(X, Y, YAW, separator=",", header="x,y,yaw"), "a column of times is missing"),
+        (lines(S, X, Y, YAW, YAW, separator=",", header="t,x,y,yaw,heading"), "yaw and one of heading"),
+        (lines(S, X, X, Y, YAW, separator=",", header="t,x,px,y,yaw"), 'columns "x" and "px" are both x'),
+        (lines(S, X + 91, Y, YAW, separator=",", header="t,lat,lon,yaw"), "is no place on Earth"),
+        (lines(S, X, Y, ZERO, *LEVEL, QZ, QW) + "1 2 3\n", "line 61 has 3 cells"),
+        (lines(S, ["nan"] * COUNT, Y, ZERO, *LEVEL, QZ, QW), "expected a finite number"),
+        (kitti([2 * pose for pose in camera_poses(True)]), "line 1: .* are no rotation"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_line_that_names_the_place(text, said, tmp_path):
+    with pytest.raises(InputError, match=said) as error:
+        read(tmp_path, text, frames=TIMES)
+    assert "\n" not in str(error.value)
+
+
+def test_a_drive_takes_a_file_and_says_what_it_understood(drive, tmp_path):
+    seconds = np.arange(0.9, 2.7, 0.1)
+    still = np.zeros(len(seconds))
+    path = tmp_path / "trajectory.log"
+    path.write_text(lines(seconds, seconds * 10, *[still] * 5, still + 1))
+    opened = open_sequence(drive, ego_motion_file=path)
+    own = open_sequence(drive)
+    assert opened.load(1).world_from_ego.translation == pytest.approx(own.load(1).world_from_ego.translation)
+    assert any(re.match(r"poses: TUM, 18 rows at 10.0 Hz, seconds, .*cover all frames", note) for note in opened.notes)
+    path.write_text(lines(seconds + 5, seconds * 10, *[still] * 5, still + 1))
+    with pytest.raises(InputError, match=r"read as poses: TUM, 18 rows .*; cover 0 of 4 frames"):
+        open_sequence(drive, ego_motion_file=path)
+
+
+def test_a_place_on_earth_becomes_that_of_the_drive(drive, tmp_path):
+    seconds = np.arange(0.9, 2.7, 0.1)
+    path = tmp_path / "gps.csv"
+    north = [f"{48 + 1e-4 * place}" for place in range(len(seconds))]
+    path.write_text(lines(seconds, north, ["11.5"] * 18, ["0"] * 18, separator=",", header="t,lat,lon,heading"))
+    opened = open_sequence(drive, ego_motion_file=path)
+    assert (opened.facts.geo_origin.latitude_deg, opened.facts.geo_origin.longitude_deg) == (48, 11.5)
+    moved = opened.load(2).world_from_ego.translation - opened.load(0).world_from_ego.translation
+    assert moved == pytest.approx([0, 111.2, 0], abs=0.1)  # a second, 0.001 degrees of latitude
+
+
+def test_the_heading_of_gps_is_clockwise_from_north(tmp_path):
+    there = ["48"] * COUNT, ["11"] * COUNT, np.linspace(0, 5, COUNT)
+    found = read(tmp_path, lines(S, *there, separator=",", header="t,lat,lon,heading"))
+    yaws = [np.degrees(Pose(np.zeros(3), quaternion).yaw) for quaternion in found.motion.quaternions]
+    assert yaws == pytest.approx(90 - np.linspace(0, 5, COUNT))
+    turned = read(tmp_path, lines(S, X, Y, COMPASS, separator=",", header="t,x,y,heading"), pose_angles="compass")
+    assert Pose(np.zeros(3), turned.motion.quaternions[0]).yaw == pytest.approx(YAW[0])
+
+
+def test_pitch_lifts_the_nose_with_a_heading_from_north(tmp_path):
+    climbs = ZERO + 2.0  # degrees
+    up = np.tan(np.radians(2)) * SPEED * 0.1 * np.arange(COUNT)
+    header = "t,lat,lon,alt,roll_deg,pitch_deg,heading_deg"
+    text = lines(S, LATITUDE, LONGITUDE, up, ZERO, climbs, COMPASS, separator=",", header=header)
+    velocities = read(tmp_path, text).motion.velocities[1:-1]
+    assert velocities[:, 2] == pytest.approx(0, abs=0.02)
+    assert velocities[:, 0] == pytest.approx(SPEED / np.cos(np.radians(2)), abs=0.02)

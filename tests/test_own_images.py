@@ -1,0 +1,73 @@
+"""docs/own-images.md: its commands run on a folder as it describes, and its note is what they say."""
+
+import csv
+import random
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from command_line import command
+
+from bevcli.sequences.open import open_sequence
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/own-images.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+COMMANDS = [line for name, block in BLOCKS if name == "sh" for line in block.splitlines()]
+
+
+@pytest.fixture
+def my_drive(tmp_path):
+    """The sample with folders of cameras and names in microseconds. Times are up to 4 ms off, and one image is lost."""
+    street, drive = ROOT / "samples/street", tmp_path / "my_drive"
+    drive.mkdir()
+    for name in ("calibration.json", "ego_motion.csv"):
+        shutil.copy(street / name, drive)
+    generator = random.Random(0)
+    for row in csv.DictReader((street / "frames.csv").read_text().splitlines()):
+        for camera in (name for name in row if name.startswith("CAM_") and "." not in name):
+            time = int(row["timestamp_ns"]) // 1000 + generator.randint(-4000, 4000)
+            folder = drive / camera.removeprefix("CAM_").lower()
+            folder.mkdir(exist_ok=True)
+            if (camera, row["frame"]) != ("CAM_BACK", "7"):
+                prefix = "CAM_FRONT_" if camera == "CAM_FRONT" else ""
+                shutil.copy(street / row[camera], folder / f"{prefix}{time}.jpg")
+    return drive
+
+
+def test_the_note_of_the_page_is_what_is_said(my_drive):
+    shown = next(block for name, block in BLOCKS if "note: " in block)
+    shown = " ".join(shown.split()).removeprefix("note: ").removesuffix(" …")
+    said = next(note for note in open_sequence(my_drive).notes if note.startswith("frames.csv"))
+    within = re.compile(r"within \d+ ms")
+    assert within.sub("", said).startswith(within.sub("", shown))
+    assert int(within.search(said)[0].split()[1]) <= 8
+
+
+def test_the_converted_drive_has_what_was_understood(my_drive, tmp_path):
+    done = command(tmp_path, *shlex.split(next(line for line in COMMANDS if "convert" in line))[1:])
+    assert done.returncode == 0, done.stderr
+    one, other = open_sequence(my_drive), open_sequence(tmp_path / "my_sequence")
+    assert (tmp_path / "my_sequence/frames.csv").exists()
+    assert [stamp.timestamp_ns for stamp in one.stamps] == [stamp.timestamp_ns for stamp in other.stamps]
+    for place in (0, 7):
+        a, b = one.load(place), other.load(place)
+        assert {name: i.timestamp_ns for name, i in a.images.items()} == {
+            n: i.timestamp_ns for n, i in b.images.items()
+        }
+        assert all(image.encoded == b.images[name].encoded for name, image in a.images.items())
+    assert list(b.dropped) == ["CAM_BACK"]
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_page_run(my_drive, tmp_path):
+    assert len(PAGE.splitlines()) < 50
+    for line in COMMANDS:
+        program, *arguments = shlex.split(line)
+        assert program == "bevcli"
+        if arguments[0] != "viz":  # which opens a viewer
+            done = command(tmp_path, *arguments)
+            assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    assert (tmp_path / "runs/my_drive-demo/recording.rrd").exists()
