@@ -8,6 +8,7 @@ from typing import Literal
 
 Group = Literal[
     "bevcli.models",
+    "bevcli.calibrations",
     "bevcli.results",
     "bevcli.model_uses",
     "bevcli.sequences",

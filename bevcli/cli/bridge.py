@@ -43,7 +43,7 @@ def model_option(help: str, panel: str = "Model", **settings: Any) -> Option:
 FormatValues = dict[str, Any]  # a parameter with the options of all input formats, by name
 Json = Annotated[bool, Option("Print one JSON object instead of text.", flag="--json")]
 InputDrive = Annotated[
-    Path, argument("Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.")
+    Path, argument("Sequence folder (images or videos), a video, nuScenes root, .mcap file or rosbag2 folder.")
 ]
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look", "eval": "Score", "export": "Score"}
+RIG = ("calibration", "extrinsics", "transform", "fov_deg", "height", "yaw_deg")
 ERRORS_FOUND = 3  # exit code of `bevcli project-debug`
 
 
@@ -192,13 +193,15 @@ def _open_viewer(recording: Path, options: ViewOptions) -> None:
 
 
 def project_debug(
-    calibration: Annotated[Path, argument("A calibration.json, a sequence that contains one, or a ROS bag.")],
+    input: Annotated[
+        Path, argument("A drive, such as a sequence folder, a ROS bag or a video, or a calibration alone.")
+    ],
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
     format_options: Annotated[
         FormatValues,
         Part(
             only=(
-                *("topics", "topics_file", "times", "image_rate_hz", "start_ns"),
+                *(*RIG, "topics", "topics_file", "times", "image_rate_hz", "start_ns"),
                 *("ego_motion_file", "pose_times", "pose_angles", "poses_of"),
             )
         ),
@@ -222,13 +225,15 @@ def project_debug(
     from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
     from bevcli.sequences.open import open_sequence
 
-    given = {name: value for name, value in format_options.items() if value}
-    check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
+    given = {name: value for name, value in format_options.items() if value not in (None, {})}
+    if options.sequence is not None and "calibration" in given:
+        raise InputError("`calibration` and `sequence` exclude each other: pass the drive, and its `calibration`")
+    check = check_calibration(input, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
     if not check.errors:
         if options.sequence is not None:
-            given["calibration"] = calibration
+            given["calibration"] = input
         how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
-        open_drive = partial(open_sequence, options.sequence or calibration, **how)
+        open_drive = partial(open_sequence, options.sequence or input, **how)
         findings = [finding for step in further for finding in step(open_drive)]
         check = replace(check, report=with_findings(check.report, findings))
     written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")

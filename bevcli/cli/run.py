@@ -48,11 +48,15 @@ def run(
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.rig.standing_check import IMAGES_MOVE, StandingCheck
         from bevcli.runs.run_into_folder import run_into_folder
+        from bevcli.sequences.format import format_of
         from bevcli.sequences.open import open_sequence
 
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
+    without_poses = not (format_options["ego_motion_file"] or format_of(sequence).has_poses)
+    if source.ego_motion == "required" and without_poses:
+        run_options = replace(run_options, temporal=False)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = open_sequence(sequence, reading, **format_options)
     for step in first:

@@ -17,15 +17,16 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.options import defaults, gather
 from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_scenes
-from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FORMAT as NATIVE
 from bevcli.sequences.native.folder import FolderSequence, read_frames_table
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import RigOptions, SequenceOptions
 from bevcli.writing import write_whole
 
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
@@ -96,11 +97,11 @@ def check_calibration(
     """Find the mistakes in a calibration.
 
     Args:
-        path: a calibration.json, a sequence folder that contains one, a nuScenes root, or a ROS bag.
+        path: a calibration of any kind, or a drive: a sequence folder, a nuScenes root, a ROS bag, a video.
         sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
-        options: of `open_sequence`, such as allow_outside, or topics for a bag. A native folder takes
-            allow_outside, and those of images without a table and of poses.
+        options: of `open_sequence`, such as allow_outside, calibration, or topics for a bag. A native folder takes
+            allow_outside and those of the rig, of images without a table and of poses.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
@@ -109,19 +110,23 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    if _is_other_drive(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
-        return _check_other_sequence(path, frame, options)
-    file = path / CALIBRATION if path.is_dir() else path
-    draft = draft_calibration(file)
+    stated = {name: options[name] for name in defaults(RigOptions).keys() - NAMES if name in options}
+    if folder is None and is_drive(path):
+        given = gather(RigOptions, None, stated).draft(path)
+        if given is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
+            return _check_other_sequence(path, frame, options)
+        if given is not None and _is_other_drive(path):
+            return _check_other_sequence(path, frame, options, given.findings)
+        draft, folder = given or draft_rig(path / CALIBRATION, path), path
+    else:
+        draft = draft_rig(path, folder, **stated)
     if folder is not None and _is_other_drive(folder):
-        return _check_other_sequence(folder, frame, {**options, "calibration": file})
-    if folder is None and path.is_dir():
-        folder = path
+        return _check_other_sequence(folder, frame, {**options, "calibration": path}, draft.findings)
     of_drive: tuple[Finding, ...] = ()
     images: Mapping[str, NDArray[np.uint8]] = {}
     if folder is not None and draft.rig.cameras:
         of_drive, images = _read_folder(folder, draft.rig, frame, options)
-    name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
+    name = os.path.basename(os.path.realpath(folder or (path if path.is_dir() else path.with_suffix(""))))
     return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), of_drive), images)
 
 
@@ -143,10 +148,12 @@ def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
     }
 
 
-def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationCheck:
+def _check_other_sequence(
+    path: Path, frame: int, options: Mapping[str, Any], found_before: Sequence[Finding] = ()
+) -> CalibrationCheck:
     sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
-    report = with_findings(check_rig(shown.rig), _missing_images(shown))
+    report = with_findings(check_rig(shown.rig, found_before), _missing_images(shown))
     return CalibrationCheck(sequence.name, shown.rig, report, _pixels(shown))
 
 

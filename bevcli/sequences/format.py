@@ -39,6 +39,7 @@ class Format:
             ground truth. Raises InputError.
         options: the dataclass of its own options.
         annotated: whether its drives may have ground truth that opening them reads, so that `bevcli eval` takes them.
+        has_poses: whether its drives may have poses; without them, `bevcli run` uses no history.
         precedence: the format with the highest one is taken where several recognise a path. A format that needs little
             to recognise a path has a low one.
     """
@@ -49,6 +50,7 @@ class Format:
     opener: str | Callable[[Path, SequenceOptions, Any], Sequence]
     options: type[FormatOptions] = FormatOptions
     annotated: bool = False
+    has_poses: bool = True
     precedence: int = 0
 
     def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:

@@ -14,6 +14,7 @@ from bevcli.options import option, options, parse_pairs
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
     from bevcli.model.config import ModelConfig
+    from bevcli.sequences.files.calibration_file import RigDraft
 
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
 # static: the vehicle stands, and the ego-motion is not read.
@@ -135,23 +136,67 @@ class FormatOptions:
         return False
 
 
+def parse_by_camera(texts: list[str]) -> float | dict[str, float]:
+    """A number for all cameras, or numbers CAMERA=NUMBER. Raises ValueError."""
+    if len(texts) == 1 and "=" not in texts[0]:
+        return _number(texts[0])
+    pairs = parse_pairs(texts, "one number, or CAMERA=NUMBER for each camera")
+    return {name: _number(text) for name, text in pairs.items()}
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise ValueError(f'"{text}" (expected a number, or CAMERA=NUMBER)')
+    return value
+
+
 @options("Input")
 class RigOptions(FormatOptions):
-    """Files that replace the calibration and the ego-motion of an input. A format that takes them inherits them."""
+    """What replaces the calibration and the ego-motion of an input. A format that takes it inherits it."""
 
-    intrinsics: Path | None = option(
-        reads="path",
-        default=None,
-        help="Kalibr camchain or ROS camera_info YAML, or a folder of these; replaces calibration.json.",
-    )
-    extrinsics: Path | None = option(
-        reads="path", default=None, help='JSON with the "ego_from_camera" of each camera; required with `intrinsics`.'
-    )
     calibration: Path | None = option(
         reads="path",
         default=None,
-        help="A calibration.json that replaces the calibration of the input.",
-        metavar="FILE",
+        help="A calibration that replaces that of the input: calibration.json, K, D and T in YAML, JSON or XML, "
+        "Kalibr, ROS, OpenCV, COLMAP, nerfstudio or KITTI; or a folder of these (docs/other-inputs.md).",
+        metavar="FILE|FOLDER",
+    )
+    intrinsics: Path | None = option(
+        reads="path", default=None, help="Another name of `calibration`, for a file without poses."
+    )
+    extrinsics: Path | None = option(
+        reads="path", default=None, help="The poses of the cameras, in place of those of `calibration`."
+    )
+    transform: Literal["ego_from_camera", "camera_from_ego"] | None = option(
+        default=None, help="What the transforms of `calibration` are, where both are possible."
+    )
+    fov_deg: float | Mapping[str, float] | None = option(
+        default=None,
+        help="Horizontal field of view, degrees: a rig without calibration. Repeatable.",
+        flag="--fov",
+        metavar="[CAMERA=]DEG",
+        parse=parse_by_camera,
+        repeatable=True,
+    )
+    height: float | Mapping[str, float] | None = option(
+        default=None,
+        help="Height of the cameras above the ground, metres. Repeatable.",
+        metavar="[CAMERA=]M",
+        parse=parse_by_camera,
+        repeatable=True,
+    )
+    yaw_deg: float | Mapping[str, float] | None = option(
+        default=None,
+        help="Viewing direction of a camera without a pose, degrees counter-clockwise from ahead. Default for a single "
+        "camera: 0. Repeatable.",
+        flag="--yaw",
+        metavar="[CAMERA=]DEG",
+        parse=parse_by_camera,
+        repeatable=True,
     )
     ego_motion_file: Path | None = option(
         reads="path",
@@ -175,16 +220,23 @@ class RigOptions(FormatOptions):
         metavar="CAMERA|vehicle",
     )
 
-    def rig(self) -> CameraRig | None:
-        """The rig of the given files; None if none is given. Raises InputError."""
-        given = self.intrinsics is not None or self.extrinsics is not None
-        if self.calibration is None and not given:
-            return None
-        from bevcli.sequences.files.calibration_file import read_calibration
-        from bevcli.sequences.files.kalibr_ros import read_rig
+    def rig(self, drive: Path | None = None) -> CameraRig | None:
+        """The rig of the given files or numbers; None if none is given. drive: its images state missing sizes.
 
-        if self.calibration is None:
-            return read_rig(self.intrinsics, self.extrinsics)
-        if given:
-            raise InputError("`calibration` excludes `intrinsics` and `extrinsics`: pass one of them")
-        return read_calibration(self.calibration)
+        Raises InputError.
+        """
+        draft = self.draft(drive)
+        return None if draft is None else draft.rig
+
+    def draft(self, drive: Path | None = None) -> RigDraft | None:
+        """The rig, and how it was understood; as `rig`."""
+        if self.calibration is not None and self.intrinsics is not None:
+            raise InputError("`calibration` and `intrinsics` are the same: pass one of them")
+        names = ("extrinsics", "transform", "fov_deg", "height", "yaw_deg")
+        how = {name: value for name in names if (value := getattr(self, name)) is not None}
+        path = self.intrinsics if self.calibration is None else self.calibration
+        if path is None and not how:
+            return None
+        from bevcli.sequences.files.calibration_file import draft_rig
+
+        return draft_rig(path, drive, **how).checked(path or Path())

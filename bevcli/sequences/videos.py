@@ -18,7 +18,6 @@ CONTAINERS = (
 )  # fmt: skip
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
 
 
 class VideoReader:
@@ -79,6 +78,14 @@ def open_capture(path: Path) -> cv2.VideoCapture:
         capture.release()
         raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
     return capture
+
+
+def size_of_video(path: Path) -> tuple[int, int]:
+    """(width, height) of the images of a video, pixels. Raises InputError as `open_capture`."""
+    capture = open_capture(path)
+    width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    capture.release()
+    return width, height
 
 
 def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:

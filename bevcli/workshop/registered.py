@@ -39,6 +39,10 @@ OWN: dict[Group, dict[str, str]] = {
         "dgp": "bevcli.workshop.formats:DGP",
         "ros": "bevcli.workshop.formats:ROS",
         "t4": "bevcli.workshop.formats:T4",
+        "video": "bevcli.workshop.formats:VIDEO",
+    },
+    "bevcli.calibrations": {
+        "files": "bevcli.workshop.formats.calibrations:read_rig",
     },
     "bevcli.poses": {
         "files": "bevcli.workshop.formats.poses:read_poses",

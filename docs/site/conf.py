@@ -27,6 +27,7 @@ SECTIONS = {
         "docs/sequence-format",
         "docs/weights",
         "docs/other-inputs",
+        "docs/video",
         "docs/recording",
         "docs/rendered-drives",
     ],

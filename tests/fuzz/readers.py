@@ -73,9 +73,18 @@ def _model(folder: Path) -> None:
 
 def _rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from bevcli.sequences.files.kalibr_ros import read_rig
+        from bevcli.sequences.options import RigOptions
 
-        read_rig(folder / "rig" / name, folder / "rig/extrinsics.json")
+        RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json").rig()
+
+    return read
+
+
+def _other_rig(name: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        from bevcli.sequences.options import RigOptions
+
+        RigOptions(calibration=folder / "rig" / name).rig(folder / "drive")
 
     return read
 
@@ -175,6 +184,18 @@ READERS = {
     "Kalibr": Reader("rig/camchain.yaml", "text", _rig("camchain.yaml")),
     "ROS": Reader("rig/camera_info.yaml", "text", _rig("camera_info.yaml")),
     "extrinsics": Reader("rig/extrinsics.json", "json", _rig("camchain.yaml")),
+    **{
+        name: Reader(f"rig/{file}", kind, _other_rig(file.partition("/")[0]))
+        for name, file, kind in (
+            ("K, D and T", "named.yaml", "text"),
+            ("K, D and T by number", "named.json", "json"),
+            ("OpenCV XML", "opencv.xml", "text"),
+            ("nerfstudio", "transforms.json", "json"),
+            ("COLMAP cameras", "colmap/cameras.txt", "text"),
+            ("COLMAP images", "colmap/images.txt", "text"),
+            ("KITTI calibration", "kitti.txt", "text"),
+        )
+    },
     "JPEG": Reader("drive/images/CAM_FRONT/0.jpg", "bytes", _drive),
     "PNG": Reader("drive/images/CAM_BACK/1.png", "bytes", _drive),
     "MP4": Reader("videos_drive/videos/CAM_FRONT.mp4", "bytes", _videos),

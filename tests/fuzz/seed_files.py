@@ -145,6 +145,32 @@ def _rig(folder: Path) -> None:
     (folder / "camera_info.yaml").write_text(yaml.safe_dump(info))
     pose = {"translation": [1.0, 0, 1.5], "rotation_wxyz": QUATERNIONS["CAM_FRONT"]}
     (folder / "extrinsics.json").write_text(json.dumps({"cameras": {"cam0": {"ego_from_camera": pose}}}))
+    _other_rigs(folder)
+
+
+def _other_rigs(folder: Path) -> None:
+    """One camera that looks ahead, as other programs write it."""
+    k, d, t = [[50.0, 0, 31.5], [0, 50.0, 17.5], [0, 0, 1]], [0.1, 0.01, 0.001, 0.001], [1.0, 0, 1.5]
+    r = [[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    matrix = [[*row, place] for row, place in zip(r, t, strict=True)]
+    named = {"K": k, "D": d, "T": matrix, "resolution": list(SIZE)}
+    (folder / "named.yaml").write_text(yaml.safe_dump({"cam0": named}))
+    by_name = {"intrinsics": {"fx": 50, "fy": 50, "cx": 31.5, "cy": 17.5}, "distortion": {"k1": 0.1, "model": "radtan"}}
+    by_name |= {"pose": {"position": {"x": 1, "y": 0, "z": 1.5}, "quaternion": [0.5, -0.5, 0.5, -0.5]}, "width": 64}
+    (folder / "named.json").write_text(json.dumps({"cameras": [{"name": "cam0", "height": 36, **by_name}]}))
+    data = " ".join(str(number) for row in k for number in row)
+    matrices = f"<K type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt><data>{data}</data></K>"
+    xml = f"<opencv_storage>{matrices}<T>{' '.join(str(n) for row in matrix for n in row)}</T></opencv_storage>"
+    (folder / "opencv.xml").write_text(xml.replace("</K>", "</K><width>64</width><height>36</height>"))
+    opengl = [[0.0, 0, -1, 1], [-1, 0, 0, 0], [0, 1, 0, 1.5], [0, 0, 0, 1]]
+    frame = {"file_path": "images/cam0/0.jpg", "transform_matrix": opengl}
+    nerf = {"fl_x": 50.0, "cx": 32, "cy": 18, "w": 64, "h": 36, "k1": 0.1, "frames": [frame]}
+    (folder / "transforms.json").write_text(json.dumps(nerf))
+    (folder / "colmap").mkdir()
+    (folder / "colmap/cameras.txt").write_text("# CAMERA_ID\n1 OPENCV 64 36 50 50 32 18 0.1 0.01 0 0\n")
+    (folder / "colmap/images.txt").write_text("1 0.5 0.5 -0.5 0.5 0 1.5 -1 1 cam0/0.jpg\n1 2 -1\n")
+    velodyne = "0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27"
+    (folder / "kitti.txt").write_text(f"P2: 50 0 32 0 0 50 18 0 0 0 1 0\nS_rect_02: 64 36\nTr: {velodyne}\n")
 
 
 def _weights(folder: Path) -> None:

@@ -92,7 +92,9 @@ def sequence_codes(folder):
     (missing / "frames.csv").write_text("\n".join([table[0], *without_back]))
     write_motion(refused, heading=(1, 0, 0, 0), rows=5)
     (unlisted / "frames.csv").unlink()
-    return motion.union(*({f.code for f in check_calibration(path).findings} for path in drives))
+    without = check_calibration(late, fov_deg=70, height=1.5, yaw_deg={"CAM_FRONT": 0, "CAM_BACK": 180})
+    checks = [without, *map(check_calibration, drives)]
+    return motion.union(*({f.code for f in check.findings} for check in checks))
 
 
 def motion_codes():

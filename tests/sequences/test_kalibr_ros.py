@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.files.kalibr_ros import read_rig
 from bevcli.sequences.options import RigOptions
 
 KALIBR = """
@@ -47,6 +46,10 @@ d: [0.1, 0.2, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1]
 k: [500.0, 0, 320, 0, 501.0, 240, 0, 0, 1]
 """
 POSE = {"translation": [1.5, 0.0, 1.4], "rotation_wxyz": [0.5, -0.5, 0.5, -0.5]}
+
+
+def read_rig(intrinsics, extrinsics):
+    return RigOptions(intrinsics=intrinsics, extrinsics=extrinsics).rig()
 
 
 def write(folder, text, poses, name="intrinsics.yaml", **more):
@@ -149,10 +152,10 @@ def test_without_files_there_is_no_rig():
         (KALIBR.replace("[458.6,", "[.nan,"), {"cam0": POSE}, "cam0.*intrinsics.*finite"),
         (KALIBR.replace("[458.6,", "[0,"), {"cam0": POSE}, "cam0.*singular"),
         (KALIBR, {"cam9": POSE}, "camera cam9: has no intrinsics"),
-        (KALIBR.replace("T_cn_cnm1", "T_other"), {"cam0": POSE}, 'camera cam1: "ego_from_camera" is missing'),
+        (KALIBR.replace("T_cn_cnm1", "T_other"), {"cam0": POSE}, "camera cam1: its pose .* is missing"),
         (KALIBR, {"cam0": {**POSE, "rotation_wxyz": [1, 1, 0, 0]}}, "cam0.*norm"),
         ("a: [", {}, "broken YAML"),
-        ("a: 1", {}, "expected a Kalibr camchain"),
+        ("a: 1", {}, "expected .* a Kalibr camchain"),
         ("!!python/object/apply:os.getcwd []", {}, "YAML"),
     ],
 )
@@ -163,8 +166,9 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
     assert str(tmp_path) in str(caught.value)
 
 
-def test_intrinsics_without_extrinsics_and_the_reverse_fail(tmp_path):
+def test_intrinsics_without_poses_and_poses_alone_fail(tmp_path):
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
-    for pair in ((intrinsics, None), (None, extrinsics)):
-        with pytest.raises(InputError, match="must be given together"):
-            read_rig(*pair)
+    with pytest.raises(InputError, match=r"cam0: its pose .* is missing"):
+        read_rig(intrinsics, None)
+    with pytest.raises(InputError, match="must be given together"):
+        read_rig(None, extrinsics)

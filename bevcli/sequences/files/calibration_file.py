@@ -1,4 +1,7 @@
-"""calibration.json: the cameras of the rig, the bev frame in which the model predicts, and facts of the drive."""
+"""calibration.json: the cameras of the rig, the bev frame in which the model predicts, and facts of the drive.
+
+`draft_rig` reads calibrations of other programs too, by the readers of the group "bevcli.calibrations".
+"""
 
 import json
 from collections.abc import Mapping
@@ -15,11 +18,13 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
+from bevcli.registry import load
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
+LARGEST_JSON = 64 << 20  # of another program, such as that of a reconstruction
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LONGEST_NAME = 60  # characters of a wrong name in a message
 LARGEST_SIZE = 16384  # pixels of a side
@@ -27,8 +32,9 @@ FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme f
 ORIGIN_LIMITS = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}  # in the order of GeoOrigin's fields
 # Names of ROS, Kalibr and OpenCV.
 LENS_NAMES = {
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan"), "brown_conrady"),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt"), "kannala_brandt"),
+    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "radial_tangential"), "brown_conrady"),
+    **dict.fromkeys(("brown_conrady", "opencv"), "brown_conrady"),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "opencv_fisheye"), "kannala_brandt"),
 }
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
@@ -47,18 +53,52 @@ class RigDraft:
     findings: tuple[Finding, ...]
     facts: DriveFacts = field(default_factory=DriveFacts)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How the file was understood, if it is no calibration.json."""
+        return tuple(finding.line for finding in self.findings if finding.severity == "info")
 
-def read_calibration(path: str | Path) -> CameraRig:
-    """The rig in calibration.json. Raises InputError with the first mistake in the file."""
-    return read_rig_and_facts(Path(path))[0]
+    def checked(self, path: Path) -> "RigDraft":
+        """The draft itself. Raises InputError with its first mistake. path: the file."""
+        for error in errors_of(self.findings):
+            raise InputError(f"{path}: {error.line}")
+        return self
 
 
-def read_rig_and_facts(path: Path) -> tuple[CameraRig, DriveFacts]:
-    """The rig in calibration.json, and what the file states about the drive. Raises as `read_calibration`."""
-    draft = draft_calibration(path)
-    for error in errors_of(draft.findings):
-        raise InputError(f"{path}: {error.line}")
-    return draft.rig, draft.facts
+def read_calibration(path: str | Path, drive: str | Path | None = None, **how: Any) -> CameraRig:
+    """The rig in calibration.json, or in a calibration of another program (docs/other-inputs.md).
+
+    drive: a folder or a video whose images state sizes that the calibration does not.
+    how: options of a calibration of another program: `extrinsics`, `transform`, `height`, `yaw_deg` of `RigOptions`.
+    Raises InputError with the first mistake in the file.
+    """
+    return draft_rig(Path(path), None if drive is None else Path(drive), **how).checked(Path(path)).rig
+
+
+def draft_rig(path: Path | None, drive: Path | None = None, **how: Any) -> RigDraft:
+    """The rig in a calibration of any kind, and all mistakes of a calibration.json. Arguments as `read_calibration`.
+
+    path: None for a rig of numbers alone (`fov_deg`). Raises InputError for a mistake in another file.
+    """
+    how = {name: value for name, value in how.items() if value is not None}
+    file = None if path is None else _own_file(path)
+    if file is None:
+        made: RigDraft = load("bevcli.calibrations", "files")(path, drive, **how)
+        return made
+    for name in how:
+        raise InputError(f"{file}: states all of the rig: remove `{name}`")
+    return draft_calibration(file)
+
+
+def _own_file(path: Path) -> Path | None:
+    """The calibration.json that a path is or contains; None for a calibration of another program."""
+    if path.is_dir():
+        return path / CALIBRATION if (path / CALIBRATION).exists() else None
+    if path.suffix.lower() != ".json" or not path.exists():
+        return path if path.name == CALIBRATION else None
+    document = read_json(path, largest=LARGEST_JSON)
+    is_own = not isinstance(document, dict) or "format" in document
+    return path if is_own or (path.name == CALIBRATION and "cameras" in document) else None
 
 
 def draft_calibration(path: Path) -> RigDraft:
@@ -71,7 +111,7 @@ def draft_calibration(path: Path) -> RigDraft:
             raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
         return dict(pairs)
 
-    missing = "the file is missing (expected a calibration)"
+    missing = "the file is missing (expected a calibration): pass `calibration=FILE` of another kind, or `fov_deg=70`"
     document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=unique)
     if not isinstance(document, dict):
         raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS
@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
-from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
+from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_rig
 from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_poses
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
@@ -50,9 +50,11 @@ class FolderSequence(ListedSequence):
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        rig, facts = own.rig() if rig is None else rig, DriveFacts()
         if rig is None:
-            rig, facts = read_rig_and_facts(path / CALIBRATION)
+            given = own.draft(path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
+        else:
+            given = RigDraft(rig, ())
+        rig, facts = given.rig, given.facts
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         entries = read_frames_table(table, rig.names) if is_there(table) else ()
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
@@ -67,7 +69,7 @@ class FolderSequence(ListedSequence):
         assert poses is not None
         if not common.allow_outside:
             _check_paths(path, entries)
-        _check_covered(file, poses, entries, advice)
+        check_covered(file, poses, entries, advice)
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
@@ -75,7 +77,8 @@ class FolderSequence(ListedSequence):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        notes = (*bev_frame_notes(rig), *filter(None, [self.understood]), *poses.notes)
+        assumed = ("the calibration",) if given.notes else ()
+        notes = (*given.notes, *bev_frame_notes(rig, *assumed), *filter(None, [self.understood]), *poses.notes)
         if videos:
             from bevcli.sequences.videos import rotation_notes
 
@@ -159,7 +162,7 @@ def _times_of(entries: tuple[FrameEntry, ...]) -> NDArray[np.int64] | None:
     return np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64) if entries else None
 
 
-def _check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...], advice: str) -> None:
+def check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...], advice: str) -> None:
     """Raise InputError for a frame or an image at a time that the poses do not cover. advice: what to do."""
     if poses.motion is None:
         return

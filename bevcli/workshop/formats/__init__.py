@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 from bevcli.options import option, options, parse_pairs
-from bevcli.parsing.files import open_regular
+from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.registry import entries
 from bevcli.sequences.format import Format
+from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.options import FormatOptions, RigOptions
 
 # Any of these makes a folder a log of Argoverse 2, so that an incomplete one gets an error that names the missing file.
@@ -154,4 +155,12 @@ T4 = Format(
     recognises=lambda path: any((path / "annotation" / f"{name}.json").exists() for name in T4_TABLES),
     opener="bevcli.workshop.formats.t4:open_t4",
     annotated=True,
+)
+VIDEO = Format(
+    name="a video",
+    expected=".mp4, .mkv, .avi, .webm, .mov or .m4v",
+    recognises=lambda path: path.suffix.lower() in VIDEO_SUFFIXES and path.is_file(),
+    opener="bevcli.workshop.formats.video_file:open_video",
+    options=FolderOptions,
+    has_poses=False,
 )

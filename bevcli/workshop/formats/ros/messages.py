@@ -19,7 +19,7 @@ from bevcli.geometry.transforms import Array, Pose, rigid
 from bevcli.parsing.documents import LARGEST_INTEGER, parse_json
 from bevcli.sequences.files.calibration_file import parse_camera
 from bevcli.sequences.files.json_fields import require, transform_to_json
-from bevcli.sequences.files.kalibr_ros import lens_fields
+from bevcli.workshop.formats.named_calibration import lens_fields
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for

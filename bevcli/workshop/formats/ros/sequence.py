@@ -24,7 +24,7 @@ from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences import images
-from bevcli.sequences.files.calibration_file import CALIBRATION, read_rig_and_facts
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
@@ -215,7 +215,8 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     if path.is_file() and is_packed_bag(path):
         raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
     stated = read_topics_file(own.topics_file, own.topics)
-    rig = own.rig()
+    draft = own.draft(path)
+    rig = None if draft is None else draft.rig
     bag = Bag(path)
     rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
     finder = TopicFinder(bag, stated, rig.names if rig else None)
@@ -229,6 +230,7 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
     entries, gaps = _covered(entries, motion, path)
     notes = (
         finder.table(source),
+        *(() if draft is None else draft.notes),
         *bag.notes,
         *beside,
         *reader.notes,
@@ -250,7 +252,8 @@ def _files_beside(
 ) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
     """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
     calibration, notes = folder / CALIBRATION, []
-    found, facts = read_rig_and_facts(calibration) if is_there(calibration) else (None, DriveFacts())
+    draft = draft_rig(calibration, folder).checked(calibration) if is_there(calibration) else None
+    found, facts = (None, DriveFacts()) if draft is None else (draft.rig, draft.facts)
     if rig is None and found is not None:
         notes.append(f"{calibration} is used in place of the calibration in the bag")
     file = own.ego_motion_file

@@ -1,0 +1,280 @@
+"""`read_rig`: the rig of any calibration, or of a field of view, a height and a yaw.
+
+`KINDS` are the kinds of files and their readers. A reader makes a `StatedCamera` of what a file states of a camera;
+`bevcli.workshop.formats.camera_poses` decides what a transform means.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.findings import Finding
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.documents import YAML_BYTES
+from bevcli.parsing.files import read_bytes
+from bevcli.printing import counted
+from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
+from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
+from bevcli.sequences.native.first_images import first_images, size_of_first
+from bevcli.workshop.formats.camera_poses import (
+    Cameras,
+    Direction,
+    Fields,
+    StatedCamera,
+    StatedPose,
+    decide_poses,
+    guessed_pose,
+    raised,
+)
+from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
+from bevcli.workshop.formats.other_calibrations import (
+    KITTI_FILES,
+    is_colmap,
+    is_nerfstudio,
+    read_colmap,
+    read_kitti,
+    read_nerfstudio,
+)
+
+ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
+FOV_DEG = (5, 170)  # of a pinhole camera
+SEVERAL = "is the video of one camera, but the calibration has {} ({}): name the video after its camera"
+HIGHEST_M = 10.0  # of a camera that is stated
+
+
+def read_rig(
+    calibration: Path | None,
+    drive: Path | None = None,
+    *,
+    extrinsics: Path | None = None,
+    transform: Direction | None = None,
+    fov_deg: ByCamera = None,
+    height: ByCamera = None,
+    yaw_deg: ByCamera = None,
+) -> RigDraft:
+    """The rig of a file or folder of any kind, or of numbers. A finding says how it was understood. Raises InputError.
+
+    drive: whose first images state sizes that the calibration does not. Others: see `RigOptions`.
+    """
+    if calibration is None:
+        if fov_deg is None:
+            raise InputError(_incomplete(extrinsics, height))
+        return _guessed_rig(drive, fov_deg, height, yaw_deg)
+    if fov_deg is not None:
+        raise InputError("`calibration` and `fov_deg` exclude each other: pass one of them")
+    kind, cameras = _stated(calibration)
+    if extrinsics is not None:
+        poses = _extrinsics(extrinsics)
+        for name in poses.keys() - cameras.keys():
+            raise InputError(f"{extrinsics}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
+        cameras = {name: replace(of, pose=poses[name].pose if name in poses else None) for name, of in cameras.items()}
+    cameras = _named_as_images(_along_chain(cameras), drive)
+    where = calibration if extrinsics is None else extrinsics
+    ego_from_camera, how = _poses(where, cameras, transform, height, yaw_deg)
+    rig = tuple(
+        require(
+            parse_camera, name, _fields(name, of, ego_from_camera[name], calibration, drive), where=where, camera=name
+        )
+        for name, of in cameras.items()
+    )
+    text = f"{calibration.name}: {kind}: {counted(len(rig), 'cameras')}; {how}"
+    ego_from_bev = _bev_frame(where)
+    found = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
+    return RigDraft(found, (Finding("calibration-read", "info", None, text),))
+
+
+def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
+    if extrinsics is not None:
+        return "`intrinsics` and `extrinsics` must be given together: pass both, or pass `calibration`"
+    name = "`yaw_deg`" if height is None else "`height`"
+    return f"{name} needs a field of view or a calibration: pass `fov_deg=70` or `calibration=FILE`"
+
+
+def _poses(
+    where: Path, cameras: Cameras, transform: Direction | None, height: ByCamera, yaw_deg: ByCamera
+) -> tuple[dict[str, Array], str]:
+    """ego_from_camera (4, 4) by camera, and how they were found."""
+    stated = {name: of.pose for name, of in cameras.items() if of.pose is not None}
+    lacking = [name for name in cameras if name not in stated]
+    if not stated and height is not None:
+        starts = tuple(name for name, of in cameras.items() if of.from_previous is None) or tuple(cameras)
+        guessed, how = _guessed_poses(starts, height, yaw_deg)
+        known = {name: StatedPose({"": pose}, "ego_from_camera", exact=True) for name, pose in guessed.items()}
+        linked = _along_chain({name: replace(of, pose=known.get(name)) for name, of in cameras.items()})
+        return decide_poses(where, {name: of.pose for name, of in linked.items() if of.pose}, None)[0], how
+    if lacking:
+        why = "moves through the file, as in a reconstruction" if cameras[lacking[0]].moves else "is missing"
+        raise InputError(
+            f'{where}: camera {lacking[0]}: its pose (T, extrinsics or "ego_from_camera") {why}: add it, pass '
+            "`extrinsics=FILE`, or pass `height` and `yaw_deg`"
+        )
+    if yaw_deg is not None:
+        raise InputError(f"{where}: states the poses of the cameras: remove `yaw_deg`")
+    heights = _by_camera(height, tuple(cameras), "height")
+    if transform is not None and all(pose.exact for pose in stated.values()):
+        raise InputError(f"{where}: states what its transforms mean: remove `transform`")
+    poses, how = decide_poses(where, stated, transform, level_known=bool(heights))
+    yaws = ", ".join(f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°" for name, pose in poses.items())
+    if heights:
+        poses, how = raised(poses, heights), f"{how}, raised to `height`"
+    return poses, f"{how}; yaw {yaws}"
+
+
+def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, drive: Path | None) -> Fields:
+    """The fields of a camera, as in calibration.json."""
+    if of.intrinsics is None:
+        raise InputError(
+            f"{path}: camera {name}: has no intrinsics (expected K, camera_matrix, intrinsics or fx, fy, cx, cy)"
+        )
+    size = of.size or size_of_first(drive, name)
+    if size is None:
+        raise InputError(
+            f"{path}: camera {name}: the image size is missing, and no image of it was found: add width and height"
+        )
+    sides = {key: int(value) if isinstance(value, float) and value.is_integer() else value
+             for key, value in zip(("width", "height"), size, strict=True)}  # fmt: skip
+    pose = {"ego_from_camera": transform_to_json(ego_from_camera)}
+    return {**sides, "intrinsics": of.intrinsics, "distortion": of.distortion, **pose}
+
+
+def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:
+    """A single camera has the name of the only folder or video with images; of several, a video is one by its name."""
+    found = list(first_images(drive)) if drive is not None else []
+    if len(cameras) == len(found) == 1:
+        return {found[0]: next(iter(cameras.values()))}
+    if drive is None or not drive.is_file() or not found:
+        return cameras
+    if found[0] not in cameras:
+        raise InputError(f"{drive}: {SEVERAL.format(counted(len(cameras), 'cameras'), ', '.join(cameras))}")
+    return {found[0]: cameras[found[0]]}
+
+
+# Kinds of files
+
+
+def _stated(path: Path) -> tuple[str, Cameras]:
+    """What a calibration is, in words, and its cameras."""
+    for kind, (recognises, read) in KINDS.items():
+        if recognises(path):
+            return kind, read(path)
+    if path.is_dir():
+        raise InputError(
+            f"{path}: has no calibration (expected calibration.json, a file a camera ({', '.join(SUFFIXES)}), "
+            f"cameras.txt, transforms.json or {KITTI_FILES[0]})"
+        )
+    read_bytes(path, YAML_BYTES)  # says what is missing or no file
+    raise InputError(
+        f"{path}: is no known calibration (expected {', '.join(SUFFIXES)}, or cameras.txt of COLMAP, or KITTI's)"
+    )
+
+
+def _extrinsics(path: Path) -> Cameras:
+    """The cameras of a file with poses."""
+    if path.suffix.lower() == ".json" and not isinstance(read_document(path), dict):
+        raise InputError(
+            f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
+        )
+    return _stated(path)[1]
+
+
+def _bev_frame(path: Path) -> Array | None:
+    """(4, 4) ego_from_bev of a file that states it."""
+    document = read_document(path) if path.suffix.lower() in SUFFIXES and not path.is_dir() else None
+    stated = isinstance(document, dict) and "ego_from_bev" in document
+    return require(parse_transform, document, "ego_from_bev", where=path) if stated else None
+
+
+def _along_chain(cameras: Cameras) -> Cameras:
+    """Poses of cameras without one by that of a neighbour in Kalibr's chain, in the file's order."""
+    found, pairs = dict(cameras), list(pairwise(cameras))
+    for known, other in [*pairs, *((name, earlier) for earlier, name in reversed(pairs))]:
+        is_next = (known, other) in pairs
+        link, pose = found[other if is_next else known].from_previous, found[known].pose
+        if found[other].pose is None and pose is not None and link is not None:
+            found[other] = replace(found[other], pose=pose.moved(inverse(link) if is_next else link))
+    return found
+
+
+# Without any file
+
+
+def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_deg: ByCamera) -> RigDraft:
+    found = list(first_images(drive)) if drive is not None else []
+    if not found:
+        raise InputError(f"{drive}: has no images of a camera (expected images/CAMERA/*.jpg, or a video)")
+    if height is None:
+        raise InputError("`fov_deg` needs the height of the camera above the ground: pass `height=1.5`")
+    fovs = _by_camera(fov_deg, tuple(found), "fov_deg")
+    poses, how = _guessed_poses(tuple(found), height, yaw_deg)
+    cameras = []
+    for name in found:
+        size = size_of_first(drive, name)
+        if size is None:
+            raise InputError(f"{drive}: camera {name}: its first image cannot be read: bring it back")
+        if not FOV_DEG[0] <= fovs[name] <= FOV_DEG[1]:
+            raise InputError(f"`fov_deg={fovs[name]:g}`: expected the horizontal field of view, 5 to 170 degrees")
+        width, tall = size
+        focal = width / 2 / np.tan(np.radians(fovs[name]) / 2)
+        matrix = [[focal, 0, (width - 1) / 2], [0, focal, (tall - 1) / 2], [0, 0, 1]]
+        fields: Fields = {"width": width, "height": tall, "intrinsics": matrix}
+        fields["ego_from_camera"] = transform_to_json(poses[name])
+        cameras.append(require(parse_camera, name, fields, where=str(drive), camera=name))
+    text = f"without calibration: {counted(len(cameras), 'cameras')} without lens distortion, {how}"
+    return RigDraft(
+        CameraRig(tuple(cameras), default_ego_from_bev(), True), (Finding("calibration-read", "info", None, text),)
+    )
+
+
+def _guessed_poses(names: tuple[str, ...], height: ByCamera, yaw_deg: ByCamera) -> tuple[dict[str, Array], str]:
+    if yaw_deg is None:
+        if len(names) > 1:
+            given = " ".join(f"`yaw_deg={name}=0`" for name in names[:2])
+            raise InputError(
+                f"the directions of {counted(len(names), 'cameras')} are not stated: pass one for each: {given} …"
+            )
+        yaw_deg = 0.0
+    heights, yaws = _by_camera(height, names, "height"), _by_camera(yaw_deg, names, "yaw_deg")
+    if len(names) > 1 and not isinstance(yaw_deg, Mapping):
+        raise InputError(
+            f"`yaw_deg={yaw_deg:g}`: is one direction for {counted(len(names), 'cameras')}: pass one for each"
+        )
+    for name in names:
+        if not 0 < heights[name] <= HIGHEST_M:
+            raise InputError(f"`height={heights[name]:g}`: expected metres above the ground, 0 to 10")
+    poses = {name: guessed_pose(heights[name], np.radians(yaws[name])) for name in names}
+    text = "; ".join(
+        f"{name} yaw {yaws[name]:g}°, {heights[name]:g} m high, {pose[0, 3]:.1f} m ahead of the rear axle"
+        for name, pose in poses.items()
+    )
+    return poses, f"assumed level, {text}"
+
+
+def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str, float]:
+    """A number for each camera; none where none is given. Raises InputError for an unknown camera or a missing one."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        return dict.fromkeys(names, float(value))
+    for name in value.keys() - set(names):
+        raise InputError(f"`{option}`: there is no camera {name} (expected {', '.join(names)})")
+    for name in (name for name in names if name not in value):
+        raise InputError(f"`{option}`: camera {name} is missing: pass one for each camera, or one for all")
+    return {name: float(value[name]) for name in names}
+
+
+# What a file is -> whether a path is it, and its reader. The first that fits is taken.
+KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cameras]]] = {
+    "COLMAP": (is_colmap, read_colmap),
+    "nerfstudio": (is_nerfstudio, read_nerfstudio),
+    "KITTI": (
+        lambda path: path.suffix == ".txt" or any((path / name).exists() for name in KITTI_FILES), read_kitti,
+    ),
+    "K, D and T by name": (
+        lambda path: path.suffix.lower() in SUFFIXES if not path.is_dir() else bool(files_in(path)), read_named,
+    ),
+}  # fmt: skip

@@ -1,0 +1,307 @@
+"""A calibration with K, D and T of each camera under their usual names: YAML, JSON, or the XML and YAML of OpenCV.
+
+Kalibr's camchain and ROS's camera_info have such names too. A file is one camera, or a mapping or list of cameras; a
+folder holds files.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import cv2
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
+from bevcli.parsing.documents import YAML_BYTES, parse_xml, read_json, read_yaml
+from bevcli.parsing.files import read_bytes
+from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
+from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
+from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
+
+SUFFIXES = (".yaml", ".yml", ".json", ".xml")
+# Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
+INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
+              "camintrinsic", "projectionparameters")  # fmt: skip
+LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
+        "distortionparameters")  # fmt: skip
+LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
+WIDTH, HEIGHT = ("width", "imagewidth", "w"), ("height", "imageheight", "h")
+SIZE = ("resolution", "imagesize", "size")
+FOCAL = ("f", "focallength")
+TRANSFORM = ("t", "extrinsics", "extrinsic", "transform", "transformmatrix", "pose", "rt", "extrinsicmatrix")
+ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "quaternion", "quaternionwxyz",
+            "quaternionxyzw", "q", "qvec", "rvec", "orientation")  # fmt: skip
+TRANSLATION = ("translation", "t", "position", "tvec", "location")
+CAMERA_FRAMES = r"camera\d*|cam\d*|sensor|c"
+EGO_FRAMES = "ego|vehicle|car|base|body|imu|rig|world|lidar|velo|b"
+EXACT: dict[str, Direction] = {"egofromcamera": "ego_from_camera", "camerafromego": "camera_from_ego"}
+COEFFICIENTS = {
+    "kannala_brandt": ("k1", "k2", "k3", "k4"),
+    "brown_conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+PINHOLES = ("pinhole", "none", "perspective")
+NO_TRANSFORM = "is not understood as a transform (expected 4x4 or 3x4 numbers, or a rotation and a translation)"
+
+
+def read_named(path: Path) -> Cameras:
+    """The cameras of a file with K, D and T, or of a folder of such files, in which poses may be files of their own."""
+    if not path.is_dir():
+        return _named_cameras(read_document(path), path)
+    cameras: Cameras = {}
+    for file in files_in(path):
+        for name, of in read_named(file).items():
+            other = cameras.get(name, of)
+            if other is not of and (of.intrinsics is None) == (other.intrinsics is None):
+                raise InputError(f"{file}: camera {name} is in another file too: keep one")
+            if other is not of:  # intrinsics in one file, and poses in another
+                known, posed = (of, other) if other.intrinsics is None else (other, of)
+                of = replace(known, pose=posed.pose or known.pose)
+            cameras[name] = of
+    return cameras
+
+
+def files_in(folder: Path) -> list[Path]:
+    """The files of a folder that may be calibrations, by their suffix."""
+    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
+
+
+def read_document(path: Path) -> Any:
+    """The contents of a JSON, XML or YAML file."""
+    if path.suffix.lower() == ".json":
+        return read_json(path, largest=LARGEST_BYTES)
+    if path.suffix.lower() == ".xml":
+        return _from_xml(parse_xml(read_bytes(path, YAML_BYTES), path))
+    return read_yaml(path)
+
+
+def _from_xml(element: Element) -> Any:
+    """The value of an element that OpenCV's FileStorage writes."""
+    children = list(element)
+    if not children:
+        words = (element.text or "").split()
+        numbers = [number_of(word) for word in words]
+        return (numbers if len(numbers) > 1 else numbers[0]) if words and None not in numbers else " ".join(words)
+    if all(child.tag == "_" for child in children):
+        return [_from_xml(child) for child in children]
+    return {child.tag: _from_xml(child) for child in children}
+
+
+def number_of(word: str) -> float | None:
+    """The number that a word is; None for another word."""
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _named_cameras(document: Any, path: Path) -> Cameras:
+    expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
+    if isinstance(document, list):
+        document = {"cameras": document}
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: is no mapping (expected {expected})")
+    document = {re.sub(r"\ACamera\d*\.", "", str(key)): value for key, value in document.items()}  # ORB-SLAM's names
+    entries = document.get("cameras", document.get("sensors"))
+    if isinstance(entries, list):
+        names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{place}")
+                 if isinstance(entry, dict) else "" for place, entry in enumerate(entries)]  # fmt: skip
+        for name in (name for place, name in enumerate(names) if name in names[:place]):
+            raise InputError(f"{path}: camera {name} is in the list twice: keep one")
+        entries = dict(zip(names, entries, strict=True))
+    if not isinstance(entries, dict) and _is_camera(document):
+        entries = {str(_value(document, "cameraname", "name") or path.stem): document}
+    if not isinstance(entries, dict):
+        entries = {name: entry for name, entry in document.items() if _is_camera(entry)}
+    if not entries:
+        raise InputError(f"{path}: has no camera (expected {expected})")
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise InputError(f"{path}: camera {name}: is no mapping (expected {expected})")
+    return {str(name): _named_camera(entry, f"{path}: camera {name}") for name, entry in entries.items()}
+
+
+def _is_camera(entry: Any) -> bool:
+    """True for a mapping with intrinsics or a pose."""
+    if not isinstance(entry, dict):
+        return False
+    names = {*INTRINSICS, "fx", *EXACT, *TRANSFORM, *ROTATION}
+    return any(_plain(key) in names or _direction_of(str(key)) is not None for key in entry)
+
+
+def _plain(key: object) -> str:
+    return re.sub("[^a-z0-9]", "", str(key).lower())
+
+
+def _value(entry: Mapping[Any, Any], *names: str) -> Any:
+    """The value of a mapping under the first of several plain names."""
+    plain = {_plain(key): value for key, value in entry.items()}
+    return next((plain[name] for name in names if plain.get(name) is not None), None)
+
+
+def _named_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
+    """What a mapping states of a camera."""
+    model = _lens_name(_value(entry, "cameramodel", "modeltype") or "pinhole")
+    if model not in (*PINHOLES, *LENS_NAMES):
+        raise InputError(f"{where}: camera_model {model:.60} is not supported (expected pinhole)")
+    intrinsics = _value(entry, *INTRINSICS)
+    inside = intrinsics if isinstance(intrinsics, dict) else {}  # K, D and the size may be one level deeper
+    stated = {**entry, **inside}
+    size = _value(stated, *SIZE)
+    sides = (_value(stated, *WIDTH), _value(stated, *HEIGHT))
+    if isinstance(size, dict):
+        sides = (_value(size, *WIDTH), _value(size, *HEIGHT))
+    elif size is not None:
+        sides = tuple(require(parse_numbers, {"resolution": size}, "resolution", (2,), where=where).tolist())
+    chain = entry.get("T_cn_cnm1")
+    return StatedCamera(
+        _camera_matrix(intrinsics, stated, where),
+        sides if None not in sides else None,
+        lens_of(stated, model, where),
+        _pose(entry, where),
+        from_previous=None if chain is None else require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where),
+    )
+
+
+def _camera_matrix(value: Any, entry: Mapping[str, Any], where: str) -> Any:
+    """(3, 3) of a matrix, nine numbers, fx fy cx cy, or a mapping of these."""
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    elif isinstance(value, dict) and (inner := _value(value, *INTRINSICS)) is not None:
+        return _camera_matrix(inner, value, where)
+    elif value is None or isinstance(value, dict):
+        value = [_value(entry, *names) for names in (("fx", *FOCAL), ("fy", "fx", *FOCAL), ("cx",), ("cy",))]
+        if value == [None] * 4:
+            return None
+    array = array_of_numbers(value)
+    if array is not None and array.shape == (4,):
+        fx, fy, cx, cy = require(parse_numbers, {"intrinsics": value}, "intrinsics", (4,), where=where).tolist()
+        return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    if array is not None and array.size == 9:
+        value = array.reshape(3, 3).tolist()
+    return require(parse_numbers, {"intrinsics": value}, "intrinsics", (3, 3), where=where).tolist()
+
+
+def lens_of(entry: Mapping[str, Any], camera_model: str, where: str) -> Fields:
+    """The lens as in calibration.json: coefficients as a list, a matrix, or by name."""
+    model, value = _value(entry, *LENS_MODEL), _value(entry, *LENS)
+    if isinstance(value, dict):
+        model = _value(value, "model", "type", *LENS_MODEL) or model
+        value = _value(value, "data", "coefficients", "coeffs", "params") or value
+    fisheye = LENS_NAMES.get(_lens_name(model or camera_model)) == "kannala_brandt"
+    if value is None or isinstance(value, dict):
+        names = COEFFICIENTS["kannala_brandt" if fisheye else "brown_conrady"]
+        stated = [_value(value or entry, name) for name in names]
+        count = max((place for place, number in enumerate(stated, 1) if number is not None), default=0)
+        value = [number or 0 for number in stated][: next((each for each in (0, 4, 5) if count <= each), 8)]
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
+        value = [number for row in value for number in row]  # a column or a row of a matrix
+    fallback = camera_model if camera_model in LENS_NAMES else "plumb_bob"
+    stated_model = _lens_name(model) if model else fallback
+    return lens_fields(fallback if stated_model in PINHOLES else stated_model, value, where)
+
+
+def _lens_name(model: object) -> str:
+    return str(model).lower().replace("-", "_")
+
+
+def lens_fields(model: object, coefficients: object, where: str) -> Fields:
+    """The lens as in calibration.json, of a model's name in ROS, Kalibr or OpenCV. Raises InputError for another."""
+    if not isinstance(coefficients, list):
+        raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
+    if not any(coefficients):
+        return {"model": "none"}
+    lens = LENS_NAMES.get(_lens_name(model) or "plumb_bob")
+    if lens is None:
+        expected = ", ".join(LENS_NAMES)
+        raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {expected})")
+    used = 8 if lens == "brown_conrady" and not any(coefficients[8:]) else None  # OpenCV states up to 14, of 0
+    return {"model": lens, "coefficients": coefficients[:used]}
+
+
+def _pose(entry: Mapping[str, Any], where: str) -> StatedPose | None:
+    """The pose of a camera under a name that states its direction, or under another one."""
+    for key, value in entry.items():
+        exact = EXACT.get(_plain(key))
+        direction = exact or _direction_of(str(key))
+        if exact and isinstance(value, dict):
+            return StatedPose({"": require(parse_transform, {exact: value}, exact, where=where)}, exact, exact=True)
+        if direction is not None and (matrices := _matrices(value)):
+            return StatedPose(matrices, direction, exact=exact is not None, name=str(key))
+        if direction is not None:
+            raise InputError(f"{where}: {key}: {NO_TRANSFORM}")
+    if matrices := _matrices(dict(entry)):
+        return StatedPose(matrices, name="rotation and translation")
+    found = next(((str(key), value) for key, value in entry.items() if _plain(key) in TRANSFORM), None)
+    if found is None or found[1] is None:
+        return None
+    if matrices := _matrices(found[1]):
+        return StatedPose(matrices, name=found[0])
+    inner = _pose(found[1], where) if isinstance(found[1], dict) else None
+    if inner is None:
+        raise InputError(f"{where}: {found[0]}: {NO_TRANSFORM}")
+    return inner
+
+
+def _direction_of(key: str) -> Direction | None:
+    """The direction that a name states, such as T_cam_ego, cam2ego, camera_to_vehicle; None for another name."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower()
+    words = re.sub("base_link|vehicle_frame", "base", words).replace("2", "_to_")
+    found = re.fullmatch(
+        rf"(?:t_|tf_)?({CAMERA_FRAMES}|{EGO_FRAMES})_(?:(from|to|t)_)?({CAMERA_FRAMES}|{EGO_FRAMES})", words
+    )
+    if key in ("T_BS", "T_bs"):
+        return "ego_from_camera"  # EuRoC: body and sensor
+    if found is None or bool(re.fullmatch(CAMERA_FRAMES, found[1])) == bool(re.fullmatch(CAMERA_FRAMES, found[3])):
+        return None
+    from_first = bool(re.fullmatch(CAMERA_FRAMES, found[1]))
+    return "ego_from_camera" if from_first == (found[2] == "to") else "camera_from_ego"
+
+
+def _matrices(value: Any) -> dict[str, Array]:
+    """The (4, 4) transforms that a value may state: two for four numbers of a quaternion in an unknown order."""
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    if isinstance(value, dict):
+        plain = {_plain(key): each for key, each in value.items()}
+        rotation = next(((name, plain[name]) for name in ROTATION if plain.get(name) is not None), None)
+        # Under "T" and "t", a translation has three numbers.
+        translation = next(
+            (each for name in TRANSLATION if (each := _numbers(plain.get(name))) is not None and each.size == 3), None
+        )
+        if rotation is None or translation is None:
+            return {}
+        return {order: rigid(translation.ravel(), each) for order, each in _rotations(*rotation).items()}
+    array = _numbers(value)
+    if array is None or array.size not in (12, 16):
+        return {}
+    matrix = np.eye(4)
+    matrix[: array.size // 4] = array.reshape(-1, 4)
+    return {"": matrix} if np.allclose(matrix[3], [0, 0, 0, 1]) else {}
+
+
+def _numbers(value: Any) -> Array | None:
+    if isinstance(value, dict):
+        value = value.get("data", [value.get(axis) for axis in "xyz"])
+    return array_of_numbers(value)
+
+
+def _rotations(name: str, value: Any) -> dict[str, Array]:
+    """(3, 3) rotations by the order of the quaternion; "" where there is one."""
+    if isinstance(value, dict) and {"w", "x", "y", "z"} <= value.keys():
+        name, value = "rotationwxyz", [value[axis] for axis in "wxyz"]
+    array = _numbers(value)
+    if array is None:
+        return {}
+    if array.size == 9:
+        return {"": array.reshape(3, 3)}
+    if array.size == 3:
+        return {"": np.asarray(cv2.Rodrigues(array.ravel())[0], dtype=np.float64)}
+    if array.size != 4 or abs(np.linalg.norm(array) - 1) > 0.01:
+        return {}
+    orders = {"wxyz": array.ravel(), "xyzw": np.roll(array.ravel(), 1)}
+    known = {order for order in orders if name.endswith(order)} or ({"wxyz"} if name == "qvec" else set(orders))
+    return {order if len(known) > 1 else "": rotation_from_quaternion(orders[order]) for order in sorted(known)}

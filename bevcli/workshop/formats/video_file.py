@@ -1,0 +1,57 @@
+"""A single video as a sequence: one camera, a frame for each image, and no poses but those of `ego_motion_file`."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
+from bevcli.printing import counted
+from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
+from bevcli.sequences.images import FrameEntry, ListedSequence, bev_frame_notes
+from bevcli.sequences.native.folder import check_covered
+from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.native.unlisted import covered, video_images
+from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.videos import rotation_notes
+from bevcli.workshop.formats.calibrations import SEVERAL
+
+
+def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> ListedSequence:
+    """A video as a `Sequence`. Its first image is at time 0. Raises InputError."""
+    video = video_images(path, own.start_ns or 0, own.image_rate_hz)
+    given = own.draft(path)
+    if given is None:
+        raise InputError(
+            f"{path}: a video does not state its camera: pass `fov_deg=70` and `height=1.5`, or `calibration=FILE`"
+        )
+    rig = given.rig
+    if len(rig.cameras) != 1:  # of a calibration.json
+        if path.stem not in rig.names:
+            raise InputError(f"{path}: {SEVERAL.format(counted(len(rig.cameras), 'cameras'), ', '.join(rig.names))}")
+        rig = replace(rig, cameras=(rig[path.stem],))
+    [name] = rig.names
+    entries = tuple(
+        FrameEntry(FrameStamp(index, "", int(time)), {name: video.image(index)}, {}, f"{path}#{index}")
+        for index, time in enumerate(video.times_ns)
+    )
+    start = "time 0 (state `start_ns`)" if own.start_ns is None else f"{own.start_ns} ns"
+    understood = f"{len(entries)} images at {1e9 / video.period_ns:g} Hz from {start} on"
+    poses = ReadPoses(None)
+    if own.ego_motion_file is not None and common.ego_motion != "static":
+        poses = read_poses(own.ego_motion_file, DrivePoses(rig, own, video.times_ns))
+    elif common.ego_motion == "required":
+        raise InputError(
+            f"{path}: a video has no poses of the vehicle: pass `ego_motion_file=FILE`, `temporal=False` to run "
+            'without history, or `ego_motion="static"` if the vehicle stands'
+        )
+    motion = poses.motion
+    if motion is not None and own.ego_motion_file is not None:
+        entries, understood = covered((entries, understood), motion)
+        check_covered(own.ego_motion_file, poses, entries, "state the time of the first image by `start_ns`")
+    assumed = bev_frame_notes(rig, "the calibration")
+    notes = (*given.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
+    if motion is None:
+        notes += ("a video has no poses: no history is used, and boxes are in the ego frame",)
+    sequence = ListedSequence(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
+    sequence.name = path.resolve().stem
+    return sequence

@@ -1,0 +1,428 @@
+"""The rig of a drive, written as other programs write it by hand, is read back; what is not certain is asked."""
+
+import json
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+import bevcli
+from bevcli.errors import InputError
+from bevcli.sequences.options import RigOptions
+from bevcli.workshop.synth.rig import RigDistribution, draw_rig
+
+STREET = Path(__file__).parents[2] / "samples/street"
+FACTS = json.loads((STREET / "calibration.json").read_text())["cameras"]
+NAMES = tuple(FACTS)
+SIZE = (FACTS[NAMES[0]]["width"], FACTS[NAMES[0]]["height"])
+D = [-0.1, 0.02, 0.001, -0.002, 0.003]
+
+
+def pose(name, *, axes=None):
+    """(4, 4) ego_from_camera. axes: (3, 3), camera_from_axes."""
+    stated = FACTS[name]["ego_from_camera"]
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(stated["rotation"]) @ (np.eye(3) if axes is None else axes)
+    matrix[:3, 3] = stated["translation"]
+    return matrix
+
+
+def k_of(name):
+    return np.array(FACTS[name]["intrinsics"])
+
+
+def four(name):
+    """fx, fy, cx, cy."""
+    return k_of(name)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+
+
+def read(path, drive=STREET, **how):
+    return RigOptions(calibration=path, **how).draft(drive)
+
+
+def written(folder, content, name="rig.yaml"):
+    path = folder / name
+    text = content if isinstance(content, str) else json.dumps(content)
+    path.parent.mkdir(exist_ok=True, parents=True)
+    path.write_text(
+        text if path.suffix != ".yaml" or isinstance(content, str) else yaml.safe_dump(content, sort_keys=False)
+    )
+    return path
+
+
+def assert_is_the_street(rig, names=NAMES, *, lens=False):
+    assert sorted(rig.names) == sorted(names)
+    for name, own in zip(sorted(names), sorted(NAMES), strict=True):
+        camera = rig[name]
+        assert (camera.width, camera.height) == SIZE
+        np.testing.assert_allclose(camera.intrinsics, k_of(own), atol=1e-6)
+        np.testing.assert_allclose(camera.ego_from_camera, pose(own), atol=1e-5)
+        assert (camera.distortion is not None) == lens
+
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+VEHICLE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+def entry(name, **more):
+    return {"K": k_of(name).tolist(), "D": D, **more}
+
+
+SPELLINGS = {
+    "T_ego_cam": lambda name: entry(name, T_ego_cam=pose(name).tolist()),
+    "T_cam_ego": lambda name: entry(name, T_cam_ego=np.linalg.inv(pose(name)).tolist()),
+    "cam2ego": lambda name: entry(name, cam2ego=pose(name).ravel().tolist()),
+    "T_cam_ego but vehicle from camera": lambda name: entry(name, T_cam_ego=pose(name).tolist()),
+    "extrinsics, either way": lambda name: entry(name, extrinsics=np.linalg.inv(pose(name)).tolist()),
+    "axes of the vehicle": lambda name: entry(name, transform=pose(name, axes=VEHICLE).tolist()),
+    "R and T": lambda name: entry(name, R=pose(name)[:3, :3].tolist(), T=pose(name)[:3, 3].tolist()),
+    "rvec and tvec": lambda name: entry(
+        name,
+        rvec=Rotation.from_matrix(pose(name)[:3, :3].T).as_rotvec().tolist(),
+        tvec=np.linalg.inv(pose(name))[:3, 3].tolist(),
+    ),
+    "intrinsics by name": lambda name: {
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), four(name), strict=True)),
+        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True)),
+        "extrinsics": {"translation": pose(name)[:3, 3].tolist(), "rotation": pose(name)[:3, :3].tolist()},
+    },
+    "a matrix with its shape": lambda name: {
+        "camera_matrix": {"rows": 3, "cols": 3, "data": k_of(name).ravel().tolist()},
+        "dist_coeffs": [D],
+        "T_vehicle_camera": {"rows": 4, "cols": 4, "data": pose(name).ravel().tolist()},
+    },
+    "quaternion": lambda name: entry(
+        name,
+        pose={
+            "position": dict(zip("xyz", pose(name)[:3, 3].tolist(), strict=True)),
+            "orientation": dict(zip("xyzw", Rotation.from_matrix(pose(name)[:3, :3]).as_quat().tolist(), strict=True)),
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+@pytest.mark.parametrize("layout", ["mapping", "list", "folder"])
+def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
+    cameras = {name: SPELLINGS[spelling](name) for name in NAMES}
+    if layout == "mapping":
+        path = written(tmp_path, cameras)
+    elif layout == "list":
+        path = written(tmp_path, {"cameras": [{"name": name, **each} for name, each in cameras.items()]}, "rig.json")
+    else:
+        path = {written(tmp_path, each, f"rig/{name}.yaml").parent for name, each in cameras.items()}.pop()
+    found = read(path)
+    assert_is_the_street(found.rig, lens=True)
+    assert found.rig[NAMES[0]].distortion.coefficients == tuple(D)
+    [line] = found.notes
+    direction = (
+        "camera_from_ego" if spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec") else "ego_from_camera"
+    )
+    assert f"{direction}, camera axes {'x forward' if 'axes' in spelling else 'x right'}" in line
+    assert ("its name says camera_from_ego" in line) == ("but" in spelling)
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_files_that_opencv_writes(tmp_path, suffix):
+    for name in NAMES:
+        path = tmp_path / "rig" / f"{name}{suffix}"
+        path.parent.mkdir(exist_ok=True)
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for key, value in {
+            "camera_matrix": k_of(name),
+            "distortion_coefficients": np.array([D]).T,
+            "T": pose(name),
+        }.items():
+            file.write(key, value)
+        for key, value in {"image_width": SIZE[0], "image_height": SIZE[1]}.items():
+            file.write(key, value)
+        file.release()
+    assert_is_the_street(read(tmp_path / "rig", None).rig, lens=True)
+
+
+EUROC = """%YAML:1.0
+sensor_type: camera
+T_BS: {{cols: 4, rows: 4, data: {pose}}}
+resolution: {size}
+camera_model: pinhole
+intrinsics: {four}
+distortion_model: radial-tangential
+distortion_coefficients: {four_of_lens}
+"""
+ORB_SLAM = """%YAML:1.0
+Camera.type: "PinHole"
+{lines}
+T_c_b: {inverse}
+"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: front
+image_width: {size[0]}
+image_height: {size[1]}
+distortion_parameters: {{k1: -0.1, k2: 0.02, p1: 0.001, p2: -0.002}}
+projection_parameters: {{fx: {four[0]}, fy: {four[1]}, cx: {four[2]}, cy: {four[3]}}}
+body_T_cam0: !!opencv-matrix {{rows: 4, cols: 4, dt: d, data: {pose}}}
+"""
+
+
+@pytest.mark.parametrize("text", [EUROC, ORB_SLAM, VINS])
+def test_files_of_other_programs_for_one_camera(tmp_path, text):
+    name = NAMES[1]
+    values = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), [*four(name), *D[:4]], strict=True))
+    lines = "\n".join(
+        f"Camera.{key}: {value}" for key, value in {**values, "width": SIZE[0], "height": SIZE[1]}.items()
+    )
+    facts = {"pose": pose(name).ravel().tolist(), "inverse": np.linalg.inv(pose(name)).tolist(), "lines": lines}
+    text = text.format(**facts, size=list(SIZE), four=four(name), four_of_lens=D[:4])
+    [camera] = read(written(tmp_path, text, "front.yaml"), None).rig.cameras
+    assert camera.name == "front"
+    assert (camera.width, camera.height) == SIZE
+    assert camera.distortion.coefficients == tuple(D[:4])
+    np.testing.assert_allclose(camera.intrinsics, k_of(name))
+    np.testing.assert_allclose(camera.ego_from_camera, pose(name), atol=1e-9)
+
+
+def test_kalibr_and_poses_of_another_file(tmp_path):
+    chain = {
+        name: {
+            "camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": D[:4],
+            "resolution": list(SIZE),
+            "intrinsics": four(name), "T_cam_imu": np.eye(4).tolist(),
+        }
+        for name in NAMES
+    }  # fmt: skip
+    for earlier, name in pairwise(NAMES):
+        chain[name]["T_cn_cnm1"] = (np.linalg.inv(pose(name)) @ pose(earlier)).tolist()
+    poses = written(tmp_path, {NAMES[2]: {"T_ego_cam": pose(NAMES[2]).tolist()}}, "poses.yaml")
+    found = read(written(tmp_path, chain, "camchain.yaml"), None, extrinsics=poses)
+    assert_is_the_street(found.rig, lens=True)
+
+
+def colmap(folder, poses):
+    """cameras.txt and images.txt. poses: of each camera, a list of camera_from_world."""
+    lines, images = ["# Camera list"], ["# Image list"]
+    for key, name in enumerate(NAMES, 1):
+        k = k_of(name)
+        numbers = (k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, *D[:4])
+        lines.append(" ".join(map(str, (key, "OPENCV", *SIZE, *numbers))))
+        for number, matrix in enumerate(poses[name]):
+            x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+            images.append(" ".join(map(str, (number, w, x, y, z, *matrix[:3, 3], key, f"{name}/{number:06d}.jpg"))))
+            images.append("1.5 2.5 1 3.5 4.5 -1 5.5 6.5 2 7.5" if number else "")
+    written(folder, "\n".join(lines), "sparse/0/cameras.txt")
+    written(folder, "\n".join(images), "sparse/0/images.txt")
+    return folder
+
+
+def test_colmap(tmp_path):
+    found = read(colmap(tmp_path, {name: [np.linalg.inv(pose(name))] * 2 for name in NAMES}))
+    assert_is_the_street(found.rig, lens=True)
+    assert "camera_from_ego" in found.notes[0]
+
+
+def test_a_reconstruction_of_a_drive_has_no_poses_on_the_vehicle(tmp_path):
+    moving = {name: [np.linalg.inv(pose(name)), np.eye(4)] for name in NAMES}
+    folder = colmap(tmp_path, moving)
+    with pytest.raises(InputError, match=r"moves through the file.*`extrinsics=FILE`"):
+        read(folder)
+    poses = written(tmp_path, {name: {"ego_from_camera": pose(name).tolist()} for name in NAMES}, "poses.json")
+    assert_is_the_street(read(folder, extrinsics=poses).rig, lens=True)
+
+
+def test_nerfstudio(tmp_path):
+    frames = [
+        {
+            "file_path": f"images/{name}/000000.jpg", "transform_matrix": pose(name, axes=OPENGL).tolist(),
+            **dict(zip(("fl_x", "fl_y", "cx", "cy"), np.array(four(name)) + [0, 0, 0.5, 0.5], strict=True)),
+        }
+        for name in NAMES
+    ]  # fmt: skip
+    path = written(
+        tmp_path, {"camera_model": "OPENCV", "w": SIZE[0], "h": SIZE[1], "frames": frames}, "transforms.json"
+    )
+    assert_is_the_street(read(path, None).rig)
+    assert_is_the_street(bevcli.read_calibration(path))
+
+
+@pytest.mark.parametrize("kind", ["objects", "raw"])
+def test_kitti(tmp_path, kind):
+    """The drawing of the vehicle: cameras 1.65 m above the road; the Velodyne 1.73 m, and 0.27 m behind them."""
+    k = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
+    rows = {"P2" if kind == "objects" else "P_rect_02": k @ np.c_[np.eye(3), [0.06, 0, 0]]}
+    camera_from_velodyne = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
+    if kind == "objects":
+        rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": camera_from_velodyne}
+    else:
+        rows |= {"S_rect_02": np.array([1242.0, 375.0]), "R_rect_00": np.eye(3)}
+        text = "calib_time: 09-Jan-2012\n" + lines_of(
+            {"R": camera_from_velodyne[:, :3], "T": camera_from_velodyne[:, 3]}
+        )
+        written(tmp_path, text, "calib_velo_to_cam.txt")
+    path = written(tmp_path, lines_of(rows), "000000.txt" if kind == "objects" else "calib_cam_to_cam.txt")
+    images = tmp_path / "images" / "image_2"
+    images.mkdir(parents=True)
+    cv2.imwrite(str(images / "0.png"), np.zeros((375, 1242, 3), np.uint8))
+    [camera] = read(path if kind == "objects" else tmp_path, tmp_path).rig.cameras
+    assert (camera.width, camera.height) == (1242, 375)
+    np.testing.assert_allclose(camera.intrinsics, k)
+    np.testing.assert_allclose(camera.ego_from_camera[:3, 3], [0.76 + 0.27, 0.06, 1.65], atol=1e-9)
+    np.testing.assert_allclose(camera.ego_from_camera[:3, 2], [1, 0, 0], atol=1e-9)
+
+
+def lines_of(rows):
+    return "".join(f"{key}: {' '.join(map(str, np.ravel(value)))}\n" for key, value in rows.items())
+
+
+def test_a_field_of_view_a_height_and_a_yaw_make_a_rig(tmp_path):
+    yaws = {name: 60.0 * place for place, name in enumerate(NAMES)}
+    rig = RigOptions(fov_deg=90, height=dict.fromkeys(NAMES, 1.5), yaw_deg=yaws).rig(STREET)
+    for name in NAMES:
+        camera, angle = rig[name], np.radians(yaws[name])
+        ahead = camera.ego_from_camera[:3, 3] + [10 * np.cos(angle), 10 * np.sin(angle), 0]
+        side = ahead + [-10 * np.sin(angle), 10 * np.cos(angle), 0]  # 45 degrees to the left: the edge of the image
+        pixels, _ = camera.project_ego([ahead, side])
+        np.testing.assert_allclose(
+            pixels, [[(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2], [-0.5, (SIZE[1] - 1) / 2]], atol=1e-6
+        )
+        assert camera.ego_from_camera[2, 3] == 1.5
+
+
+def test_a_direction_that_is_not_certain_is_asked(tmp_path):
+    """The rotation of a camera that looks to the right is its own inverse, and both heights are possible here."""
+    matrix = np.array([[-1.0, 0, 0, 1.2], [0, 0, -1, 1.0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+    stated = {"K": k_of(NAMES[0]).tolist(), "T": matrix.tolist(), "width": SIZE[0], "height": SIZE[1]}
+    path = written(tmp_path, {"front": stated})
+    with pytest.raises(
+        InputError, match=r'two directions.*`transform="ego_from_camera"` or `transform="camera_from_ego"`'
+    ):
+        read(path, None)
+    one, other = (read(path, None, transform=each).rig for each in ("ego_from_camera", "camera_from_ego"))
+    np.testing.assert_allclose(one["front"].ego_from_camera, matrix)
+    np.testing.assert_allclose(other["front"].ego_from_camera, np.linalg.inv(matrix))
+
+
+@pytest.mark.parametrize("height", [1.5, -0.3])
+def test_the_sign_of_a_height_alone_decides_nothing(tmp_path, height):
+    """A camera with the vehicle's axes is upright in both directions; the origin may be on the ground or in a lidar."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = (1.2, 0, height)
+    stated = {"K": k_of(NAMES[0]).tolist(), "T": matrix.tolist(), "width": SIZE[0], "height": SIZE[1]}
+    path = written(tmp_path, {"front": stated})
+    with pytest.raises(InputError, match=r'below the origin.*`transform="'):
+        read(path, None)
+    rig = read(path, None, transform="ego_from_camera", height=1.5).rig
+    np.testing.assert_allclose(rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
+    stated["T_ego_cam"] = stated.pop("T")
+    named = written(tmp_path, {"front": stated}, "named.yaml")
+    if height > 0:
+        np.testing.assert_allclose(read(named, None).rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
+
+
+def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):
+    lowered = {name: pose(name) for name in NAMES}
+    for matrix in lowered.values():
+        matrix[2, 3] -= 1.84
+    path = written(tmp_path, {name: entry(name, T=lowered[name].tolist()) for name in NAMES})
+    with pytest.raises(InputError, match=r"(above|below) the origin.*`height=1.5`"):
+        read(path)
+    heights = {name: float(pose(name)[2, 3]) for name in NAMES}
+    assert_is_the_street(read(path, height=heights).rig, lens=True)
+
+
+def scaled(matrix, factors):
+    return [(np.array(row) * factors).tolist() for row in matrix[:3]]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drawn_rigs_are_read_right_in_both_directions(tmp_path, seed):
+    """A whole rig under a name that states nothing; each camera alone under one that states the direction."""
+    cameras = draw_rig(RigDistribution(), seed, SIZE).rig.cameras
+    assert_read_right(tmp_path, cameras)
+
+
+def test_real_rigs_are_read_right_in_both_directions(shared, tmp_path):
+    for drive in ("nuscenes-scene-0103", "kitti-straight", "dgp-scene_01"):
+        sequence = bevcli.open_sequence(shared / "data" / drive, ego_motion="optional", ground_truth=False)
+        assert_read_right(tmp_path, sequence.rig.cameras)
+
+
+def assert_read_right(folder, cameras):
+    for rig in (cameras, *((camera,) for camera in cameras)):
+        for name, stated in (("T_ego_cam", np.array), ("T_cam_ego", np.linalg.inv)):
+            key = name if len(rig) == 1 else "T"
+            entries = {
+                camera.name: {
+                    "K": camera.intrinsics.tolist(), key: stated(camera.ego_from_camera).tolist(),
+                    "resolution": [camera.width, camera.height],
+                }
+                for camera in rig
+            }  # fmt: skip
+            found = read(written(folder, entries, "rig.json"), None).rig
+            for camera in rig:
+                np.testing.assert_allclose(found[camera.name].ego_from_camera, camera.ego_from_camera, atol=1e-9)
+
+
+MISTAKES = {
+    "no pose": (lambda e: e.pop("T"), "its pose .T, extrinsics.*is missing.*`height` and `yaw_deg`"),
+    "no intrinsics": (lambda e: e.pop("K"), "has no intrinsics"),
+    "lens": (lambda e: e.update(distortion_model="cata"), "distortion_model cata is not supported"),
+    "millimetres": (lambda e: e.update(T=scaled(e["T"], [1, 1, 1, 1000])), "in millimetres"),
+    "two numbers": (lambda e: e.update(T=[1, 2]), "T: is not understood as a transform"),
+    "rotation": (lambda e: e.update(T=scaled(e["T"], [1.1, 1, 1, 1])), "T: the rotation is not orthonormal"),
+    "upside down": (lambda e: e.update(T=(np.array(e["T"]) @ np.diag([-1, -1, 1, 1])).tolist()), "not upright"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_that_names_file_and_camera(tmp_path, mistake):
+    spoil, expected = MISTAKES[mistake]
+    cameras = {name: entry(name, T=pose(name).tolist()) for name in NAMES}
+    spoil(cameras[NAMES[1]])
+    path = written(tmp_path, cameras)
+    with pytest.raises(InputError, match=expected) as caught:
+        read(path)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ")
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [
+        ({"fov_deg": 70}, "needs the height"),
+        ({"height": 1.5}, "needs a field of view or a calibration"),
+        ({"fov_deg": 70, "height": 1.5}, "directions of 6 cameras are not stated"),
+        ({"fov_deg": 70, "height": 1.5, "yaw_deg": 0}, "one direction for 6 cameras"),
+        ({"fov_deg": 70, "height": 1.5, "yaw_deg": {"front": 0}}, "there is no camera front"),
+        ({"fov_deg": 0, "height": 1.5, "yaw_deg": dict.fromkeys(NAMES, 0)}, "5 to 170"),
+        ({"fov_deg": 70, "height": 150, "yaw_deg": dict.fromkeys(NAMES, 0)}, "metres above the ground"),
+    ],
+)
+def test_numbers_that_are_missing_or_wrong_are_named(how, expected):
+    with pytest.raises(InputError, match=expected):
+        RigOptions(**how).rig(STREET)
+
+
+def test_a_size_that_nothing_states_is_missing(tmp_path):
+    path = written(tmp_path, {name: entry(name, T=pose(name).tolist()) for name in NAMES})
+    with pytest.raises(InputError, match=re.escape(f"camera {NAMES[0]}: the image size is missing")):
+        read(path, None)
+
+
+def test_cameras_and_sizes_are_found_where_the_images_lie(tmp_path):
+    image = cv2.imencode(".jpg", np.zeros((36, 64, 3), np.uint8))[1].tobytes()
+    for folder, path in (("a", "images/front/7.jpg"), ("b", "front/7.jpg"), ("c", "rgb/7.jpg")):
+        file = tmp_path / folder / path
+        file.parent.mkdir(parents=True)
+        file.write_bytes(image)
+    (tmp_path / "c/frames.csv").write_text("frame,timestamp_ns,front\n0,1,\n1,2,rgb/7.jpg\n")
+    for folder in "abc":
+        [camera] = RigOptions(fov_deg=90, height=1.5).rig(tmp_path / folder).cameras
+        assert (camera.name, camera.width, camera.height) == ("front", 64, 36)
+        np.testing.assert_allclose(camera.intrinsics, [[32, 0, 31.5], [0, 32, 17.5], [0, 0, 1]])
