@@ -28,7 +28,7 @@ if TYPE_CHECKING:
         Prediction as Prediction,
         Sequence as Sequence,
     )
-    from bevcli.geometry.boxes import Boxes3D as Boxes3D
+    from bevcli.geometry.boxes import Box3D as Box3D, Boxes3D as Boxes3D
     from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
@@ -41,10 +41,17 @@ if TYPE_CHECKING:
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
+    from bevcli.viewer.export import export as export
     from bevcli.viewer.recording_file import show as show
+    from bevcli.viewer.views import screenshot as screenshot, video as video
+    from bevcli.weights.model_file import model_file_for as model_file_for
+    from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
+    from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
+    from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
+    from bevcli.workshop.training.train import train as train, validate as validate
 
 # The public names by the modules that define them.
 _NAMES = {
@@ -52,7 +59,7 @@ _NAMES = {
     "bevcli.errors": "BevcliError",
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
-    "bevcli.geometry.boxes": "Boxes3D",
+    "bevcli.geometry.boxes": "Box3D Boxes3D",
     "bevcli.geometry.cameras": "Camera CameraRig Distortion",
     "bevcli.geometry.ego_motion": "Kinematics",
     "bevcli.geometry.transforms": "Pose",
@@ -65,9 +72,16 @@ _NAMES = {
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
     "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
+    "bevcli.weights.model_file": "model_file_for",
+    "bevcli.workshop.batch.batch": "batch",
+    "bevcli.workshop.engines.write_model": "export_onnx quantize",
+    "bevcli.workshop.formats.convert": "convert",
     "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
+    "bevcli.workshop.training.train": "train validate",
+    "bevcli.viewer.export": "export",
     "bevcli.viewer.recording_file": "show",
+    "bevcli.viewer.views": "screenshot video",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = list(_MODULES)

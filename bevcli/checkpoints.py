@@ -13,17 +13,21 @@ import torch
 from torch import Tensor
 
 from bevcli.config import known_models, load_config
-from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
+from bevcli.printing import counted
 from bevcli.writing import check_output, write_whole
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
 PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
-AVERAGES = r"ema_|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
+AVERAGES = r"ema[_.]|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
+AVERAGED_PREFIXES = r"(?:(?:ema_)?(?:module|model)\.|ema[_.])*"  # where a file has averages only
+WRAPPERS = ("state_dict", "model", "model_state_dict")  # keys that a file may hold its state dict under
+LEAST_SHARE = 0.5  # of a model's tensors, that a file must hold for a difference in words
 OFFICIAL = ("img_backbone.", "img_neck.", "pts_bbox_head.")  # of names in the released files
 
 
@@ -51,6 +55,26 @@ class Checkpoint:
     def models(self) -> tuple[str, ...]:
         """Names of the known models that the state dict fits."""
         return tuple(name for name in known_models() if not compare(self.state, _expected_of(name)))
+
+    @cached_property
+    def nearest(self) -> str:
+        """The known model with the fewest different tensors."""
+        return min(known_models(), key=lambda name: sum(map(len, compare(self.state, _expected_of(name)).values())))
+
+    @cached_property
+    def own_classes(self) -> int | None:
+        """The number of classes of the file, where it is the nearest model with another number; else None."""
+        return classes_instead(self.state, _expected_of(self.nearest), len(load_config(self.nearest).classes))
+
+    @property
+    def misfit(self) -> str:
+        """The known model that is nearest, and the difference from it, for an error of a file that fits none."""
+        expected, count = _expected_of(self.nearest), len(load_config(self.nearest).classes)
+        advice = ": name its own by `model=FILE.toml`"
+        if self.own_classes is not None:
+            advice = f": `bevcli weights model-file {self.path} my.toml` writes its model file"
+        what = difference(self.state, expected, count)
+        return f"fits none of the known models; nearest is {self.nearest}: {what}{advice}"
 
     @property
     def parameters(self) -> int:
@@ -83,6 +107,9 @@ def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tenso
     if not by_kind:
         return
     differences = "; ".join(f"{len(keys)} {kind}: {', '.join(keys)}" for kind, keys in by_kind.items())
+    count = _class_count(model)
+    if count is not None and classes_instead(checkpoint.state, expected, count) is not None:
+        differences = difference(checkpoint.state, expected, count)
     if checkpoint.models:
         first = "; ".join(f"{len(keys)} {kind}, such as {keys[0]}" for kind, keys in by_kind.items())
         differences = f"it holds weights of {' or '.join(checkpoint.models)}; {first}"
@@ -99,7 +126,7 @@ def convert(source: Path, destination: Path) -> Checkpoint:
     """
     checkpoint = read_checkpoint(source)
     if not checkpoint.models:
-        raise WeightsError(f"{source}: fits none of the known models ({', '.join(known_models())})")
+        raise WeightsError(f"{source}: {checkpoint.misfit}")
     if destination.suffix != ".safetensors":
         raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
@@ -123,14 +150,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         state, facts = read_safetensors(path, error=WeightsError)
     else:
         state, facts, not_read = _read_pth(path, left_out)
-    count = len(state)
-    state = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
-    left_out += [f"{count - len(state)} running averages (ema_*)"] if len(state) < count else []
-    prefixes = {match[0] for match in (re.match(PREFIXES, key) for key in state) if match}
-    if len(prefixes) == 1 and "" not in prefixes:
-        (prefix,) = prefixes
-        left_out.append(f'the prefix "{prefix}" of all names')
-        state = {key.removeprefix(prefix): tensor for key, tensor in state.items()}
+    state = _unwrapped(state, left_out)
     _check_numbers(path, state)
     official = any(key.startswith(OFFICIAL) for key in state)
     if official:
@@ -154,6 +174,21 @@ def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tu
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
         reason = " ".join(str(failure).split())
         raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None
+
+
+def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str, Tensor]:
+    """The state dict without running averages and prefixes of other programs, which `left_out` names then."""
+    prefixes = PREFIXES
+    kept = {key: tensor for key, tensor in state.items() if not re.match(f"{PREFIXES}({AVERAGES})", key)}
+    if not kept:
+        kept, prefixes = dict(state), AVERAGED_PREFIXES
+    left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
+    found = {match[0] for match in (re.match(prefixes, key) for key in kept) if match}
+    if len(found) != 1 or "" in found:
+        return kept
+    (prefix,) = found
+    left_out.append(f'the prefix "{prefix}" of all names')
+    return {key.removeprefix(prefix): tensor for key, tensor in kept.items()}
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -180,6 +215,48 @@ def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict
     return {kind: keys for kind, keys in by_kind.items() if keys}
 
 
+def difference(state: Mapping[str, Tensor], expected: Mapping[str, Tensor], classes: int) -> str:
+    """The difference between a state dict and that of a model in words. classes: number of the model's classes."""
+    by_kind = compare(state, expected)
+    fitting = len(expected) - len(by_kind.get("missing", ())) - len(by_kind.get("misshapen", ()))
+    if fitting < LEAST_SHARE * len(expected):
+        return f"{fitting} of its {len(expected)} tensors are in the file"
+    own, parts = classes_instead(state, expected, classes, whole=False), []
+    if own is not None:
+        parts.append(f"{counted(own, 'classes')} instead of {classes}")
+        del by_kind["misshapen"]
+    words = {"missing": "missing", "unexpected": "too many", "misshapen": "of another shape"}
+    for kind, keys in by_kind.items():
+        parts.append(f"{counted(len(keys), 'tensors')} {words[kind]}{', such as' if len(keys) > 1 else ':'} {keys[0]}")
+    return "; ".join(parts)
+
+
+def classes_instead(
+    state: Mapping[str, Tensor], expected: Mapping[str, Tensor], classes: int, *, whole: bool = True
+) -> int | None:
+    """The number of classes of a state dict, where each misshapen tensor has another number of rows for classes.
+
+    None where that is not so. classes: number of the model's classes. whole: nothing else may differ.
+    """
+    by_kind = compare(state, expected)
+    pairs = [
+        (tensor.shape, state[key].shape)
+        for key, tensor in expected.items()
+        if key in state and tensor.shape != state[key].shape
+    ]
+    if not pairs or (whole and len(by_kind) > 1):
+        return None
+    counts = {found[0] if wanted[:1] == (classes,) and found[1:] == wanted[1:] else None for wanted, found in pairs}
+    return counts.pop() if len(counts) == 1 else None
+
+
+def _class_count(model: str) -> int | None:
+    try:
+        return len(load_config(model).classes)
+    except ConfigError:  # a name that is given for the message only
+        return None
+
+
 @cache
 def _expected_of(model: str) -> Mapping[str, Tensor]:
     return expected_state(load_config(model))
@@ -197,11 +274,9 @@ def _read_pth(path: Path, left_out: list[str]) -> tuple[dict[str, Tensor], dict[
     file = read_pth(path)
     contents = state = file.contents
     if isinstance(contents, dict):
-        wrapper = next(
-            (key for key in ("state_dict", "model") if not isinstance(contents.get(key), StoredTensor | None)), ""
-        )
+        wrapper = next((key for key in WRAPPERS if not isinstance(contents.get(key), StoredTensor | None)), "")
         state = contents[wrapper] if wrapper else contents
-        left_out += ['everything but "model"'] if wrapper == "model" else []
+        left_out += [f'everything but "{wrapper}"'] if wrapper not in ("", WRAPPERS[0]) else []
     named = state if isinstance(state, dict) else {"": state}
     hidden = [f"{key}: {each.made_by}".removeprefix(": ") for key, each in named.items() if type(each) is Placeholder]
     if hidden:

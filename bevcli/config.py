@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import json
 import math
 import re
 import types
@@ -85,6 +86,25 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
     stated = {name: own for name, own in portable.items() if own != ClassSettings()}
     table = {ARCHITECTURE: config.architecture, **_plain(replace(config, class_settings=stated))}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
+
+
+def as_toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """A table as TOML: its values first, then the tables in it."""
+    lines = [f"{_key(key)} = {_json(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            name = f"{prefix}{_key(key)}"
+            lines += ["", f"[{name}]", as_toml(value, f"{name}.").rstrip("\n")]
+    return "\n".join(lines) + "\n"
+
+
+def _json(value: Any) -> str:
+    """A text, number, truth value or list in TOML, which writes these as JSON does."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _json(name)
 
 
 def _plain(settings: Any) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,10 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
-from bevcli.geometry.object_classes import Color
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
-from bevcli.printing import valid_text
+from bevcli.printing import counted, valid_text
+from bevcli.registry import load
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -154,6 +155,11 @@ class FrameStamp:
     timestamp_ns: int
 
 
+def _named(stamp: FrameStamp) -> str:
+    """A frame in words, for one line."""
+    return f"frame {stamp.index}" + (f" of {stamp.scene}" if stamp.scene else "")
+
+
 @dataclass(frozen=True)
 class Frame:
     """The sensor data and the ground truth of one moment.
@@ -185,6 +191,10 @@ class Frame:
     ground_truth_results: tuple[FrameResult, ...] = ()
     sample_token: str | None = None
     impossible_boxes: int = 0
+
+    def __repr__(self) -> str:
+        truth = "" if self.ground_truth is None else f", {len(self.ground_truth)} true boxes"
+        return f"Frame({_named(self.stamp)}, images of {', '.join(self.images) or 'no camera'}{truth})"
 
 
 @dataclass(frozen=True)
@@ -221,6 +231,10 @@ class Sequence(Protocol):
     notes: tuple[str, ...] = ()
     facts: DriveFacts = DriveFacts()
     ego_motion: EgoMotion | None = None
+
+    def __repr__(self) -> str:
+        count, cameras = len(self.stamps), len(self.rig.cameras)
+        return f"{type(self).__name__}({self.name}, {counted(count, 'frames')}, {counted(cameras, 'cameras')})"
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -383,6 +397,9 @@ class Prediction:
         attention: what the attentions sampled, where this was asked for.
         stage_seconds: stage of the pipeline -> seconds, in the order of execution.
         results: further results of the model, each of another type.
+        object_classes: of the model, by name.
+        frame: that it is for, with its images, which `plot` draws; None where it was left out.
+        untrained: whether the weights are random: boxes and maps are meaningless.
     """
 
     stamp: FrameStamp
@@ -399,6 +416,29 @@ class Prediction:
     attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     results: tuple[FrameResult, ...] = ()
+    object_classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
+    frame: Frame | None = None
+    untrained: bool = False
+
+    def __repr__(self) -> str:
+        found = self.failure or f"{len(self.boxes)} boxes"
+        further = (*(["map"] if self.segmentation is not None else []), *(each.kind for each in self.results))
+        return f"Prediction({', '.join((_named(self.stamp), found, *further))})"
+
+    def plot(
+        self, image: str | None = None, *, score: float = 0.25, color_order: Literal["bgr", "rgb"] = "bgr"
+    ) -> NDArray[np.uint8]:
+        """The images of the frame with the boxes, and the map from above, as one image (H, W, 3) uint8.
+
+        Args:
+            image: a camera, for its image alone, in its own size.
+            score: boxes scored below this are left out.
+            color_order: of the result: "bgr", as OpenCV writes it, or "rgb".
+
+        Raises InputError for an unknown camera or color order, and where `frame` is None.
+        """
+        drawn: NDArray[np.uint8] = load("bevcli.plots", "prediction")(self, image, score, color_order)
+        return drawn
 
     @property
     def failure(self) -> str:

@@ -14,6 +14,7 @@ command line prints such a name as its flag: "pass --force".
 """
 
 import dataclasses
+import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING
@@ -88,13 +89,41 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:
     """The options of a call that takes the dataclass or keywords: `given` or the defaults, with the changes.
 
-    A text becomes a Path where the field is one. Raises TypeError for a keyword that the dataclass does not have.
+    A text becomes a Path where the field is one, and one or a list of them a tuple where the field is that. Raises
+    TypeError for a keyword that the dataclass does not have.
     """
-    paths = {name for name, hint in get_type_hints(kind).items() if hint in (Path, Path | None)}
-    made = {name: Path(value) if name in paths and isinstance(value, str) else value for name, value in changes.items()}
+    hints = get_type_hints(kind)
+    made = {name: _as_paths(value, hints.get(name)) for name, value in changes.items()}
     if given is None:
         return kind(**made)
     return dataclasses.replace(given, **made) if made else given  # type: ignore[type-var]
+
+
+def _as_paths(value: Any, hint: Any) -> Any:
+    """The value of a field, as paths where its type says so."""
+    if hint == tuple[Path, ...]:
+        return tuple(map(Path, [value] if isinstance(value, str | Path) else value))
+    return Path(value) if hint in (Path, Path | None) and isinstance(value, str) else value
+
+
+def spread(changes: Mapping[str, Any], *kinds: type[Any]) -> tuple[Any, ...]:
+    """Keywords of a call, spread over dataclasses of options; last, a dict of those that are in none of them."""
+    left, made = dict(changes), []
+    for kind in kinds:
+        names = [field.name for field in dataclasses.fields(kind) if field.name in changes]
+        made.append(gather(kind, None, {name: changes[name] for name in names}))
+        for name in names:
+            left.pop(name, None)
+    return (*made, left)
+
+
+def refuse(left: Mapping[str, Any], function: str, *kinds: type[Any]) -> None:
+    """Raise TypeError for keywords that a function does not take. kinds: the dataclasses of its options."""
+    if left:
+        name, known = next(iter(left)), [field.name for kind in kinds for field in dataclasses.fields(kind)]
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f": did you mean {near[0]}?" if near else f" (expected some of {', '.join(sorted(set(known)))})"
+        raise TypeError(f"{function}() has no option {name}{hint}")
 
 
 def defaults(kind: type[Any]) -> dict[str, Any]:

@@ -47,6 +47,9 @@ OWN: dict[Group, dict[str, str]] = {
         "nuscenes": "bevcli.evaluation.submission:DETECTION",
         "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
     },
+    "bevcli.plots": {
+        "prediction": "bevcli.viewer.plot:plot",
+    },
     "bevcli.commands": {
         "eval": "bevcli.cli.commands:evaluate",
         "export": "bevcli.cli.commands:export",

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
     Checkpoint,
+    bundled_weights,
     compare,
     convert,
     expected_state,
@@ -26,12 +27,14 @@ from bevcli.checkpoints import (
 )
 from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
-from bevcli.errors import WeightsError
+from bevcli.errors import OutputError, WeightsError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.inference.load import load_model
 from bevcli.model import parts
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 from bevcli.model.temporal_model import build_model
+from bevcli.weights.model_file import model_file_for
 from bevcli.workshop.training.warm_start import warm_start
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
@@ -184,6 +187,77 @@ def test_weights_of_other_programs_are_read_with_a_note(wrap: Callable, said: st
     assert found.state.keys() == state.keys()
     assert all(torch.equal(found.state[key], value) for key, value in state.items())
     assert said in found.left_out
+
+
+@pytest.mark.parametrize("prefix", ["ema_", "ema_model.", "ema."])
+def test_weights_that_are_averages_only_are_read(prefix: str, tmp_path: Path) -> None:
+    state = small_model(seed=1).state_dict()
+    torch.save({"model_state_dict": {prefix + key: value for key, value in state.items()}}, tmp_path / "w.pth")
+    found = read_checkpoint(tmp_path / "w.pth")
+    assert found.state.keys() == state.keys()
+    assert found.left_out == f'everything but "model_state_dict" and the prefix "{prefix}" of all names'
+
+
+@pytest.fixture(scope="module")
+def demo_state() -> dict[str, torch.Tensor]:
+    return dict(read_checkpoint(Path(str(bundled_weights("demo")))).state)
+
+
+def of_seven_classes(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The weights with the rows of the first seven classes."""
+    rows = [f"detection_head.class_branches.{k}.6.{kind}" for k in range(3) for kind in ("weight", "bias")]
+    return state | {key: state[key][:7].clone() for key in rows}
+
+
+def test_the_nearest_model_and_the_difference_are_named(demo_state: dict, tmp_path: Path) -> None:
+    gone = "neck.lateral.0.bias"
+    less = {key: tensor for key, tensor in demo_state.items() if key != gone}
+    more = {"my.loss": torch.zeros(2)}
+    third = {key: tensor for place, (key, tensor) in enumerate(demo_state.items()) if place % 3 == 0}
+    cases = {
+        f"1 tensor missing: {gone}": less,
+        "1 tensor too many: my.loss": demo_state | more,
+        f"1 tensor missing: {gone}; 1 tensor too many: my.loss": less | more,
+        "7 classes instead of 10": of_seven_classes(demo_state),
+        "7 classes instead of 10; 1 tensor too many: my.loss": of_seven_classes(demo_state) | more,
+        f"1 tensor of another shape: {gone}: expected (96,), found (5,)": demo_state | {gone: torch.zeros(5)},
+        f"{len(third)} of its {len(demo_state)} tensors are in the file": third,
+    }
+    for text, state in cases.items():
+        path = tmp_path / "w.safetensors"
+        safetensors.torch.save_file(state, path)
+        with pytest.raises(WeightsError) as caught:
+            convert(path, tmp_path / "out.safetensors")
+        assert f"fits none of the known models; nearest is demo: {text}: " in str(caught.value)
+
+
+def test_a_model_file_for_other_classes_takes_the_weights(demo_state: dict, tmp_path: Path) -> None:
+    path, out = tmp_path / "seven.safetensors", tmp_path / "my.toml"
+    safetensors.torch.save_file(of_seven_classes(demo_state), path)
+    with pytest.raises(WeightsError, match="7 classes instead of 10: `bevcli weights model-file"):
+        load_model(weights=path)
+    with pytest.raises(WeightsError, match="does not fit model demo: 7 classes instead of 10; "):
+        load_model("demo", weights=path)
+    command = ["weights", "model-file", str(path), str(out)]
+    refused = str(CliRunner().invoke(app, command).exception)
+    assert "has 7 classes: pass their names in the order of the training as `classes=NAME,NAME` (found none)" in refused
+    names = "car,truck,forklift,bus,trailer,barrier,motorcycle"
+    answer = CliRunner().invoke(app, [*command, "--classes", names], catch_exceptions=False)
+    assert f"{out}: demo with 7 classes: car, truck, forklift, " in answer.stdout
+    model = load_model(out, weights=path)
+    assert model.name == "my"
+    assert ",".join(model.config.classes) == names
+    assert model.config.backbone == load_config("demo").backbone
+    assert "already exists" in str(CliRunner().invoke(app, [*command, "--classes", names]).exception)
+
+
+def test_a_model_file_is_for_other_classes_only(demo_state: dict, tmp_path: Path) -> None:
+    path = tmp_path / "more.safetensors"
+    safetensors.torch.save_file(of_seven_classes(demo_state) | {"my.loss": torch.zeros(2)}, path)
+    with pytest.raises(WeightsError, match=r"differs from demo, .* in more than classes: .*too many: my\.loss"):
+        model_file_for(path, tmp_path / "my.toml")
+    with pytest.raises(OutputError, match=r"ends in \.toml"):
+        model_file_for(path, tmp_path / "my.txt")
 
 
 def test_half_precision_weights_are_loaded_as_float32(tmp_path: Path) -> None:

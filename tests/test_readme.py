@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from command_line import command
 
+from bevcli.published import read_sources
+
 ROOT = Path(__file__).parents[1]
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.MULTILINE | re.DOTALL)
 OPENS_A_VIEWER = re.compile(r"^bevcli viz \S+$")
@@ -53,3 +55,12 @@ def test_the_python_example_writes_a_recording(folder: Path) -> None:
     with contextlib.chdir(folder):
         exec(example, {})
     assert (folder / "street.rrd").stat().st_size > 100_000
+
+
+def test_readme_and_weights_page_name_what_weights_list_does(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))  # without names of the user
+    listed = list(read_sources())
+    [names] = re.findall(r"^The names are (.*?)\. ", (ROOT / "README.md").read_text(), flags=re.MULTILINE | re.DOTALL)
+    assert re.findall(r"`(.+?)`", names) == listed
+    rows = re.findall(r"^\| `(.+?)` \|", (ROOT / "docs/weights.md").read_text(), flags=re.MULTILINE)
+    assert rows == listed

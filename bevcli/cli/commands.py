@@ -23,12 +23,10 @@ from bevcli.rig import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.viewer.options import ViewOptions
-from bevcli.writing import check_output, output_errors, write_whole
+from bevcli.writing import output_errors, write_whole
 
 if TYPE_CHECKING:
-    from bevcli.evaluation.box_format import BoxFormat
     from bevcli.frame import Frame
-    from bevcli.sequences.files.boxes_file import BoxesFile
 
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look", "eval": "Score", "export": "Score"}
@@ -312,27 +310,7 @@ def export(
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    from bevcli.registry import load_form
-    from bevcli.sequences.files.boxes_file import above_score
+    from bevcli.viewer.export import export
 
-    chosen: BoxFormat = load_form("bevcli.box_formats", options.form)
-    file = predictions / "predictions.json" if predictions.is_dir() else predictions
-    target = options.out or file.parent / chosen.target
-    check_output(target, file)
-    boxes = above_score(_read_boxes(file), options.score)
-    say(f"{target}: {chosen.write(boxes, target, options, file)}")
-
-
-def _read_boxes(file: Path) -> "BoxesFile":
-    """The boxes of a boxes file or of a recording."""
-    from bevcli.sequences.files.boxes_file import read_boxes
-
-    if file.suffix.lower() != ".rrd":
-        return read_boxes(file)
-    from bevcli.viewer.recording_file import open_recording
-    from bevcli.viewer.recording_reader import read_recording
-
-    with open_recording(file) as whole:
-        if whole != file:
-            say(f"note: {file} is incomplete (its run was stopped or is still going)", err=True)
-        return read_recording(whole)
+    target, what = export(predictions, options, report=print_note)
+    say(f"{target}: {what}")

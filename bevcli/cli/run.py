@@ -111,7 +111,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     if model.is_exported:
         notes.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:
-        notes.append(f"{model.weights}: left out {model.left_out}, which only training uses")
+        notes.append(f"{model.weights}: left out {model.left_out}, which a run does not need")
     if model.not_read:
         notes.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
     later = model.config.later_frames

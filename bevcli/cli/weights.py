@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, argument, command, model_option
+from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option
 from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
-from bevcli.printing import aligned, say
+from bevcli.printing import aligned, counted, say
+from bevcli.weights.options import ModelFileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -109,7 +110,7 @@ def inspect(
         data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
         data["parts"] = [asdict(part) for part in parts]
         texts.append(_parts_as_text(config.name, parts))
-    say(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
+    say(json.dumps(data, indent=1) if as_json else as_flags("\n\n".join(texts)))
 
 
 @weights_app.command(cls=PlainCommand)
@@ -129,6 +130,24 @@ def convert(
     if destination.exists() and not force:
         raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")
     say(_as_text(convert_file(source, destination)))
+
+
+@weights_app.command(name="model-file", cls=PlainCommand)
+@command
+def model_file(
+    weights: Annotated[Path, argument("Weights of a known model with other classes: a .pth or a .safetensors.")],
+    out: Annotated[Path, argument("The model file to write.", reads=None, metavar="FILE.toml")],
+    options: ModelFileOptions,
+) -> None:
+    """Write the model file of WEIGHTS that fit a known model but for the number or names of its classes.
+
+    `bevcli run SEQUENCE --model FILE.toml --weights WEIGHTS` takes it then.
+    """
+    from bevcli.weights.model_file import model_file_for
+
+    config, model = model_file_for(weights, out, options)
+    say(f"{out}: {model} with {counted(len(config.classes), 'classes')}: {', '.join(config.classes)}")
+    say(f"next: bevcli run SEQUENCE --model {out} --weights {weights}")
 
 
 def _named_as_data(weights: "NamedWeights") -> dict[str, object]:
@@ -160,6 +179,7 @@ def _as_data(checkpoint: "Checkpoint") -> dict[str, object]:
     return {
         "file": str(checkpoint.path),
         "models": list(checkpoint.models),
+        "misfit": "" if checkpoint.models else checkpoint.misfit,
         "official_key_names": checkpoint.official,
         "tensors": len(checkpoint.state),
         "parameters": checkpoint.parameters,
@@ -174,8 +194,8 @@ def _as_text(checkpoint: "Checkpoint") -> str:
     not_read = ", ".join(checkpoint.not_read)
     rows = [
         ("key names", "the original BEVFormer" if checkpoint.official else "bevcli"),
-        ("fits", ", ".join(checkpoint.models) or "none of our models"),
-        ("left out", checkpoint.left_out and f"{checkpoint.left_out}, which only training uses"),
+        ("fits", ", ".join(checkpoint.models) or checkpoint.misfit.removeprefix("fits ")),
+        ("left out", checkpoint.left_out and f"{checkpoint.left_out}, which a run does not need"),
         *checkpoint.facts.items(),
         ("not read", not_read and f"{not_read} (objects that are no weights; nothing was run)"),
     ]

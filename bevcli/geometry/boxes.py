@@ -1,13 +1,14 @@
 """Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from math import nan
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bevcli.errors import BevcliError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
@@ -36,10 +37,42 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Box3D:
+    """One of `Boxes3D`, in the same frame of reference.
+
+    Attributes:
+        class_name: such as "car".
+        score: confidence, 0 to 1; None if it is unknown.
+        center: (3,) metres.
+        size_lwh: (3,) length, width and height, metres.
+        yaw: radians, counter-clockwise about z, 0 along x.
+        velocity: (2,) m/s along x and y; NaN if unknown.
+        columns: the further columns that the boxes have, by key: "attribute", "instance" and so on.
+    """
+
+    class_name: str
+    score: float | None
+    center: Array
+    size_lwh: Array
+    yaw: float
+    velocity: Array
+    columns: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        score = "" if self.score is None else f" {self.score:.2f}"
+        x, y, z = self.center
+        return f"Box3D({self.class_name}{score} at {x:.1f}, {y:.1f}, {z:.1f} m, yaw {np.degrees(self.yaw):.0f}°)"
+
+
+# What selects several boxes: a mask (N,) bool, an index array or a slice.
+Selection = slice | Sequence[int] | Sequence[bool] | NDArray[Any] | np.bool
+
+
+@dataclass(frozen=True)
 class Boxes3D:
     """N boxes in one frame of reference: bev, ego or world. The owner of the object states which one.
 
-    An optional column is None if it is unknown for all boxes.
+    They are a sequence of `Box3D`. An optional column is None if it is unknown for all boxes.
 
     Attributes:
         centers: (N, 3) box centres, metres.
@@ -77,11 +110,33 @@ class Boxes3D:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def __getitem__(self, selection: ArrayLike | slice) -> "Boxes3D":
-        """The boxes of a mask (N,) bool, an index array or a slice."""
+    @overload
+    def __getitem__(self, selection: int | np.integer[Any]) -> Box3D: ...
+
+    @overload
+    def __getitem__(self, selection: Selection) -> "Boxes3D": ...
+
+    def __getitem__(self, selection: int | np.integer[Any] | Selection) -> "Box3D | Boxes3D":
+        """The box at an index, or the boxes of a mask (N,) bool, an index array or a slice."""
+        if isinstance(selection, int | np.integer):
+            return self._box(int(selection))
         key = selection if isinstance(selection, slice) else np.asarray(selection)
         chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
         return Boxes3D(**chosen)
+
+    def __iter__(self) -> Iterator[Box3D]:
+        return map(self._box, range(len(self)))
+
+    def __repr__(self) -> str:
+        names, counts = np.unique(self.classes, return_counts=True)
+        listed = ", ".join(f"{count} {names[i]}" for i, count in sorted(enumerate(counts), key=lambda each: -each[1]))
+        return f"Boxes3D({len(self)} boxes{': ' if listed else ''}{listed})"
+
+    def _box(self, place: int) -> Box3D:
+        found = {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
+        row = {key: values[place].item() for key, values in found.items() if values is not None}
+        center, size, yaw, velocity = (c[place] for c in (self.centers, self.sizes_lwh, self.yaws, self.velocities))
+        return Box3D(str(self.classes[place]), row.pop("score", None), center, size, float(yaw), velocity, row)
 
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
@@ -154,6 +209,14 @@ class Boxes3D:
         values = {"class": self.classes, **dict(zip(NUMBERS, self.to_numpy().T, strict=True))}
         values |= {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
         return {key: values[key].tolist() for key in TABLE_COLUMNS if values[key] is not None}
+
+    def to_pandas(self) -> Any:
+        """The table of `to_dict` as a `pandas.DataFrame`. Raises BevcliError where pandas is not installed."""
+        try:
+            import pandas
+        except ImportError:
+            raise BevcliError("pandas is not installed: run pip install pandas, or use `to_dict()`") from None
+        return pandas.DataFrame(self.to_dict())
 
 
 OPTIONAL_COLUMNS: dict[str, Column] = {

@@ -170,6 +170,9 @@ class CameraRig:
     ego_from_bev: Array
     ego_from_bev_assumed: bool = False
 
+    def __repr__(self) -> str:
+        return "CameraRig(" + ", ".join(f"{c.name} {c.width}x{c.height}" for c in self.cameras) + ")"
+
     @property
     def names(self) -> tuple[str, ...]:
         """The cameras' names, in the rig's order."""

@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
-from bevcli.errors import BevcliError, ConfigError, WeightsError
-from bevcli.frame import Sequence
+from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
+from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Pose
+from bevcli.inference.frames_from_memory import ColorOrder, check_color_order, checked_images
 from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions
@@ -29,9 +32,12 @@ from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
 from bevcli.registry import entries, load
+from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.images import AT_REST
 from bevcli.weights import DownloadReport
 
 DEFAULT_MODEL = "demo"
+WEIGHTS_SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
 
 
@@ -68,6 +74,47 @@ class Model:
     file: Path | None = None
     calibrate_with: Path | None = None
     engine_note: str = ""
+
+    def __repr__(self) -> str:
+        source = self.weights or self.file
+        weights = "random weights" if source is None else source.name
+        return f"Model({self.name}, {weights}, {self.precision} on {self.device} by {self.engine})"
+
+    def __call__(
+        self,
+        images: Mapping[str, NDArray[Any]],
+        calibration: CameraRig | str | Path | None = None,
+        *,
+        color_order: ColorOrder = "bgr",
+    ) -> Prediction:
+        """The prediction for one frame alone, without history, times and poses: the vehicle is taken to stand.
+
+            prediction = model({"CAM_FRONT": image}, "calibration.json")
+
+        A `Session` steps the model over frames in order, and gives better boxes: it uses the history.
+
+        Args:
+            images: camera -> (H, W, 3) uint8, in the size that the calibration states; cameras may be missing.
+            calibration: the cameras: a `CameraRig`, such as `drive.rig`, or a calibration file.
+            color_order: of the images: "bgr", as OpenCV decodes them, or "rgb".
+
+        Raises InputError without a calibration, for an unknown camera or color order, and for an image of another size
+        or type.
+        """
+        check_color_order(color_order)
+        if not isinstance(calibration, CameraRig | str | Path):
+            found = "is missing" if calibration is None else f"is a {type(calibration).__name__}"
+            raise InputError(
+                f"`calibration` {found}: model {self.name} does not know where your cameras are: pass a "
+                "calibration.json, or a CameraRig such as `drive.rig`"
+            )
+        rig = calibration if isinstance(calibration, CameraRig) else read_calibration(Path(calibration))
+        given, pose = checked_images(images, rig, color_order, 0), Pose.identity()
+        dropped = {name: "not given" for name in rig.names if name not in given}
+        at = dict.fromkeys(rig.names, pose)
+        frame = Frame(FrameStamp(0, "", 0), rig, given, pose, at, AT_REST, dropped)
+        runner = self.in_engine(rig).runner(track=False)
+        return runner.step(None, runner.preparation(runner.preprocessor())(frame))[1]
 
     @property
     def config(self) -> ModelConfig:
@@ -174,8 +221,8 @@ class Model:
 
     def runner(self, *, track: bool, **asked: Any) -> Runner:
         """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
-        tracker = self.tracker if track else None
-        return Runner(self.prepared, self.device, StepOptions(tracker=tracker, takes_pixels=self.is_exported, **asked))
+        asked |= {"tracker": self.tracker if track else None, "untrained": self.untrained}
+        return Runner(self.prepared, self.device, StepOptions(takes_pixels=self.is_exported, **asked))
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:
@@ -228,6 +275,8 @@ def load_model(
         return opened
     if chosen.weights is not None and chosen.untrained:
         raise WeightsError(f"`weights={chosen.weights}` and `untrained` exclude each other: pass one of them")
+    if Path(str(chosen.model)).suffix in WEIGHTS_SUFFIXES:
+        raise WeightsError(f"`model={chosen.model}`: is a file of weights: pass it as `weights={chosen.model}`")
     name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
@@ -349,12 +398,10 @@ def installed_engines() -> dict[str, Any]:
 
 def _model_of(weights: Path) -> str:
     """The first known model that a file of weights fits."""
-    models = read_checkpoint(weights).models
-    if not models:
-        raise WeightsError(
-            f"{weights}: fits none of the known models ({', '.join(known_models())}): name its own by `model=FILE.toml`"
-        )
-    return models[0]
+    checkpoint = read_checkpoint(weights)
+    if not checkpoint.models:
+        raise WeightsError(f"{weights}: {checkpoint.misfit}")
+    return checkpoint.models[0]
 
 
 def choose_device(name: str | torch.device) -> torch.device:

@@ -2,17 +2,24 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from operator import index
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, DriveFacts, Frame, FrameStamp, Prediction, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.frame import DriveFacts, Frame, FrameStamp, Prediction, Sequence
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
+from bevcli.inference.frames_from_memory import (
+    ColorOrder,
+    check_cameras,
+    check_color_order,
+    checked_images,
+    whole_nanoseconds,
+)
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState, one_command, read_commands
 
@@ -52,6 +59,9 @@ def run(
         InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
             attention of an exported file is asked for.
     """
+    for argument, given, maker in (("model", model, "load_model"), ("sequence", sequence, "open_sequence")):
+        if isinstance(given, str | Path):
+            raise InputError(f"`{argument}={given}`: is a text or path: pass what `bevcli.{maker}` returns for it")
     model = model.in_engine(sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
     asked = {"ask_attention": attention or bool(probes), "probes": tuple(probes)}
     runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
@@ -59,7 +69,6 @@ def run(
     return ((frame, prediction) for frame, prediction, _ in steps)
 
 
-ColorOrder = Literal["bgr", "rgb"]
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
 
 
@@ -113,8 +122,7 @@ class Session:
         Raises InputError for a rig without cameras or with two of one name, an unknown camera in `cameras`, color order
         or command, and for a model that needs later frames.
         """
-        if color_order not in ("bgr", "rgb"):
-            raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
+        check_color_order(color_order)
         if not rig.names or len(set(rig.names)) < len(rig.names):
             raise InputError(f"`rig`: expected cameras with different names (found {', '.join(rig.names) or 'none'})")
         if temporal and model.config.later_frames:
@@ -136,7 +144,7 @@ class Session:
 
     def step(
         self,
-        images: Mapping[str, NDArray[np.uint8]],
+        images: Mapping[str, NDArray[Any]],
         world_from_ego: Pose | ArrayLike,
         timestamp_ns: int,
         *,
@@ -170,11 +178,11 @@ class Session:
             name: _pose(world_from_ego_then, f"`world_from_ego_at`: camera {name}")
             for name, world_from_ego_then in given
         }
-        self._check_cameras(at, "world_from_ego_at")
+        check_cameras(at, self.rig, "world_from_ego_at")
         frame = Frame(
             stamp=stamp,
             rig=self.rig,
-            images=self._checked(images, stamp.timestamp_ns),
+            images=checked_images(images, self.rig, self._color_order, stamp.timestamp_ns),
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(self.rig.names, pose) | at,
             kinematics=poses.kinematics() if kinematics is None else kinematics,
@@ -193,7 +201,7 @@ class Session:
         self._drive, self._last_ns = self._drive + 1, None
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
-        time = index(timestamp_ns)
+        time = whole_nanoseconds(timestamp_ns)
         if self._last_ns is not None and time <= self._last_ns:
             raise InputError(
                 f"`timestamp_ns={time}`: is not later than the frame before ({self._last_ns}): pass frames in order, "
@@ -201,29 +209,6 @@ class Session:
             )
         number = 0 if self.frame is None else self.frame.stamp.index + 1
         return FrameStamp(number, str(self._drive) if self._drive > 1 else "", time)
-
-    def _checked(self, images: Mapping[str, NDArray[np.uint8]], timestamp_ns: int) -> dict[str, CameraImage]:
-        self._check_cameras(images, "images")
-        for name, pixels in images.items():
-            _check_image(pixels, self.rig[name])
-        turned = images.items() if self._color_order == "bgr" else ((n, p[..., ::-1]) for n, p in images.items())
-        return {name: CameraImage(timestamp_ns, np.ascontiguousarray(pixels)) for name, pixels in turned}
-
-    def _check_cameras(self, given: Mapping[str, object], argument: str) -> None:
-        for name in given:
-            if name not in self.rig.names:
-                raise InputError(f"`{argument}`: camera {name} is not in the rig (it has {', '.join(self.rig.names)})")
-
-
-def _check_image(pixels: NDArray[np.uint8], camera: Camera) -> None:
-    """Raise InputError where pixels are not an image of a camera."""
-    shape, kind = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
-    if shape != (camera.height, camera.width, 3) or kind != np.uint8:
-        found = kind if shape is None else f"{kind} of shape {shape}"
-        raise InputError(
-            f"`images`: camera {camera.name}: expected uint8 of shape ({camera.height}, {camera.width}, 3), as in the "
-            f"rig (found {found})"
-        )
 
 
 def _pose(given: Pose | ArrayLike, argument: str) -> Pose:

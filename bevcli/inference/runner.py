@@ -59,6 +59,7 @@ class StepOptions:
         commands: of the driver, for a model that plans.
         tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
         takes_pixels: whether the model is an exported file: see `PreparedFrame.pixels`.
+        untrained: whether the weights are random, which `Prediction.plot` says.
     """
 
     temporal: bool = True
@@ -67,6 +68,7 @@ class StepOptions:
     commands: Commands = ()
     tracker: TrackerConfig | None = None
     takes_pixels: bool = False
+    untrained: bool = False
 
 
 class Runner:
@@ -225,6 +227,9 @@ class Runner:
             grid=self.config.bev_grid,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
+            object_classes=self.config.object_classes,
+            frame=frame,
+            untrained=self.options.untrained,
             **{"boxes": Boxes3D.empty(), "bev": None, **fields},
         )
 

@@ -246,25 +246,20 @@ def log_scene(
         stream.log(entities.camera(camera.name), pinhole, static=True)
     vehicle = default_vehicle() if vehicle is None else vehicle
     log_mesh(stream, entities.VEHICLE, vehicle.mesh)
-    strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
+    strips = [bev_image_points(rig, strip) for strip in vehicle.top_view]
     stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=entities.EGO_COLOR, draw_order=40), static=True)
-    angles = np.linspace(0, 2 * np.pi, 121)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
-    lines = rings = [circle * distance for distance in distances]
-    if grid is not None:
-        border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
-        lines = [*rings, apply(rig.ego_from_bev, border)[:, :2]]
+    rings, lines = range_rings(grid), range_lines(rig, grid)
     in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
     stream.log(
         entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*entities.RING_COLOR, 140], radii=width), static=True
     )
-    flat = [_bev_image_points(rig, line) for line in lines]
+    flat = [bev_image_points(rig, line) for line in lines]
     stream.log(
         entities.BEV_RINGS, rr.LineStrips2D(flat, colors=entities.RING_COLOR, radii=width, draw_order=5), static=True
     )
     # The labels are on the circles, ahead to the right, where they cover little.
-    positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
+    positions = [bev_image_points(rig, ring[[105]])[0] for ring in rings]
     labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=RING_LABEL_COLOR, draw_order=6)
     log(stream, f"{entities.BEV_RINGS}/labels", labels, static=True)
 
@@ -376,7 +371,23 @@ def ring_distances_m(grid: BevGrid | None) -> list[int]:
     return list(range(RING_STEP_M, int(reach) + 1, RING_STEP_M))
 
 
-def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
+def range_rings(grid: BevGrid | None) -> list[Array]:
+    """The range rings, (P, 2) each on the ground of the ego frame, metres."""
+    angles = np.linspace(0, 2 * np.pi, 121)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return [circle * distance for distance in ring_distances_m(grid)]
+
+
+def range_lines(rig: CameraRig, grid: BevGrid | None) -> list[Array]:
+    """The range rings and the border of the grid, as `range_rings`."""
+    rings = range_rings(grid)
+    if grid is None:
+        return rings
+    border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
+    return [*rings, apply(rig.ego_from_bev, border)[:, :2]]
+
+
+def bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     """Points (K, 2) on the ground in the ego frame -> (K, 2) in the flat BEV image: x to the right, -y down, metres."""
     points = apply(inverse(rig.ego_from_bev), np.column_stack([points_ego, np.zeros(len(points_ego))]))
     return points[:, :2] * (1, -1)

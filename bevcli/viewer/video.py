@@ -6,7 +6,7 @@ H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM
 import errno
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import MAP_CLASSES
@@ -188,14 +188,20 @@ def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     sizes = {name: _camera_size(frame, name) for name in frame.texts(entities.RUN, "camera_names")}
     if not sizes:
         raise frame.wrong(entities.RUN, "camera_names", "the names of cameras", "none")
-    aspect = min(width / height for width, height in sizes.values())
-    rows = rows_of_largest_images(_camera_yaws(frame), aspect, CAMERAS_WIDTH, CAMERAS_HEIGHT)
+    return tiles_of(sizes, _camera_yaws(frame))
+
+
+def tiles_of(sizes: Mapping[str, ArrayLike], yaws: Mapping[str, float]) -> tuple[Tile, ...]:
+    """The rectangles of cameras. sizes: width and height of their images. yaws: radians, in the ego frame."""
+    whole = {name: np.asarray(size, dtype=np.float64) for name, size in sizes.items()}
+    aspect = min(width / height for width, height in whole.values())
+    rows = rows_of_largest_images(yaws, aspect, CAMERAS_WIDTH, CAMERAS_HEIGHT)
     cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
     layout = []
     for r, row in enumerate(rows):
         indent = (CAMERAS_WIDTH - len(row) * cell[0]) // 2
         for c, name in enumerate(row):
-            width, height = sizes[name]
+            width, height = whole[name]
             scale = min(cell[0] / width, cell[1] / height)
             w, h = max(1, round(width * scale)), max(1, round(height * scale))
             left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
@@ -251,8 +257,13 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         draw_strips(canvas, frame, each, to_canvas)
     for each in (boxes, *layers):
         draw_labels(canvas, frame, f"{each}/labels", to_canvas, 0.36)
-    cv2.rectangle(canvas, (0, 0), (10 * len(tile.camera) + 12, 22), BACKGROUND, -1)
-    text, color = (tile.camera, TEXT) if image is not None else (f"{tile.camera}: no image", WARNING)
+    draw_title(canvas, tile.camera, has_image=image is not None)
+
+
+def draw_title(canvas: Canvas, camera: str, *, has_image: bool) -> None:
+    """Draws the name of a camera into the corner of its image."""
+    cv2.rectangle(canvas, (0, 0), (10 * len(camera) + 12, 22), BACKGROUND, -1)
+    text, color = (camera, TEXT) if has_image else (f"{camera}: no image", WARNING)
     draw_text(canvas, text, (8, 11), color, 0.42)
 
 
@@ -303,15 +314,15 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
         counts[name] = len(frame.texts(entities.layer(entities.WORLD, name), "name"))
     for index, (name, color) in enumerate((layers or _class_colors(frame)).items()):
         position = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        _draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
+        draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
     for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
-        _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
+        draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
         classes = frame.texts(entities.RUN, "map_classes") or list(MAP_CLASSES)
         width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
         for index, (name, color) in enumerate(map_colors(classes).items()):
-            _draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
+            draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
 
 
 def _layers(frame: RecordedFrame) -> dict[str, Color]:
@@ -337,7 +348,8 @@ def _named_colors(frame: RecordedFrame, names: str, colors: str) -> dict[str, Co
         raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", values) from None
 
 
-def _draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: str) -> None:
+def draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: str) -> None:
+    """Draws an entry of a legend. position: x, y of its left edge. color: RGB."""
     x, y = position
     cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), color[::-1], -1)
     draw_text(canvas, text, (x + 24, y), TEXT)

@@ -1,6 +1,11 @@
+import sys
+from dataclasses import replace
+from types import ModuleType
+
 import numpy as np
 import pytest
 
+from bevcli.errors import BevcliError
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 
@@ -69,3 +74,43 @@ def test_boxes_as_an_array_and_as_a_table():
         "yaw": [0.5], "vx": [7], "vy": [8],
     }  # fmt: skip
     assert Boxes3D.empty().to_numpy().shape == (0, 9)
+
+
+def test_boxes_are_a_sequence_of_single_boxes():
+    boxes = some_boxes()
+    first, last = boxes[0], boxes[-1]
+    assert (first.class_name, first.score, first.yaw) == ("car", boxes.scores[0], boxes.yaws[0])
+    assert np.array_equal(first.center, boxes.centers[0])
+    assert np.array_equal(first.size_lwh, boxes.sizes_lwh[0])
+    assert np.array_equal(first.velocity, boxes.velocities[0])
+    assert first.columns == {}
+    assert last.score == boxes.scores[4]
+    assert [box.score for box in boxes] == boxes.scores.tolist()
+    assert boxes[np.argmax(boxes.scores)].score == max(boxes.scores)
+    assert len(boxes[1:3]) == len(boxes[[0, 4]]) == 2
+    with pytest.raises(IndexError):
+        boxes[5]
+    tracked = replace(boxes, scores=None, instances=np.array(list("abcde")), num_points=np.arange(5))
+    assert tracked[2].score is None
+    assert tracked[2].columns == {"instance": "c", "num_points": 2}
+
+
+def test_boxes_become_a_table_of_pandas(monkeypatch):
+    boxes = some_boxes()
+    monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
+    with pytest.raises(BevcliError, match=r"pandas is not installed: run pip install pandas, or use `to_dict\(\)`"):
+        boxes.to_pandas()
+    pandas = ModuleType("pandas")
+    pandas.DataFrame = lambda columns: columns
+    monkeypatch.setitem(sys.modules, "pandas", pandas)
+    assert boxes.to_pandas() == boxes.to_dict()
+
+
+def test_boxes_are_described_in_one_line():
+    boxes = replace(some_boxes(3), classes=np.array(["car", "bus", "bus"]))
+    assert repr(boxes) == "Boxes3D(3 boxes: 2 bus, 1 car)"
+    assert repr(Boxes3D.empty()) == "Boxes3D(0 boxes)"
+    box = Boxes3D(
+        np.array([[1.0, -2, 0.25]]), np.ones((1, 3)), np.array([np.pi / 2]), np.zeros((1, 2)), boxes.classes[:1]
+    )
+    assert repr(box[0]) == "Box3D(car at 1.0, -2.0, 0.2 m, yaw 90°)"

@@ -38,9 +38,8 @@ def test_a_track_has_its_past_and_the_next_second(tmp_path):
         ahead, _, *past = strips(frame, CAR)
         car = recorded_boxes(frame).boxes[0]
         origin = frame.array(entities.WORLD, "origin", 3)[0]
-        velocity = car.velocities
-        np.testing.assert_allclose(ahead[1, :2] - ahead[0, :2], velocity * AHEAD_S, atol=1e-4)
-        np.testing.assert_allclose(ahead[0, :2], (car.centers - origin)[:2], atol=1e-4)
+        np.testing.assert_allclose(ahead[1, :2] - ahead[0, :2], car.velocity * AHEAD_S, atol=1e-4)
+        np.testing.assert_allclose(ahead[0, :2], (car.center - origin)[:2], atol=1e-4)
         assert [len(strip) for strip in past] == ([place + 1] if place else [])
     assert frames[-1].values(CAR, "track") == ["7"]
 

@@ -34,7 +34,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import TRAINING, load_config, load_table, read_model_file
+from bevcli.config import TRAINING, as_toml, load_config, load_table, read_model_file
 from bevcli.inference.load import choose_device, weights_file
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ImageConfig
@@ -44,7 +44,6 @@ from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training.augmentation import RandomisationConfig, randomised
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
-from bevcli.workshop.training.model_file import _toml
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.trainer import Trainer, computes_in_bfloat16, save_weights, update_average
 
@@ -123,7 +122,7 @@ def model_file(path: Path) -> Path:
             part.clear()
         part.update(changes)
     table["name"] = "photographs"
-    path.write_text(_toml(table))
+    path.write_text(as_toml(table))
     return path
 
 

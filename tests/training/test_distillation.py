@@ -12,7 +12,7 @@ import torch
 from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import as_table, load_config
+from bevcli.config import as_table, as_toml as toml_of, load_config
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
@@ -20,7 +20,6 @@ from bevcli.model.network import build_network
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.clip_steps import DistillationLossConfig, Teacher, forward_clip
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob
-from bevcli.workshop.training.model_file import _toml as toml_of
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
 from bevcli.workshop.training.trainer import Trainer, save_weights
 

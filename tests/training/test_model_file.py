@@ -12,7 +12,7 @@ from memory_drive import MemorySequence
 from recorded_drive import with_truth
 from small_fleet import write_fleet
 
-from bevcli.config import TRAINING, load_config, load_table
+from bevcli.config import TRAINING, as_toml, load_config, load_table
 from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import BevFrameConfig
@@ -22,7 +22,6 @@ from bevcli.workshop.training.model_file import (
     NUSCENES_SIZES,
     PRESETS,
     Cost,
-    _toml,
     class_of_size,
     fitting_batch,
     look_at,
@@ -80,7 +79,7 @@ def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_gives_a_model_with_its_own_layers(preset: str, tmp_path: Path) -> None:
     facts = look_at([TrueDrive(6)], FRAME)
-    (tmp_path / "m.toml").write_text(_toml(model_table("m", preset, facts)))
+    (tmp_path / "m.toml").write_text(as_toml(model_table("m", preset, facts)))
     config, base = load_config(tmp_path / "m.toml"), load_config(PRESETS[preset][0])
     assert (config.encoder, config.decoder, config.backbone) == (base.encoder, base.decoder, base.backbone)
     assert (config.bev_grid.rows, config.channels) == (base.bev_grid.rows, base.channels)
@@ -88,7 +87,7 @@ def test_every_preset_gives_a_model_with_its_own_layers(preset: str, tmp_path: P
 
 def test_toml_keeps_texts_numbers_and_names_with_dots() -> None:
     table = {"a": 'Zug "1" ü', "b": [1, 2.5], "c": True, "d.e": {"f": 1e-4, "g": {"h": ["x"]}}}
-    assert tomllib.loads(_toml(table)) == table
+    assert tomllib.loads(as_toml(table)) == table
 
 
 def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_path: Path) -> None:

@@ -57,52 +57,26 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.sequences.nuscenes import NuScenesOptions
-    from bevcli.workshop.batch.job import Job, all_own_options, find_drives, read_list, with_absolute_paths
-    from bevcli.workshop.batch.storage import is_url
+    from bevcli.cli.progress import load_with_bar
+    from bevcli.workshop.batch.batch import prepare_batch
 
-    texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]
     if options.retry_failed and not options.resume:
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
-    job = Job(
-        options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
-        with_absolute_paths(model),
-        run=replace(run_options, recording=recording),
-        evaluate=options.evaluate,
-        retries=workers.retries,
-    )
-    loaded = load_for_batch(job, workers, fetch=model.fetch)
-    found, notes = find_drives(texts, NuScenesOptions(format_options["version"], format_options.pop("split")))
-    if loaded.needs_export:
-        notes = (*notes, "the first drive of each number of cameras and image size exports the model, and waits for it")
-    source = source.for_model(loaded.config, temporal=run_options.temporal)
-    job = replace(job, source=source, own=all_own_options(format_options))
+    run_options = replace(run_options, recording=recording)
+    prepared = prepare_batch(drives or [], options, workers, model, run_options, source, format_options, load_with_bar)
     summary = run_with_progress(
-        job, loaded, found, notes, workers, resume=options.resume, retry_failed=options.retry_failed
+        prepared.job,
+        prepared.model,
+        prepared.drives,
+        prepared.notes,
+        workers,
+        resume=options.resume,
+        retry_failed=options.retry_failed,
     )
     say(summary.table())
     if summary.failed:
         say("some drives failed; `--resume --retry-failed` runs them again", err=True)
         raise typer.Exit(SOME_FAILED)
-
-
-def load_for_batch(job: "Job", workers: Workers, *, fetch: bool = False) -> "Model":
-    """The model, loaded before the batch, so that a mistake in it ends the command at once. Raises BevcliError.
-
-    The batch needs its hash; only a worker in this process runs it. fetch: download weights that are missing.
-    """
-    from bevcli.cli.progress import load_with_bar
-    from bevcli.inference.load import choose_device
-    from bevcli.workshop.batch.worker import use_threads
-
-    alone, device = workers.in_this_process, job.model.device
-    if alone and workers.threads is not None:
-        use_threads(workers.threads)
-    if alone and workers.gpus == 0 and device == "auto":
-        device = "cpu"
-    if workers.address is None:
-        choose_device(device)
-    return load_with_bar(replace(job.model, device=device if alone else "cpu", fetch=fetch))
 
 
 def run_with_progress(
@@ -176,7 +150,9 @@ def reproduce(
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
     question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
+    from bevcli.cli.progress import load_with_bar
     from bevcli.published import named_weights
+    from bevcli.workshop.batch.batch import model_for_batch
     from bevcli.workshop.batch.job import Job, all_own_options, find_drives, with_absolute_paths
     from bevcli.workshop.batch.report import METRICS
 
@@ -199,7 +175,7 @@ def reproduce(
         evaluate=True,
         retries=workers.retries,
     )
-    loaded = load_for_batch(job, workers)
+    loaded = model_for_batch(job, workers, load_with_bar)
     job = replace(job, source=SequenceOptions().for_model(loaded.config, temporal=run_options.temporal))
     summary = run_with_progress(job, loaded, drives, notes, workers, resume=options.resume, retry_failed=options.resume)
     if not any(record.get("scores") for record in summary.records):

@@ -34,30 +34,14 @@ def export_onnx(
     an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
     docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.errors import BevcliError
     from bevcli.inference.load import load_model
-    from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.export_onnx import export_onnx as write_onnx
     from bevcli.workshop.engines.exported import check_exported, difference_lines
+    from bevcli.workshop.engines.write_model import write_model
 
     loaded = load_model(model, options=replace(model_options, device="cpu"))
-    loaded.require_parts("bevcli export-onnx")
-    if options.rig is not None:
-        if options.cameras is not None:
-            raise BevcliError("`rig` states the number of cameras: leave `cameras` out")
-        rig = read_calibration(options.rig)
-        loaded, options = loaded.for_rig(rig), replace(options, cameras=len(rig.cameras))
-    target = file.target(Path(f"{loaded.name}.onnx"))
     drive = None if options.check is None else open_sequence(options.check, rate_hz=loaded.config.rate_hz)
-    write_onnx(
-        loaded.network,
-        target,
-        options,
-        contents=loaded.contents(),
-        untrained=loaded.untrained,
-        bundled=loaded.bundled,
-    )
+    target, loaded = write_model(loaded, file, options)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
         say("\n".join(difference_lines(list(check_exported(target, loaded, drive)))))
@@ -102,18 +86,16 @@ def quantize(
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.export_onnx import calibration_images, quantize as write_quantized
     from bevcli.workshop.engines.exported import check_exported, difference_lines, load_exported
+    from bevcli.workshop.engines.write_model import write_quantized
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
     engine = model_options.engine or FILE_ENGINE
-    network = load_exported(model, engine)
-    config = network.config
-    target = file.target(model.with_name(f"{model.stem}-int8.onnx"))
-    drives = [open_sequence(path, rate_hz=config.rate_hz) for path in options.calibrate]
-    drive = None if options.check is None else open_sequence(options.check, rate_hz=config.rate_hz)
-    write_quantized(model, calibration_images(config, network.cameras, drives, options.frames), target)
+    drive = None
+    if options.check is not None:
+        drive = open_sequence(options.check, rate_hz=load_exported(model, engine).config.rate_hz)
+    target = write_quantized(model, options.calibrate, options.frames, engine, file)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
         say("\n".join(difference_lines(list(check_exported(target, model, drive, engine)))))

@@ -1,14 +1,15 @@
 """`bevcli convert`: writes any input as a drive of another format."""
 
-import os
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
-from bevcli.printing import counted, say
+from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.formats import LabelOptions, WriteOptions
+
+if TYPE_CHECKING:
+    from bevcli.frame import Frame
 
 PANEL = "Start"
 
@@ -27,42 +28,17 @@ def convert(
     Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
     from bevcli.cli.progress import Progress
-    from bevcli.errors import OutputError
-    from bevcli.geometry.boxes import IMPOSSIBLE
-    from bevcli.registry import load
-    from bevcli.sequences.images import no_image_error
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.formats.labels import WithLabels
-    from bevcli.workshop.formats.output import GROUP, open_writer
+    from bevcli.workshop.formats.convert import drive_to_convert, write_drive
 
-    if Path(os.path.realpath(input)).is_relative_to(os.path.realpath(out)):
-        raise OutputError(f"{out}: contains the input: choose another path")
-    sequence = open_sequence(input, replace(options, ego_motion="optional"), **format_options)
-    if labels.labels is not None:
-        sequence = WithLabels(sequence, labels.labels, labels)
-    count = len(sequence.stamps)
-    gaps, left_out = 0, set[str]()
-    images, boxes, reasons = 0, 0, dict[str, str]()
-    with (
-        open_writer(out, sequence, written) as writer,
-        Progress(count, "frames", sequence.notes) as progress,
-    ):
-        for index in range(count):
-            frame = sequence.load(index)
-            for camera, reason in frame.dropped.items():
-                progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
-            gaps += len(frame.dropped)
-            reasons |= frame.dropped
-            images, boxes = images + len(frame.images), boxes + frame.impossible_boxes
-            writer.write(frame)
-            left_out |= load(GROUP, written.form).left_out(frame)
-            progress.advance()
-        if not images:
-            raise no_image_error(sequence.name, reasons.items())
-    if boxes:
-        say(f"note: {counted(boxes, 'boxes')} of the ground truth {IMPOSSIBLE}", err=True)
-    if left_out:
-        name = load(GROUP, written.form).name
-        say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)
-    missing = f", {counted(gaps, 'images')} missing" if gaps else ""
-    say(f"{out}: {counted(count, 'frames')}, {counted(len(frame.rig.cameras), 'cameras')}{missing}")
+    sequence = drive_to_convert(input, out, options, labels, format_options)
+
+    def show(frame: "Frame") -> None:
+        for camera, reason in frame.dropped.items():
+            progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
+        progress.advance()
+
+    with Progress(len(sequence.stamps), "frames", sequence.notes) as progress:
+        converted = write_drive(sequence, out, written, show)
+    for note in converted.notes:
+        say(f"note: {note}", err=True)
+    say(str(converted))

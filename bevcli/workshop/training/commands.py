@@ -77,11 +77,11 @@ def _run(trainer: "Trainer") -> None:
     """Train in the process that prints. Raises typer.Exit after a stop."""
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
+    from bevcli.workshop.training.train import check_steps_left
 
+    check_steps_left(trainer)
     job, first = trainer.job, trainer.done
     updates, steps = job.config.clips.updates, job.config.steps - first
-    if steps < 0:
-        raise InputError(f"{job.out}: has done {first} steps already (expected at most `steps={job.config.steps}`)")
 
     def after_update(loss: float) -> None:
         progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
@@ -125,25 +125,11 @@ def validate(
     """
     from bevcli.cli.progress import Progress
     from bevcli.inference.load import load_model
-    from bevcli.workshop.synth.drives import count_frames, scored_drives
-    from bevcli.workshop.training.job import rig_for_drives
-    from bevcli.workshop.training.validation import check_scored_drives, validate as validate_model
+    from bevcli.workshop.synth.drives import count_frames
+    from bevcli.workshop.training.train import drives_to_score, score_drives
 
     loaded = load_model(model, options=model_options)
-    rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
-    drives = scored_drives(drive_options, loaded.config, rig)
-    notes = check_scored_drives(drive_options, drives, loaded.config)
-    if loaded.needs_export:
-        drive = drives.open(0)
-        loaded = loaded.in_engine(drive.rig, drive, report=print_note)
-        notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
-    runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
+    drives, notes, loaded = drives_to_score(loaded, model or loaded.name, drive_options, options, print_note)
     with Progress(count_frames(drives), "frames", notes) as progress:
-        scores = validate_model(
-            runner,
-            drives,
-            options.max_range,
-            after_frame=progress.advance,
-            each_drive=options.each,
-        )
+        scores = score_drives(loaded, drives, options, temporal=run_options.temporal, after_frame=progress.advance)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")

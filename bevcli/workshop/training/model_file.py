@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import json
 import math
 import re
 import tempfile
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bevcli.config import TRAINING, load_config, read_model_file
+from bevcli.config import TRAINING, as_toml, load_config, read_model_file
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
@@ -272,7 +271,7 @@ def write_model_file(
             table[TRAINING]["clips"]["batch"] = batch
             cost = _cost_of(table, device, data, longest_s)
     lines += [f"Cost, measured on this machine: {cost}.", f"In this file {cost.config.clips}."]
-    text = "\n".join([*(f"# {line}" for line in lines), _toml(table)])
+    text = "\n".join([*(f"# {line}" for line in lines), as_toml(table)])
     write_whole(path, text.encode(), parents=True)
     return lines
 
@@ -280,7 +279,7 @@ def write_model_file(
 def _cost_of(table: Mapping[str, Any], device: torch.device, data: DriveOptions, longest_s: float) -> "Cost":
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "model.toml"
-        trial.write_text(_toml(table), encoding="utf-8")
+        trial.write_text(as_toml(table), encoding="utf-8")
         job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
         return measure_cost(job, longest_s)
 
@@ -324,25 +323,6 @@ def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
     yield f"{INSIDE_PERCENT:g} % of the boxes are within {facts.reach_m:.1f} m ahead and to the sides: {cells}."
     if 0 < facts.map_reach_m < half:
         yield f"Maps reach {facts.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
-
-
-def _toml(table: Mapping[str, Any], prefix: str = "") -> str:
-    """A table as TOML: its values first, then the tables in it."""
-    lines = [f"{_key(key)} = {_json(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            name = f"{prefix}{_key(key)}"
-            lines += ["", f"[{name}]", _toml(value, f"{name}.").rstrip("\n")]
-    return "\n".join(lines) + "\n"
-
-
-def _json(value: Any) -> str:
-    """A text, number, truth value or list in TOML, which writes these as JSON does."""
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _json(name)
 
 
 class _EnoughMeasured(Exception):

@@ -38,6 +38,8 @@ FORMAT = "bevcli-training/1"
 # What PyTorch raises for contents that belong to another model.
 _DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
+WEIGHTS = "weights.safetensors"  # in the output folder
+
 
 def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
     """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone.
@@ -265,7 +267,7 @@ class Trainer:
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
-        save_weights(job.out / "weights.safetensors", model, dtype)
+        save_weights(job.out / WEIGHTS, model, dtype)
         draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 

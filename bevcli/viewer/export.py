@@ -1,0 +1,57 @@
+"""`export`: write the boxes of a run, a boxes file or a recording in another format."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bevcli.evaluation import ExportOptions
+from bevcli.evaluation.box_format import BoxFormat
+from bevcli.options import gather
+from bevcli.registry import load_form
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
+from bevcli.viewer.recording_file import open_recording
+from bevcli.viewer.recording_reader import read_recording
+from bevcli.writing import check_output
+
+
+def export(
+    predictions: str | Path,
+    options: ExportOptions | None = None,
+    *,
+    report: Callable[[str], None] = lambda note: None,
+    **changes: Any,
+) -> tuple[Path, str]:
+    """Write boxes as a table, a boxes file, KITTI labels or a nuScenes submission, as `bevcli export` does.
+
+        bevcli.export("runs/first", form="csv")
+
+    Args:
+        predictions: predictions.json, ground_truth.json, the folder of a run, or a recording, whose shown boxes are
+            written.
+        options: see `ExportOptions`; or as keywords.
+        report: called with a note where a recording is incomplete.
+        changes: the options as keywords: `form` ("csv", "json", "kitti", "nuscenes", "nuscenes-tracking"), `out`,
+            `score`, `calibration` and `camera`.
+
+    Returns the file or folder, and what was written, such as "20 boxes".
+
+    Raises InputError for predictions that cannot be read or that the format cannot hold, and OutputError.
+    """
+    given = Path(predictions)
+    chosen = gather(ExportOptions, options, changes)
+    form: BoxFormat = load_form("bevcli.box_formats", chosen.form)
+    file = given / "predictions.json" if given.is_dir() else given
+    target = chosen.out or file.parent / form.target
+    check_output(target, file)
+    boxes = above_score(_boxes_of(file, report), chosen.score)
+    return target, form.write(boxes, target, chosen, file)
+
+
+def _boxes_of(file: Path, report: Callable[[str], None]) -> BoxesFile:
+    """The boxes of a boxes file or of a recording."""
+    if file.suffix.lower() != ".rrd":
+        return read_boxes(file)
+    with open_recording(file) as whole:
+        if whole != file:
+            report(f"{file} is incomplete (its run was stopped or is still going)")
+        return read_recording(whole)

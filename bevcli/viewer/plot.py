@@ -1,0 +1,155 @@
+"""Draws a prediction: the images of its frame with the boxes, and the map from above, as one image."""
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame, Prediction
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.object_classes import Color
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.recording import entities
+from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_colors
+from bevcli.recording.log_boxes import MOVING_M_S, box_colors
+from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
+from bevcli.recording.log_static import bev_image_points, default_vehicle, range_lines
+from bevcli.viewer.video import (
+    BACKGROUND,
+    BEV_MARGIN,
+    BEV_SIDE,
+    CAMERAS_HEIGHT,
+    CAMERAS_WIDTH,
+    FAR,
+    HEIGHT,
+    SUBPIXEL_BITS,
+    TEXT,
+    WARNING,
+    WIDTH,
+    Canvas,
+    draw_entry,
+    draw_text,
+    draw_title,
+    tiles_of,
+)
+
+TOP = (4, 5, 6, 7, 4)  # corners of a box, around its top
+UNTRAINED = "UNTRAINED WEIGHTS: boxes are meaningless"
+LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
+
+
+def plot(prediction: Prediction, image: str | None, score: float, color_order: Literal["bgr", "rgb"]) -> Canvas:
+    """See `Prediction.plot`."""
+    frame, boxes = prediction.frame, prediction.boxes.scored(score)
+    if color_order not in ("bgr", "rgb"):
+        raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
+    if frame is None:
+        raise InputError("the prediction has no frame, whose images `plot` draws: predict it anew, or set `frame`")
+    if image is not None and image not in frame.rig.names:
+        raise InputError(f"`image={image}`: is not a camera of the rig (it has {', '.join(frame.rig.names)})")
+    colors = class_colors(prediction.object_classes.values())
+    if image is None:
+        drawn = _whole(prediction, frame, boxes, colors)
+    else:
+        camera = frame.rig[image]
+        drawn = _camera_image(prediction, frame, boxes, colors, camera, camera.width, camera.height)
+    return drawn if color_order == "bgr" else np.ascontiguousarray(drawn[..., ::-1])
+
+
+def _whole(prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color]) -> Canvas:
+    canvas = np.full((HEIGHT, WIDTH, 3), BACKGROUND, dtype=np.uint8)
+    sizes = {camera.name: (camera.width, camera.height) for camera in frame.rig.cameras}
+    for tile in tiles_of(sizes, {camera.name: camera.yaw for camera in frame.rig.cameras}):
+        drawn = _camera_image(prediction, frame, boxes, colors, frame.rig[tile.camera], tile.width, tile.height)
+        canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width] = drawn
+    _draw_from_above(canvas[:, CAMERAS_WIDTH:], prediction, frame, boxes, colors)
+    _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], prediction, boxes, colors)
+    return canvas
+
+
+def _camera_image(
+    prediction: Prediction,
+    frame: Frame,
+    boxes: Boxes3D,
+    colors: dict[str, Color],
+    camera: Camera,
+    width: int,
+    height: int,
+) -> Canvas:
+    """The image of a camera in some size with the boxes, (height, width, 3)."""
+    scaled = camera.scaled(width / camera.width, height / camera.height)
+    image = frame.images.get(camera.name)
+    canvas = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
+    if image is not None:
+        canvas[:] = cv2.resize(image.pixels_bgr, (width, height), interpolation=cv2.INTER_AREA)
+    world_from_camera = frame.world_from_ego_at[camera.name].matrix @ camera.ego_from_camera
+    posed = PosedCamera(scaled, world_from_camera, inverse(world_from_camera))
+    world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
+    [lines] = lines_in_images(boxes.transformed(world_from_bev).corners(), [posed])
+    own, texts = box_colors(boxes, colors), box_labels(boxes)
+    for box in np.unique(lines.owners):
+        _draw_lines(canvas, lines.segments[lines.owners == box], own[box], 1 + width // 800)
+    size = max(0.36, width * LABEL_SHARE)
+    for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
+        draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own[box]), size, centered=True)
+    draw_title(canvas, camera.name, has_image=image is not None)
+    if prediction.untrained:
+        draw_text(canvas, UNTRAINED, (width // 2, height - 14), WARNING, 0.42, centered=True)
+    return canvas
+
+
+def _draw_from_above(
+    canvas: Canvas, prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color]
+) -> None:
+    """The map, range rings, boxes with their velocities, and the vehicle, in the bev frame."""
+    grid, rings = prediction.grid, range_lines(frame.rig, prediction.grid)
+    reach = BEV_MARGIN * max(np.abs([*grid.x_range_m, *grid.y_range_m]))
+
+    def to_canvas(points: Array) -> Array:
+        return np.clip((points / reach + 1) * BEV_SIDE / 2, -FAR, FAR)
+
+    if prediction.segmentation is not None:
+        (left, right), (low, high) = prediction.segmentation.x_range_m, prediction.segmentation.y_range_m
+        (x0, y0), (x1, y1) = to_canvas(np.array([[left, -high], [right, -low]])).round().astype(int)
+        palette = map_colors(prediction.segmentation.classes)
+        area = prediction.segmentation.painted(palette, entities.BACKGROUND)[..., ::-1]
+        canvas[y0:y1, x0:x1] = cv2.resize(area, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
+    for ring in rings:
+        _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, ring))[None], RING_COLOR)
+    corners, own = boxes.corners()[..., :2] * (1, -1), box_colors(boxes, colors)
+    for index in reversed(range(len(boxes))):  # the best ones lie on top
+        _draw_lines(canvas, to_canvas(corners[index][[TOP]]), own[index], 2)
+        velocity = boxes.velocities[index] * (1, -1)
+        if np.linalg.norm(velocity) > MOVING_M_S:  # not of NaN
+            start = boxes.centers[index, :2] * (1, -1)
+            tail, tip = to_canvas(np.stack([start, start + velocity])).astype(int).tolist()
+            cv2.arrowedLine(canvas, tail, tip, _bgr(own[index]), 1, cv2.LINE_AA, 0, 0.25)
+    for strip in default_vehicle().top_view:
+        _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, strip))[None], EGO_COLOR, 2)
+
+
+def _draw_legend(canvas: Canvas, prediction: Prediction, boxes: Boxes3D, colors: dict[str, Color]) -> None:
+    scene = f"{prediction.stamp.scene}   " if prediction.stamp.scene else ""
+    draw_text(canvas, f"{scene}frame {prediction.stamp.index}", (16, 24), TEXT, 0.6)
+    draw_text(canvas, prediction.failure, (250, 24), WARNING, 0.45)
+    counts = boxes.classes.tolist()
+    entries = [(color, f"{name.replace('_', ' ')} {counts.count(name)}") for name, color in colors.items()]
+    if prediction.segmentation is not None:
+        maps = map_colors(prediction.segmentation.classes).items()
+        entries += [(color, f"map: {name.replace('_', ' ')}") for name, color in maps]
+    for index, (color, text) in enumerate(entries[:15]):
+        draw_entry(canvas, (16 + 250 * (index % 5), 60 + 32 * (index // 5)), color, text)
+
+
+def _draw_lines(canvas: Canvas, lines: Array, color: Color | NDArray[np.uint8], thickness: int = 1) -> None:
+    """Lines (M, P, 2) in pixels. color: RGB."""
+    points = np.round(lines * (1 << SUBPIXEL_BITS)).astype(np.int32)
+    cv2.polylines(canvas, list(points), False, _bgr(color), thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _bgr(color: Color | NDArray[np.uint8]) -> Color:
+    red, green, blue = map(int, color)
+    return blue, green, red

@@ -1,0 +1,69 @@
+"""The model file of weights that fit a known model but for its classes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from bevcli.checkpoints import Checkpoint, difference, expected_state, read_checkpoint
+from bevcli.config import as_toml, config_of_table, load_config, read_model_file
+from bevcli.errors import OutputError, WeightsError
+from bevcli.model.config import ModelConfig
+from bevcli.options import gather
+from bevcli.printing import counted
+from bevcli.weights.options import ModelFileOptions
+from bevcli.writing import write_whole
+
+
+def model_file_for(
+    weights: str | Path, out: str | Path, options: ModelFileOptions | None = None, **changes: Any
+) -> tuple[ModelConfig, str]:
+    """Write the model file of weights that fit a known model but for the number or names of its classes.
+
+    Args:
+        weights: a .pth or a .safetensors.
+        out: the FILE.toml to write; its name is that of the model.
+        options: see `ModelFileOptions`.
+        changes: options as keywords: `classes` and `force`.
+
+    Returns its configuration, and the name of the known model.
+
+    Raises:
+        WeightsError: the weights cannot be read, differ in more than the classes, or do not name these.
+        OutputError: the file exists, has another ending, or cannot be written.
+        ConfigError: a name is no name of a class, or stands there twice.
+    """
+    chosen = gather(ModelFileOptions, options, changes)
+    path, checkpoint = Path(out), read_checkpoint(Path(weights))
+    if path.suffix != ".toml":
+        raise OutputError(f"{path}: expected a file name that ends in .toml")
+    if path.exists() and not chosen.force:
+        raise OutputError(f"{path}: already exists; choose another name, or pass `force=True` to overwrite it")
+    model = checkpoint.nearest
+    names = chosen.classes or _stated(checkpoint)
+    known = load_config(model)
+    count = len(known.classes) if checkpoint.models else checkpoint.own_classes
+    if count is None:
+        other = difference(checkpoint.state, expected_state(known), len(known.classes))
+        raise WeightsError(f"{weights}: differs from {model}, the nearest known model, in more than classes: {other}")
+    if len(names) != count:
+        found = counted(len(names), "names") if names else "none"
+        raise WeightsError(
+            f"{weights}: has {counted(count, 'classes')}: pass their names in the order of the training as "
+            f"`classes=NAME,NAME` (found {found})"
+        )
+    contents = read_model_file(model)[0] | {"name": path.stem, "classes": list(names)}
+    settings = contents.get("class_settings", {})
+    contents["class_settings"] = {name: settings[name] for name in names if name in settings}
+    config = config_of_table(contents, str(path))
+    text = f"# {model} with other classes, for the weights {Path(weights).name}.\n{as_toml(contents)}"
+    write_whole(path, text.encode())
+    return config, model
+
+
+def _stated(checkpoint: Checkpoint) -> tuple[str, ...]:
+    """The classes that the metadata of weights name; else none."""
+    try:
+        stated = json.loads(checkpoint.facts.get("classes", "[]"))
+    except ValueError:
+        return ()
+    return tuple(map(str, stated)) if isinstance(stated, list) else ()

@@ -1,0 +1,99 @@
+"""`convert`: write any input as a drive of another format."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bevcli.errors import OutputError
+from bevcli.frame import Frame, Sequence
+from bevcli.geometry.boxes import IMPOSSIBLE
+from bevcli.options import spread
+from bevcli.printing import counted
+from bevcli.registry import load
+from bevcli.sequences.images import no_image_error
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.formats import LabelOptions, WriteOptions
+from bevcli.workshop.formats.labels import WithLabels
+from bevcli.workshop.formats.output import GROUP, open_writer
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A drive that was written. Its text is one line.
+
+    Attributes:
+        out: the folder or file.
+        frames: their number.
+        cameras: their number.
+        missing: number of images that were missing.
+        notes: what was left out, one line each.
+    """
+
+    out: Path
+    frames: int
+    cameras: int
+    missing: int
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        missing = f", {counted(self.missing, 'images')} missing" if self.missing else ""
+        return f"{self.out}: {counted(self.frames, 'frames')}, {counted(self.cameras, 'cameras')}{missing}"
+
+
+def convert(
+    source: str | Path, out: str | Path, *, on_frame: Callable[[Frame], None] = lambda frame: None, **options: Any
+) -> Converted:
+    """Write any input as a native sequence folder, or as a drive of another format, as `bevcli convert` does.
+
+        bevcli.convert("drive.mcap", "drive", calibration="calibration.json")
+        bevcli.convert("samples/street", "street.mcap", form="mcap")
+
+    Args:
+        source: an input of `open_sequence`.
+        out: the folder or file to write.
+        on_frame: called after each frame.
+        options: those of `WriteOptions` (`form`, `force`, …), of `LabelOptions`, and of `open_sequence`.
+
+    Raises:
+        InputError: see `open_sequence`; or not one image could be read.
+        OutputError: something is there already, or it cannot be written.
+    """
+    common, labels, written, own = spread(options, SequenceOptions, LabelOptions, WriteOptions)
+    sequence = drive_to_convert(Path(source), Path(out), common, labels, own)
+    return write_drive(sequence, Path(out), written, on_frame)
+
+
+def drive_to_convert(
+    source: Path, out: Path, common: SequenceOptions, labels: LabelOptions, own: dict[str, Any]
+) -> Sequence:
+    """The drive that is to be written, with its labels. own: options of its format by name."""
+    if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
+        raise OutputError(f"{out}: contains the input: choose another path")
+    sequence = open_sequence(source, replace(common, ego_motion="optional"), **own)
+    return sequence if labels.labels is None else WithLabels(sequence, labels.labels, labels)
+
+
+def write_drive(
+    sequence: Sequence, out: Path, written: WriteOptions, on_frame: Callable[[Frame], None] = lambda frame: None
+) -> Converted:
+    """Write a drive, see `convert`."""
+    gaps, images, boxes = 0, 0, 0
+    left_out, reasons = set[str](), dict[str, str]()
+    with open_writer(out, sequence, written) as writer:
+        form = load(GROUP, written.form)
+        for place in range(len(sequence.stamps)):
+            frame = sequence.load(place)
+            gaps, reasons = gaps + len(frame.dropped), reasons | dict(frame.dropped)
+            images, boxes = images + len(frame.images), boxes + frame.impossible_boxes
+            writer.write(frame)
+            left_out |= form.left_out(frame)
+            on_frame(frame)
+        if not images:
+            raise no_image_error(sequence.name, reasons.items())
+    notes = [f"{counted(boxes, 'boxes')} of the ground truth {IMPOSSIBLE}"] if boxes else []
+    if left_out:
+        notes.append(f"{form.name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out")
+    return Converted(out, len(sequence.stamps), len(frame.rig.cameras), gaps, tuple(notes))

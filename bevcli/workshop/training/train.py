@@ -1,0 +1,128 @@
+"""`train` and `validate` as functions with the options of the commands as keywords."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bevcli.errors import InputError
+from bevcli.inference.load import Model, choose_device, load_model
+from bevcli.inference.options import ModelOptions
+from bevcli.options import refuse, spread
+from bevcli.workshop.synth.drives import Drives, scored_drives
+from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training.job import leave_process_group, prepare_training, rig_for_drives
+from bevcli.workshop.training.options import TrainOptions, ValidationOptions
+from bevcli.workshop.training.trainer import WEIGHTS, Trainer
+from bevcli.workshop.training.validation import Validation, check_scored_drives, validate as validate_runner
+
+Report = Callable[[str], None]
+
+
+def train(
+    model: str | Path,
+    *,
+    device: str = "auto",
+    report: Report = lambda note: None,
+    after_step: Callable[[], None] = lambda: None,
+    after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
+    should_stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> Path:
+    """Train a model as `bevcli train` does; return the file of its weights.
+
+        weights = bevcli.train("my.toml", data=["drives/a", "drives/b"], out="runs/mine", steps=2000)
+        model = bevcli.load_model("my.toml", weights=weights)
+
+    Args:
+        model: a model name or a FILE.toml, whose training table holds the settings.
+        device: "auto", "cpu", "cuda" and so on.
+        report: called with notes on the drives, and with what is loaded of earlier weights.
+        after_step: called after each step.
+        after_validation: called with the number of steps done and the scores.
+        should_stop: asked after each step; True writes a checkpoint and ends the training, which `resume` continues.
+        options: those of `TrainOptions` (`out`, `steps`, `weights`, `resume`, …) and of `DriveOptions` (`data`,
+            `rendered`, `split`, `class_map`).
+
+    Raises:
+        InputError: a drive or a setting is wrong.
+        WeightsError: the weights to start from cannot be read or do not fit.
+        OutputError: the folder holds another training, is in use, or cannot be written.
+    """
+    chosen, drives, left = spread(options, TrainOptions, DriveOptions)
+    refuse(left, "train", TrainOptions, DriveOptions)
+    torch.manual_seed(chosen.seed)
+    job = prepare_training(str(model), choose_device(device), drives, chosen)
+    with job.lock:
+        trainer = Trainer(job, resume=chosen.resume)
+        check_steps_left(trainer)
+        for note in (*job.notes, *job.changed_settings(), *(start.table() for start in job.warm_starts)):
+            report(note)
+        trainer.run(after_step, after_validation, should_stop)
+    leave_process_group(job.group)
+    return job.out / WEIGHTS
+
+
+def check_steps_left(trainer: Trainer) -> None:
+    """Raise InputError where a resumed training has done more steps than it is to do."""
+    job = trainer.job
+    if trainer.done > job.config.steps:
+        found = f"has done {trainer.done} steps already (expected at most `steps={job.config.steps}`)"
+        raise InputError(f"{job.out}: {found}")
+
+
+def validate(
+    model: Model | str | Path | None = None,
+    *,
+    temporal: bool = True,
+    report: Report = lambda note: None,
+    after_frame: Callable[[], None] = lambda: None,
+    **options: Any,
+) -> Validation:
+    """Score a model on drives with ground truth, all drives together, as `bevcli validate` does.
+
+        scores = bevcli.validate("demo", data="samples/street")
+        print(scores.table())
+
+    Args:
+        model: a `Model`, or what `load_model` takes.
+        temporal: use the frames before (and after).
+        report: called with notes on the drives.
+        after_frame: called after each frame.
+        options: those of `DriveOptions` (`data`, `rendered`, …) and `ValidationOptions` (`rig`, `max_range`,
+            `tracking`, `each`); and of `ModelOptions` (`weights`, `device`, `engine`, …), where `model` is no `Model`.
+
+    Raises InputError for a drive that cannot be read or has no ground truth, and what `load_model` raises.
+    """
+    of_model = () if isinstance(model, Model) else (ModelOptions,)
+    drives, chosen, *model_options, left = spread(options, DriveOptions, ValidationOptions, *of_model)
+    refuse(left, "validate", DriveOptions, ValidationOptions, *of_model)
+    loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
+    name = loaded.name if model is None or isinstance(model, Model) else str(model)
+    found, notes, loaded = drives_to_score(loaded, name, drives, chosen, report)
+    for note in notes:
+        report(note)
+    return score_drives(loaded, found, chosen, temporal=temporal, after_frame=after_frame)
+
+
+def drives_to_score(
+    model: Model, name: str, drive_options: DriveOptions, options: ValidationOptions, report: Report
+) -> tuple[Drives, tuple[str, ...], Model]:
+    """The drives of a validation, notes on them, and the model in its engine. name: of the model, or its file."""
+    rig = None if options.rig is None else rig_for_drives(options.rig, name)
+    drives = scored_drives(drive_options, model.config, rig)
+    notes = check_scored_drives(drive_options, drives, model.config)
+    if model.needs_export:
+        drive = drives.open(0)
+        model = model.in_engine(drive.rig, drive, report=report)
+        notes = (*notes, model.engine_note) if model.engine_note else notes
+    return drives, notes, model
+
+
+def score_drives(
+    model: Model, drives: Drives, options: ValidationOptions, *, temporal: bool, after_frame: Callable[[], None]
+) -> Validation:
+    """Run a model over drives and score them."""
+    runner = model.runner(track=options.tracking, temporal=temporal)
+    return validate_runner(runner, drives, options.max_range, after_frame=after_frame, each_drive=options.each)
