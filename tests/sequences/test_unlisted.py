@@ -139,6 +139,16 @@ def test_the_poses_decide_between_two_readings(drive):
     assert seconds(sequence)[:3] == [0, 1, 2]
 
 
+def test_numbered_images_with_poses_without_times_need_a_rate(drive):
+    (drive / "ego_motion.csv").unlink()
+    (drive / "kitti.txt").write_text("\n".join(f"1 0 0 {n} 0 1 0 0 0 0 1 0" for n in range(5)))
+    images(drive, both([f"{n:06d}" for n in range(5)]))
+    poses_of = {"ego_motion_file": drive / "kitti.txt", "poses_of": "vehicle"}
+    with pytest.raises(InputError, match=r"numbered 0 to 4, and there are poses: state .* by `image_rate_hz`$"):
+        open_sequence(drive, **poses_of)
+    assert seconds(open_sequence(drive, image_rate_hz=10, **poses_of)) == [0, 0.1, 0.2, 0.3, 0.4]
+
+
 def test_local_dates_are_moved_to_the_time_of_the_poses(drive):
     """The clock of the images shows 14:00 where the poses, since 1970, begin at 12:00 in UTC."""
     poses(drive, START_S)

@@ -62,7 +62,8 @@ class FolderSequence(ListedSequence):
         if not entries:
             from bevcli.sequences.native.unlisted import covered, find_frames
 
-            found = find_frames(path, rig.names, own, None if poses is None else poses.motion)
+            motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
+            found = find_frames(path, rig.names, own, motion, has_poses=has_poses)
             poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(found[0])))
             entries, self.understood = found if poses.motion is None else covered(found, poses.motion)
             advice = "state the time of the first image by `start_ns`, or in timing.toml"

@@ -115,19 +115,22 @@ def find_frames(
     cameras: tuple[str, ...],
     own: FolderOptions = FolderOptions(),
     motion: EgoMotion | None = None,
+    *,
+    has_poses: bool = False,
 ) -> Found:
     """The frames in `images/CAMERA/*`, `CAMERA/*` or `videos/CAMERA.*`, and a note that tells how they were understood.
 
     motion: the poses, which decide where the names of images have two readings. None where they are not known yet.
+    has_poses: there are poses, for which the rate of numbered images must be known.
     Raises InputError if there are no images, or their times are not known.
     """
     timing = read_timing(folder, cameras, own)
     if (folder / "images").is_dir():
-        entries, line = _from_names(folder / "images", timing, motion)
+        entries, line = _from_names(folder / "images", timing, motion, has_poses)
     elif (folder / "videos").is_dir():
         entries, line = _from_videos(folder, timing)
     elif match_names(cameras, _folders(folder)):
-        entries, line = _from_names(folder, timing, motion)
+        entries, line = _from_names(folder, timing, motion, has_poses)
     else:
         raise InputError(
             f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
@@ -154,7 +157,7 @@ def _folders(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.is_dir())
 
 
-def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None) -> Found:
+def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None, has_poses: bool) -> Found:
     """Frames of image files, and what their names were understood as."""
     found = _folders(folder)
     matched = match_names(timing.cameras, found)
@@ -168,7 +171,7 @@ def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None) -> Found
     names = {camera: [path.stem for path in of_camera] for camera, of_camera in paths.items()}
     reading = read_names(folder, names, motion, timing.times)
     if reading.kind == "index":
-        entries, line = _from_indices(folder, paths, reading, timing, motion)
+        entries, line = _from_indices(folder, paths, reading, timing, motion, has_poses)
     else:
         entries, line = _from_times(paths, reading, timing)
     return entries, line + renamed(matched)
@@ -218,13 +221,18 @@ def _missing(missing: int, images: int) -> str:
 
 
 def _from_indices(
-    folder: Path, paths: Mapping[str, list[Path]], reading: Reading, timing: Timing, motion: EgoMotion | None
+    folder: Path,
+    paths: Mapping[str, list[Path]],
+    reading: Reading,
+    timing: Timing,
+    motion: EgoMotion | None,
+    has_poses: bool,
 ) -> Found:
     """Frames of numbered images: each has the images of one number."""
     numbered = {camera: dict(zip(reading.values[camera].tolist(), of, strict=True)) for camera, of in paths.items()}
     numbers = sorted(set().union(*numbered.values()))
     _check_numbers(folder, numbered)
-    times, how = _times_of_indices(folder, numbers, timing, motion)
+    times, how = _times_of_indices(folder, numbers, timing, motion, has_poses)
     entries, missing = [], 0
     for number, time in zip(numbers, times, strict=True):
         there = {camera: of[number] for camera, of in numbered.items() if number in of}
@@ -249,7 +257,7 @@ def _check_numbers(folder: Path, numbered: Mapping[str, Mapping[int, Path]]) -> 
 
 
 def _times_of_indices(
-    folder: Path, numbers: list[int], timing: Timing, motion: EgoMotion | None
+    folder: Path, numbers: list[int], timing: Timing, motion: EgoMotion | None, has_poses: bool
 ) -> tuple[list[int], str]:
     """The time of each number, ns, and where it comes from. As many poses as numbers are the poses of the images."""
     first, count = numbers[0], numbers[-1] - numbers[0] + 1
@@ -258,11 +266,15 @@ def _times_of_indices(
         times = motion.timestamps_ns.tolist()
         rate = 1e9 / float(np.median(np.diff(motion.timestamps_ns)))
         return [times[number - first] for number in numbers], f"with the times of the {count} poses ({rate:.1f} Hz)"
-    if rate is None and motion is not None:
+    if rate is None and has_poses:
+        cover, also = "there are poses", ""
+        if motion is not None:
+            seconds = (motion.last_ns - motion.first_ns) / 1e9
+            cover = f"the poses cover {seconds:.1f} s from {motion.first_ns} ns on"
+            also = ", and the time of the first one by `start_ns`"
         raise InputError(
-            f"{folder}: the images are numbered {first} to {numbers[-1]}, and the poses cover "
-            f"{(motion.last_ns - motion.first_ns) / 1e9:.1f} s from {motion.first_ns} ns on: state the images per "
-            "second by `image_rate_hz`, and the time of the first one by `start_ns`"
+            f"{folder}: the images are numbered {first} to {numbers[-1]}, and {cover}: state the images per second by "
+            f"`image_rate_hz`{also}"
         )
     assumed = "" if rate else " (assumed: state `image_rate_hz`)"
     start, rate = timing.start_ns or 0, rate or ASSUMED_RATE_HZ
