@@ -8,6 +8,7 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.parsing.documents import CSV_BYTES, name_of
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text, size_of_image
+from bevcli.sequences.native.camera_names import match_names
 from bevcli.sequences.videos import size_of_video
 
 LARGEST_IMAGE = 256 * MIB
@@ -56,7 +57,8 @@ def _first_in(folder: Path) -> Path | None:
 
 def size_of_first(drive: Path | None, camera: str) -> tuple[int, int] | None:
     """(width, height) in pixels of a camera's first image; None where it has none that can be read."""
-    path = None if drive is None else first_images(drive).get(camera)
+    found = {} if drive is None else first_images(drive)
+    path = found.get(match_names([camera], found).get(camera, ""))
     if path is None:
         return None
     try:
