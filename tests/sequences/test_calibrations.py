@@ -426,3 +426,13 @@ def test_cameras_and_sizes_are_found_where_the_images_lie(tmp_path):
         [camera] = RigOptions(fov_deg=90, height=1.5).rig(tmp_path / folder).cameras
         assert (camera.name, camera.width, camera.height) == ("front", 64, 36)
         np.testing.assert_allclose(camera.intrinsics, [[32, 0, 31.5], [0, 32, 17.5], [0, 0, 1]])
+
+
+def test_a_size_is_that_of_a_folder_with_a_similar_name(tmp_path):
+    """front is CAM_FRONT."""
+    cameras = {name: {"K": k_of(name).tolist(), "T": pose(name).tolist()} for name in NAMES}
+    for name in NAMES:
+        folder = tmp_path / "drive" / name.removeprefix("CAM_").lower()
+        folder.mkdir(parents=True)
+        (folder / "0.jpg").write_bytes((STREET / f"images/{name}/000000.jpg").read_bytes())
+    assert_is_the_street(read(written(tmp_path, cameras), tmp_path / "drive").rig)

@@ -17,7 +17,7 @@ from bevcli.workshop.formats.calibrations import SEVERAL
 
 
 def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> ListedSequence:
-    """A video as a `Sequence`. Its first image is at time 0. Raises InputError."""
+    """A video as a `Sequence`. Raises InputError."""
     video = video_images(path, own.start_ns or 0, own.image_rate_hz)
     given = own.draft(path)
     if given is None:
@@ -54,4 +54,5 @@ def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> Liste
         notes += ("a video has no poses: no history is used, and boxes are in the ego frame",)
     sequence = ListedSequence(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
+    sequence.facts = replace(given.facts, geo_origin=given.facts.geo_origin or poses.geo_origin)
     return sequence
