@@ -103,9 +103,10 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
     """The boxes of one model. Raises InputError."""
     if isinstance(boxes, str | Path):
         return open_predictions(Path(boxes), class_map)
+    of_one_frame = isinstance(boxes, Boxes3D)
     wrong: list[object] = [each for each in boxes if each is not None and not isinstance(each, Boxes3D)]
-    if isinstance(boxes, Boxes3D) or wrong:
-        found = f"a {type(wrong[0]).__name__}" if wrong else "those of one frame"
+    if of_one_frame or wrong:
+        found = "those of one frame" if of_one_frame else f"a {type(wrong[0]).__name__}"
         raise InputError(
             f"`boxes`: {name}: found {found} (expected a file, or a list with the Boxes3D of each frame in the world "
             "frame)"

@@ -39,9 +39,8 @@ def run_into_folder(
     """Run a model over a sequence and write recording, boxes, tracks, maps and summary.json into a folder.
 
     Whatever ends the run: the files hold all finished frames, summary.json is written, and the state is saved, so that
-    `resume` can go on. A run that an error ends before its first frame with images leaves no files. The files of a
-    killed process hold all finished frames too, predictions.json as predictions.json.partial; its run goes on from the
-    last saved state.
+    `resume` can go on. Bad input before the first frame with images leaves no files. The files of a killed process hold
+    all finished frames too, predictions.json as predictions.json.partial; it goes on from the last saved state.
 
     Args:
         model: of `load_model`.
@@ -96,11 +95,7 @@ def run_into_folder(
                 raise no_image_error(sequence.name, (image[1:] for image in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
-                is_mistake = isinstance(error, BevcliError) and not isinstance(error, OutputError)
-                if is_mistake and summary.frames == len(summary.counts.skipped):
-                    folder.discard()  # so that it does not stand in the way of the corrected run
-                else:
-                    summary.write(out, files.written())
+                _close(folder, summary, files, error)
             if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < done == summary.frames:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
                 message = f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
@@ -108,6 +103,18 @@ def run_into_folder(
             raise
         summary.write(out, files.written())
     return summary
+
+
+def _close(folder: RunFolder, summary: RunSummary, files: RunFiles, error: BaseException) -> None:
+    """Writes the summary of a run that an error ended; or removes a run without frames that bad input ended.
+
+    So that it does not stand in the way of the corrected run.
+    """
+    is_mistake = isinstance(error, BevcliError) and not isinstance(error, OutputError)
+    if is_mistake and summary.frames == len(summary.counts.skipped):
+        folder.discard()
+    else:
+        summary.write(folder.path, files.written())
 
 
 def _state_to_start_from(folder: RunFolder, facts: dict[str, str], model: Model, resume: bool) -> RunState[Any]:
