@@ -24,6 +24,7 @@ SECTIONS = {
     "Run and look": [
         "docs/commands",
         "docs/own-images",
+        "docs/cameras-only",
         "docs/sequence-format",
         "docs/weights",
         "docs/other-inputs",

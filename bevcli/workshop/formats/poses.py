@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
+from bevcli.sequences.native.name_times import SINCE_1970_NS, UNITS_NS, WORDS
+from bevcli.sequences.native.options import TimeKind
 from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
@@ -48,15 +51,12 @@ NAMES = {
     "yaw": rf"{_OF}yaw{_UNIT}",
     "heading": rf"{_OF}(?:heading|course|azimuth|bearing){_UNIT}",
 }  # fmt: skip
-UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-UNIT_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 FASTEST_M_S = 100.0
 COUNTER_CLOCKWISE, CLOCKWISE = "counter-clockwise from x", "clockwise from north"
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
-YEARS_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # times since 1970 are between the years 2000 and 2100
 
 
 @dataclass(frozen=True)
@@ -237,13 +237,12 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
         raise InputError(f"{table.path}: a column of times is missing (expected a name such as {known})")
     values = [_decimal(row) for row in rows]
     stated = _UNIT_OF_NAME.search(name)
-    unit = (
-        drive.stated.pose_times or (stated and (stated[1] or stated[2])) or _unit(table.path, values, positions, drive)
-    )
+    of_name = cast("TimeKind | None", stated and (stated[1] or stated[2]))
+    unit = drive.stated.pose_times or of_name or _unit(table.path, values, positions, drive)
     if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
-        raise InputError(f"{rows[0].path}: the times are too large for {UNIT_WORDS[unit]}: pass `pose_times`")
+        raise InputError(f"{rows[0].path}: the times are too large for {WORDS[unit]}: pass `pose_times`")
     times = np.array([int((value * UNITS_NS[unit]).to_integral_value()) for value in values], dtype=np.int64)
-    return times, UNIT_WORDS[unit] + (" since 1970" if YEARS_NS[0] <= times[0] <= YEARS_NS[1] else "")
+    return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
 
 
 def _decimal(row: CsvRow) -> Decimal:
@@ -265,7 +264,7 @@ def _decimal(row: CsvRow) -> Decimal:
     return value
 
 
-def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePoses) -> str:
+def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePoses) -> TimeKind:
     """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
     units = list(UNITS_NS)
     steps = np.array([float(time - times[0]) for time in times])
@@ -281,10 +280,10 @@ def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePo
         ends = {unit: (times[0] * UNITS_NS[unit], times[-1] * UNITS_NS[unit]) for unit in units}
         covered = {unit: _covered(*ends[unit], drive.times_ns) for unit in units}
         units = [unit for unit in units if covered[unit] == max(covered.values())]
-    recent = [unit for unit in units if YEARS_NS[0] <= times[0] * UNITS_NS[unit] <= YEARS_NS[1]]
+    recent = [unit for unit in units if SINCE_1970_NS[0] <= times[0] * UNITS_NS[unit] <= SINCE_1970_NS[1]]
     units = recent or units
     if len(units) > 1:
-        words = " or ".join(UNIT_WORDS[unit] for unit in units)
+        words = " or ".join(WORDS[unit] for unit in units)
         options = " or ".join(f"`pose_times={unit}`" for unit in units)
         message = f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}"
         raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
