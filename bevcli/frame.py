@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVa
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
@@ -22,6 +23,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MOST_MAP_CLASSES = 8  # a BEV map has one bit for each class
+
+
+ColorOrder = Literal["bgr", "rgb"]
+
+
+def check_color_order(color_order: str) -> None:
+    """Raise InputError for another color order than those of `ColorOrder`."""
+    if color_order not in ("bgr", "rgb"):
+        raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
 
 
 def class_bits(names: Iterable[str]) -> dict[str, int]:
@@ -426,7 +436,7 @@ class Prediction:
         return f"Prediction({', '.join((_named(self.stamp), found, *further))})"
 
     def plot(
-        self, image: str | None = None, *, score: float = 0.25, color_order: Literal["bgr", "rgb"] = "bgr"
+        self, image: str | None = None, *, score: float = 0.25, color_order: ColorOrder = "bgr"
     ) -> NDArray[np.uint8]:
         """The images of the frame with the boxes, and the map from above, as one image (H, W, 3) uint8.
 

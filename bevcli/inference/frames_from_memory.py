@@ -2,16 +2,15 @@
 
 from collections.abc import Mapping
 from operator import index
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage
+from bevcli.frame import CameraImage, ColorOrder
 from bevcli.geometry.cameras import Camera, CameraRig
 
-ColorOrder = Literal["bgr", "rgb"]
 EXAMPLE = 'such as {"CAM_FRONT": image}'
 
 
@@ -28,12 +27,6 @@ def checked_images(
         _check_image(pixels, rig[name])
     turned = images.items() if color_order == "bgr" else ((n, p[..., ::-1]) for n, p in images.items())
     return {name: CameraImage(timestamp_ns, np.ascontiguousarray(pixels)) for name, pixels in turned}
-
-
-def check_color_order(color_order: str) -> None:
-    """Raise InputError for another color order than those of `ColorOrder`."""
-    if color_order not in ("bgr", "rgb"):
-        raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
 
 
 def check_cameras(given: Mapping[str, object], rig: CameraRig, argument: str) -> None:

@@ -18,10 +18,10 @@ from torch import Tensor
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
-from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
+from bevcli.frame import ColorOrder, Frame, FrameStamp, Prediction, Sequence, check_color_order
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.frames_from_memory import ColorOrder, check_color_order, checked_images
+from bevcli.inference.frames_from_memory import checked_images
 from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner, StepOptions

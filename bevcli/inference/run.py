@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp, Prediction, Sequence
+from bevcli.frame import ColorOrder, DriveFacts, Frame, FrameStamp, Prediction, Sequence, check_color_order
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.frames_from_memory import (
-    ColorOrder,
     check_cameras,
-    check_color_order,
     checked_images,
     whole_nanoseconds,
 )

@@ -162,10 +162,8 @@ def _read_folder(
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images by camera of one of its frames."""
     findings: list[Finding] = []
-    outside, own = (
-        bool(given.get("allow_outside")),
-        FolderOptions(**{name: given[name] for name in NAMES & given.keys()}),
-    )
+    outside = bool(given.get("allow_outside"))
+    own = FolderOptions(**{name: given[name] for name in NAMES & given.keys()})
     options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
         sequence = FolderSequence(folder, options, own, rig)

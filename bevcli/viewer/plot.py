@@ -1,13 +1,11 @@
 """Draws a prediction: the images of its frame with the boxes, and the map from above, as one image."""
 
-from typing import Literal
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, Prediction
+from bevcli.frame import ColorOrder, Frame, Prediction, check_color_order
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import Color
@@ -41,11 +39,10 @@ UNTRAINED = "UNTRAINED WEIGHTS: boxes are meaningless"
 LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
 
 
-def plot(prediction: Prediction, image: str | None, score: float, color_order: Literal["bgr", "rgb"]) -> Canvas:
+def plot(prediction: Prediction, image: str | None, score: float, color_order: ColorOrder) -> Canvas:
     """See `Prediction.plot`."""
     frame, boxes = prediction.frame, prediction.boxes.scored(score)
-    if color_order not in ("bgr", "rgb"):
-        raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
+    check_color_order(color_order)
     if frame is None:
         raise InputError("the prediction has no frame, whose images `plot` draws: predict it anew, or set `frame`")
     if image is not None and image not in frame.rig.names:

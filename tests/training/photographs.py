@@ -37,14 +37,14 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, as_toml, load_config, load_table, read_model_file
 from bevcli.inference.load import choose_device, weights_file
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.model.config import ImageConfig
 from bevcli.model.network import Network, build_network
 from bevcli.printing import say
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
-from bevcli.workshop.training.augmentation import RandomisationConfig, randomised
+from bevcli.workshop.training.augmentation import RandomisationConfig, randomised, renormalised
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
 from bevcli.workshop.training.options import TrainOptions
+from bevcli.workshop.training.samples import images_from_bytes, write_bytes
 from bevcli.workshop.training.trainer import Trainer, computes_in_bfloat16, save_weights, update_average
 
 CHANGES = {
@@ -139,32 +139,20 @@ def render(model: Path, seed: int, cache: Path, until_s: float) -> int | None:
     file = images_of(cache.parent, seed)
     if not file.exists():
         demo = load_config("demo")
-        prepare = Preprocessor(demo, threads=1)
+        prepare = Preprocessor(demo, threads=1, write=write_bytes, dtype=np.uint8)
         images = torch.cat(
             [prepare(drive.load(index)).images[0] for index in range(0, len(drive.stamps), FRAMES_APART)]
         )
         file.parent.mkdir(exist_ok=True)
         partial = file.with_suffix(".partial.npy")
-        np.save(partial, as_pixels(images, demo.image).numpy())
+        np.save(partial, images.numpy())
         partial.rename(file)
     return seed
 
 
 def images_of(out: Path, seed: int) -> Path:
-    """The file with images of a drive, as the network takes them: (M, 3, H, W) uint8."""
+    """The file with images of a drive, of `write_bytes` for demo: (M, 3, H, W) uint8."""
     return out / "images" / f"{seed}.npy"
-
-
-def as_pixels(images: Tensor, image: ImageConfig) -> Tensor:
-    """(M, 3, H, W) uint8 of normalised images."""
-    mean, std = (torch.tensor(numbers)[:, None, None] for numbers in (image.mean, image.std))
-    return (images * std + mean).round().clamp(0, 255).to(torch.uint8)
-
-
-def as_images(pixels: Tensor, image: ImageConfig) -> Tensor:
-    """(M, 3, H, W) float32, normalised, channels last, of uint8 pixels."""
-    mean, std = (torch.tensor(numbers, device=pixels.device)[:, None, None] for numbers in (image.mean, image.std))
-    return ((pixels.float() - mean) / std).contiguous(memory_format=torch.channels_last)
 
 
 def rendered(model: Path, seeds: tuple[int, ...], cache: Path, seconds: float) -> tuple[int, ...]:
@@ -185,6 +173,10 @@ def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, sec
     device = images[0].device
     images_of_a_drive = 4 if device.type == "cpu" else 48
     demo = load_config("demo")
+
+    def seen_by_model(pixels: Tensor) -> Tensor:
+        return renormalised(images_from_bytes(pixels[None], demo.image)[0], demo.image, model.config.image)
+
     teacher = build_network(demo)
     load_weights(weights_file(Path("demo")), teacher, "demo")
     teacher.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
@@ -196,7 +188,7 @@ def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, sec
     optimizer = torch.optim.AdamW([{"params": part} for part in learned], weight_decay=1e-3)
     # The new lateral convolutions begin with small outputs, whatever the size of the backbone's maps.
     with torch.no_grad():
-        maps = model.backbone(as_images(images[0][:4], model.config.image))
+        maps = model.backbone(seen_by_model(images[0][:4]))
     for lateral, x in zip(model.neck.lateral, maps, strict=True):
         nn.init.normal_(lateral.weight, std=0.3 / math.sqrt(lateral.in_channels) / float(x.std()))
         nn.init.zeros_(lateral.bias)
@@ -214,10 +206,13 @@ def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, sec
             pixels = pixels[torch.randint(len(pixels), (images_of_a_drive,), generator=draw).to(device)]
             if torch.rand((), generator=draw) < 0.5:
                 pixels = pixels.flip(-1)
-            seen = randomised(as_images(pixels, model.config.image)[None], chance, model.config.image, draw)[0]
+            seen = randomised(seen_by_model(pixels), chance, model.config.image, draw)
             with amp:
                 with torch.no_grad():
-                    targets = [x.float() for x in teacher.neck(teacher.backbone(as_images(pixels, demo.image)))]
+                    targets = [
+                        x.float()
+                        for x in teacher.neck(teacher.backbone(images_from_bytes(pixels[None], demo.image)[0]))
+                    ]
                 maps = model.neck(model.backbone(seen.contiguous(memory_format=torch.channels_last)))
             pairs = zip(maps, targets, strict=True)
             loss = torch.stack([F.mse_loss(x.float(), target) / target.var() for x, target in pairs]).mean()
