@@ -44,6 +44,7 @@ WINGS: dict[str, set[str]] = {
     "batch": set(),
     "benchmark": {"engines"},
     "calibration": set(),
+    "odometry": {"calibration"},
     "engines": set(),
     "formats": set(),
     "robustness": {"calibration", "synth"},
