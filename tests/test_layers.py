@@ -43,7 +43,8 @@ LAYERS = (
 WINGS: dict[str, set[str]] = {
     "batch": set(),
     "benchmark": {"engines"},
-    "calibration": set(),
+    "calibration": {"correspondence"},
+    "correspondence": set(),
     "engines": set(),
     "formats": set(),
     "robustness": {"calibration", "synth"},
