@@ -30,6 +30,7 @@ SIDE = round(2 * REACH_M / CELL_M)  # pixels
 BLUR_M = 0.4  # ground that a pixel covers: cells that a camera sees less sharply are left out
 BODY_M = (-1.2, 4.2, 1.1)  # of the vehicle: back and front, and half its width, from the origin of the ego frame
 MOST_PIXELS = 1600  # of a side of the stitched road
+SHOWN_WIDTH, MOST_SHOWN = 320, 100  # of images in the recording: pixels, and frames
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 WAY, STATED, GUESSED = "#ff8c1a", "#2a7de1", "#d62728"
 
@@ -82,26 +83,38 @@ def _seen_from(camera: Camera, cells: Array) -> tuple[Array, Array]:
     return pixels, np.where(sharp, distance, np.inf)
 
 
+def _small(image: Pixels) -> bytes:
+    """JPEG of an image, SHOWN_WIDTH wide."""
+    height = round(SHOWN_WIDTH * image.shape[0] / image.shape[1])
+    small = cv2.resize(image, (SHOWN_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", small, JPEG)[1].tobytes()
+
+
 class WatchedDrive(DerivedSequence):
     """A drive that keeps what is drawn of each frame that is loaded: the road from above, and its stated pose.
 
     Attributes:
         road: place -> JPEG of the road from above.
-        views: rig -> `GroundView`, of each frame's own.
+        images: place -> camera -> JPEG of its small image; of MOST_SHOWN frames at most.
         stated: place -> world_from_ego (4, 4); of a drive with poses.
+        view: the cells of the road in the images of the rig; None before a frame is loaded.
     """
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence)
         self.road: dict[int, bytes] = {}
+        self.images: dict[int, dict[str, bytes]] = {}
         self.stated: dict[int, Array] = {}
         self.view: GroundView | None = None
+        self._every = -(-len(sequence.stamps) // MOST_SHOWN)
 
     def load(self, place: int) -> Frame:
         frame = super().load(place)
         if self.view is None or self.view.rig is not frame.rig:
             self.view = GroundView(frame.rig)
         self.road[place] = cv2.imencode(".jpg", self.view.of(frame), JPEG)[1].tobytes()
+        if place % self._every == 0:
+            self.images[place] = {name: _small(image.pixels_bgr) for name, image in frame.images.items()}
         if self.has_ego_motion:
             self.stated[place] = frame.world_from_ego.matrix
         return frame

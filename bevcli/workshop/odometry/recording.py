@@ -9,19 +9,19 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError
-from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.files import plain_name
 from bevcli.recording import entities
-from bevcli.recording.blueprint import Layout, flat_view, frame_rate_hz
+from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
 from bevcli.workshop.odometry.measure import MeasuredMotion
-from bevcli.workshop.odometry.picture import SIDE, StitchedRoad, WatchedDrive
+from bevcli.workshop.odometry.picture import SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
 from bevcli.writing import whole_file
 
-WAY, ROAD = "way", "road"
+WAY, ROAD, CAMERAS = "way", "road", "cameras"
 CURVES = {"speed": "speed, m/s", "yaw_rate": "yaw rate, °/s"}
 COLOR, PALE, STATED_COLOR, GUESSED_COLOR = (255, 140, 26), (255, 140, 26, 110), (42, 125, 225), (255, 45, 85)
+SERIES = (("measured", "measured", COLOR, 2.0), ("low", "- σ", PALE, 1.0), ("high", "+ σ", PALE, 1.0))
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
@@ -29,7 +29,7 @@ def write_recording(
     path: Path, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, stated: Items[Array] | None
 ) -> None:
     """Write the recording. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
-    layout = _layout(drive.stamps, road)
+    layout = _layout(drive, road)
     with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream("bevcli-odometry") as stream:
         try:
             stream.save(unfinished, default_blueprint=layout)
@@ -39,8 +39,8 @@ def write_recording(
             layout.free()
         _log_way(stream, motion, road, stated)
         for name in CURVES:
-            for part, color, width in (("measured", COLOR, 2.0), ("low", PALE, 1.0), ("high", PALE, 1.0)):
-                style = rr.SeriesLines(colors=color, widths=width, names=part)
+            for part, text, color, width in SERIES:
+                style = rr.SeriesLines(colors=color, widths=width, names=text)
                 stream.log(f"curves/{name}/{part}", style, static=True)
         for place, stamp in enumerate(drive.stamps):
             stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
@@ -48,19 +48,24 @@ def write_recording(
             _log_frame(stream, motion, drive, road, place)
 
 
-def _layout(stamps: tuple[FrameStamp, ...], road: StitchedRoad) -> Layout:
+def _layout(drive: WatchedDrive, road: StitchedRoad) -> Layout:
     height, width = road.image.shape[:2]
     ahead = flat_view(ROAD, "road from above, ahead is up", (0, SIDE), (0, SIDE))
     way = flat_view(WAY, "way", (0, width), (0, height))
     curves = [rrb.TimeSeriesView(origin=f"curves/{name}", name=title) for name, title in CURVES.items()]
     texts = rrb.TextLogView(origin=entities.EVENTS, name="steps that were not measured")
+    cameras = {
+        camera.name: flat_view(
+            f"{CAMERAS}/{camera.name}", camera.name, (0, SHOWN_WIDTH), (0, SHOWN_WIDTH * camera.height / camera.width)
+        )
+        for camera in drive.rig.cameras
+    }
+    rows = [rrb.Horizontal(*(cameras[name] for name in row)) for row in camera_rows(drive.rig)]
+    middle = rrb.Horizontal(way, ahead, rrb.Vertical(*curves, texts, row_shares=[3, 3, 2]), column_shares=[3, 2, 3])
     return Layout(
-        rrb.Horizontal(
-            rrb.Vertical(way, ahead, row_shares=[1, 1]), rrb.Vertical(*curves, texts, row_shares=[3, 3, 2]),
-            column_shares=[3, 2],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE, fps=frame_rate_hz(stamps)),
-    )  # fmt: skip
+        rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[1, 2, 1][: len(rows) + 1]),
+        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE, fps=frame_rate_hz(drive.stamps)),
+    )
 
 
 def _log_way(
@@ -88,8 +93,12 @@ def _log_frame(
     pose = motion.poses[place]
     ahead = pose @ np.array([[1, 0, 0, 3.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     start, end = road.pixels(np.stack([pose, ahead]))
-    stream.log(f"{WAY}/vehicle", rr.Arrows2D(origins=[start], vectors=[end - start], colors=entities.EGO_COLOR))
+    radii = rr.Radius.ui_points(3.0)
+    vehicle = rr.Arrows2D(origins=[start], vectors=[end - start], colors=entities.EGO_COLOR, radii=radii)
+    stream.log(f"{WAY}/vehicle", vehicle)
     stream.log(f"{ROAD}/image", rr.EncodedImage(contents=drive.road[place], media_type="image/jpeg"))
+    for name, encoded in drive.images.get(place, {}).items():
+        stream.log(f"{CAMERAS}/{name}/image", rr.EncodedImage(contents=encoded, media_type="image/jpeg"))
     if place == 0:
         return
     for name, (values, deviations) in zip(CURVES, (speeds(motion), yaw_rates_deg(motion)), strict=True):
