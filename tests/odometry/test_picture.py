@@ -42,7 +42,7 @@ class ChessBoard(MemorySequence):
 @pytest.fixture(scope="module")
 def watched():
     """Frames of two cameras, and their true motion."""
-    cameras = tuple(make_camera(name, yaw, 640, 360) for name, yaw in (("front", 0), ("back", 180)))
+    cameras = tuple(make_camera(name, yaw, 480, 270) for name, yaw in (("front", 0), ("back", 180)))
     drive = WatchedDrive(ChessBoard(4, CameraRig(cameras, default_ego_from_bev())))
     return drive, motion_of(drive)
 

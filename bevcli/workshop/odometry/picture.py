@@ -256,7 +256,8 @@ def _draw_curve(
     axes.plot(middles, values, color=WAY, linewidth=1.5)
     guessed = np.array([bool(step.reason) for step in motion.steps])
     axes.plot(middles[guessed], values[guessed], color=GUESSED, linestyle="", marker="x")
-    axes.set_ylabel(f"{label} ± σ")
+    axes.set_ylabel(label)
+    axes.set_title(f"± σ, {np.median(deviations):.3f} (median)" if len(values) else "", fontsize=9, loc="right")
     axes.grid(visible=True, color="#e6e6e6")
     if len(values):  # a guess's wide deviation must not hide the curve
         shown = values if stated is None else np.concatenate([values, stated])
