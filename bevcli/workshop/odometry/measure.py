@@ -203,6 +203,7 @@ class MeasuredDrive(DerivedSequence):
     def __init__(self, sequence: Sequence, motion: MeasuredMotion) -> None:
         super().__init__(sequence)
         self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
+        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
 
     def load(self, place: int) -> Frame:
         return self._moved(self.sequence.load(place))
@@ -221,4 +222,5 @@ class MeasuredDrive(DerivedSequence):
             ground_truth=None if truth is None else truth.transformed(moved),
             world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
             kinematics=motion.kinematics_at(time),
+            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
         )
