@@ -12,6 +12,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
 from bevcli.workshop.odometry.picture import GroundView, WatchedDrive, ground_cells, stitched, write_picture
 from bevcli.workshop.odometry.recording import write_recording
+from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 
 SQUARE_M = 3.0
 
@@ -86,14 +87,38 @@ def test_pixels_of_poses_are_where_the_road_was_stitched(watched):
 
 def test_the_picture_and_the_recording_are_written(watched, tmp_path):
     drive, motion = watched
-    guessed = replace(motion, steps=(*motion.steps[:2], replace(motion.steps[2], reason="too dark")))
+    points = SeenPoints(
+        np.zeros(1, np.int16), np.full((1, 2), 0.5, np.float32), np.ones(1, np.float32), np.ones(1, bool)
+    )
+    seen, unseen = replace(motion.steps[0], seen=points), replace(motion.steps[2], reason="too dark")
+    guessed = replace(motion, steps=(seen, motion.steps[1], unseen))
     road = stitched(drive, motion.poses)
     write_picture(tmp_path / "odometry.png", guessed, road, drive.stated_poses)
     assert (tmp_path / "odometry.png").read_bytes().startswith(b"\x89PNG")
     write_recording(tmp_path / "odometry.rrd", guessed, drive, road, drive.stated_poses)
     assert (tmp_path / "odometry.rrd").stat().st_size < 500_000
     entities = [chunk.entity_path for chunk in RrdReader(tmp_path / "odometry.rrd").stream()]
-    assert {"/way/road", "/way/measured", "/road/image", "/curves/speed/measured", "/events"} <= set(entities)
+    assert {
+        "/way/road",
+        "/way/measured",
+        "/road/image",
+        "/curves/speed/measured",
+        "/events",
+        "/cameras/front/points",
+    } <= set(entities)
+
+
+def test_an_even_choice_of_the_points_is_shown_where_they_are():
+    cameras = [make_camera("front", 0, 640, 360), make_camera("back", 180, 640, 360)]
+    pixels = np.stack([np.linspace(10, 630, 400), np.linspace(20, 340, 400)], axis=-1)
+    of, residuals = np.arange(400) % 2, np.full((400, 2), 3.0)
+    seen = seen_points(
+        cameras, (of, cameras[0].rays(pixels), residuals), (of[:4], cameras[0].rays(pixels[:4]), residuals[:4])
+    )
+    assert np.bincount(seen.camera[~seen.is_road]).tolist() == [50, 50]  # every fourth of 200
+    assert seen.is_road.sum() == 4
+    assert seen.at[0] * (640, 360) == pytest.approx(pixels[0], abs=0.01)
+    assert seen.residuals_px == pytest.approx(np.hypot(3, 3))
 
 
 def test_a_drive_without_poses_has_no_stated_ones():

@@ -8,6 +8,7 @@ In the order of the work:
     chain                the choice among them by the steps before and after
     measure              the entry point: reads a drive frame by frame; the measured motion, and the drive with it
     report               the measured motion in words and files, and against stated poses
+    seen_points          the points of a step that a recording shows
     picture, recording   the way on the road, and curves
     run_option           the option `odometry` of `open_sequence`
 """

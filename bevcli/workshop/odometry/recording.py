@@ -9,6 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.files import plain_name
 from bevcli.recording import entities
@@ -16,12 +17,15 @@ from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rat
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.picture import SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
+from bevcli.workshop.odometry.seen_points import SeenPoints
 from bevcli.writing import whole_file
 
 WAY, ROAD, CAMERAS = "way", "road", "cameras"
 CURVES = {"speed": "speed, m/s", "yaw_rate": "yaw rate, °/s"}
 COLOR, PALE, STATED_COLOR, GUESSED_COLOR = (255, 140, 26), (255, 140, 26, 110), (42, 125, 225), (255, 45, 85)
 SERIES = (("measured", "measured", COLOR, 2.0), ("low", "- σ", PALE, 1.0), ("high", "+ σ", PALE, 1.0))
+ROAD_COLOR = (70, 150, 255)
+RESIDUALS_PX, RESIDUAL_COLORS = (0.5, 1.5), ((70, 220, 120), (245, 222, 90), (255, 45, 85))  # of matched points
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
@@ -106,6 +110,22 @@ def _log_frame(
         parts = {"measured": value, "low": value - deviation, "high": value + deviation}
         for part, number in parts.items():
             stream.log(f"curves/{name}/{part}", rr.Scalars(number))
+    if place in drive.images:
+        _log_points(stream, motion.steps[place - 1].seen, drive.rig)
     reason = motion.steps[place - 1].reason
     if reason:
         stream.log(entities.EVENTS, rr.TextLog(f"frame {drive.stamps[place].index}: {reason}", level="WARN"))
+
+
+def _log_points(stream: rr.RecordingStream, seen: SeenPoints | None, rig: CameraRig) -> None:
+    """The points of a step in the images: those of the road blue, matched ones by their residual."""
+    for index, camera in enumerate(rig.cameras):
+        entity = f"{CAMERAS}/{camera.name}/points"
+        if seen is None:
+            stream.log(entity, rr.Clear(recursive=False))
+            continue
+        mine = seen.camera == index
+        colors = np.asarray(RESIDUAL_COLORS)[np.digitize(seen.residuals_px[mine], RESIDUALS_PX)]
+        colors[seen.is_road[mine]] = ROAD_COLOR
+        at = seen.at[mine] * (SHOWN_WIDTH, SHOWN_WIDTH * camera.height / camera.width)
+        stream.log(entity, rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(1.5), draw_order=10))
