@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations, product
 
 import numpy as np
@@ -39,6 +40,11 @@ class Poses:
     rotations: Array
     positions: Array
 
+    @cached_property
+    def quaternions(self) -> Array:
+        """(T, 4) of the rotations, x, y, z, w."""
+        return np.asarray(Rotation.from_matrix(self.rotations).as_quat())
+
     @classmethod
     def of(cls, motion: EgoMotion) -> "Poses":
         """The poses of ego-motion."""
@@ -54,19 +60,12 @@ class Poses:
     def at(self, times_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Poses (..., 4, 4) at times (...), and whether the rows cover them; between rows they are interpolated."""
         covered = (times_ns >= self.times_ns[0] - TOLERANCE_NS) & (times_ns <= self.times_ns[-1] + TOLERANCE_NS)
-        if len(self.times_ns) == 1:
-            row, later, fraction = (
-                np.zeros(times_ns.shape, np.int64),
-                np.zeros(times_ns.shape, np.int64),
-                0 * times_ns / 1,
-            )
-        else:
-            row = np.clip(np.searchsorted(self.times_ns, times_ns, side="right") - 1, 0, len(self.times_ns) - 2)
-            later = row + 1
-            fraction = (times_ns - self.times_ns[row]) / (self.times_ns[later] - self.times_ns[row])
-        fraction = np.clip(fraction, 0, 1)[..., None]
-        quaternions = Rotation.from_matrix(self.rotations).as_quat()
-        start, end = quaternions[row], quaternions[later]
+        last = len(self.times_ns) - 1
+        row = np.clip(np.searchsorted(self.times_ns, times_ns, side="right") - 1, 0, max(last - 1, 0))
+        later = np.minimum(row + 1, last)
+        duration = np.maximum(self.times_ns[later] - self.times_ns[row], 1)  # 0 for a single row
+        fraction = np.clip((times_ns - self.times_ns[row]) / duration, 0, 1)[..., None]
+        start, end = self.quaternions[row], self.quaternions[later]
         end = np.where((start * end).sum(-1, keepdims=True) < 0, -end, end)
         mixed = start + fraction * (end - start)  # neighbouring rows differ by little
         poses = np.broadcast_to(np.eye(4), (*times_ns.shape, 4, 4)).copy()
