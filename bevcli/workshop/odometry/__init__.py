@@ -2,6 +2,7 @@
 
 In the order of the work:
     measure              the entry point: reads a drive frame by frame; the measured motion, and the drive with it
+    measured_steps       measured steps, and how far other steps are from them in standard deviations
     stated               stated poses at the times of frames, and common mistakes in them, undone one by one
     compare              stated poses against the measured motion: the mistake that explains their difference
 """

@@ -9,20 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bevcli.findings import Finding
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.workshop.odometry.measure import MeasuredMotion
+from bevcli.workshop.odometry.measured_steps import FREEDOMS, MeasuredSteps
 from bevcli.workshop.odometry.stated import Mistake, Poses, mistakes, steps_between, turn_between
 
 FEWEST_STEPS = 3  # that are measured
-WIDEST = np.radians(2.0), 0.2, 0.3  # deviations of a step that counts as measured: yaw; length in its own, or metres
-# Deviations of sound poses: roll, pitch and yaw of a step; its translation, and that in its length.
-POSE_DEVIATIONS, LENGTH_DEVIATION = np.array([np.radians(1.0)] * 2 + [np.radians(0.1)] + [0.02, 0.02, 0.1]), 0.01
-FREEDOMS = 6  # of a step
 FITS = 5.0  # largest distance of a step that fits, in deviations
 UNLIKE = 12.0  # least median distance of a wrong drive, in deviations
 MOST = 0.6  # share of the steps that must fit
@@ -56,63 +52,6 @@ SCALES = {
 
 
 @dataclass(frozen=True)
-class _Measured:
-    """K measured steps.
-
-    Attributes:
-        times_ns: (K + 1,) of the frames.
-        poses: (K + 1, 4, 4) world_from_ego.
-        steps: (K, 4, 4).
-        precisions: (K, 6, 6) of the difference to a sound stated step.
-        is_used: (K,) bool: measured well, and covered by the stated poses.
-    """
-
-    times_ns: NDArray[np.int64]
-    poses: Array
-    steps: Array
-    precisions: Array
-    is_used: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, motion: MeasuredMotion) -> "_Measured":
-        steps = np.stack([step.ego_a_from_ego_b for step in motion.steps])
-        covariances = np.stack([step.covariance for step in motion.steps])
-        lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-        deviations = np.broadcast_to(POSE_DEVIATIONS, (len(steps), 6)).copy()
-        deviations[:, 3:5] = np.hypot(deviations[:, 3:5], LENGTH_DEVIATION * lengths[:, None])
-        yaw, share, metres = WIDEST
-        spread = np.sqrt(covariances[:, 3, 3] + covariances[:, 4, 4])
-        is_used = (np.sqrt(covariances[:, 2, 2]) < yaw) & (spread < np.maximum(share * lengths, metres))
-        is_used &= [not step.reason for step in motion.steps]
-        precisions = np.linalg.inv(covariances + np.einsum("ki,ij->kij", deviations**2, np.eye(6)))
-        return cls(motion.timestamps_ns, motion.poses, steps, precisions, is_used)
-
-    def differences(self, steps: Array) -> Array:
-        """(..., K, 6) rotation and translation of steps (..., K, 4, 4) minus the measured ones."""
-        turns = steps[..., :3, :3] @ np.swapaxes(self.steps[:, :3, :3], 1, 2)
-        vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*steps.shape[:-2], 3)
-        return np.concatenate([vectors, steps[..., :3, 3] - self.steps[:, :3, 3]], axis=-1)
-
-    def distances(self, steps: Array) -> Array:
-        """(..., K) the length of the differences in standard deviations."""
-        return np.sqrt(self.squared(self.differences(steps)))
-
-    def squared(self, differences: Array) -> Array:
-        """(..., K) squared distances of differences (..., K, 6)."""
-        return np.einsum("...ki,kij,...kj->...k", differences, self.precisions, differences)
-
-    def cost(self, distances: Array, is_used: NDArray[np.bool_] | None = None) -> Array:
-        """(...) robust cost of distances (..., K): that of the steps in use, times the number of all that are used."""
-        used = self.is_used if is_used is None else self.is_used & is_used
-        each = np.where(used, FREEDOMS * np.log1p(distances**2 / FREEDOMS), 0).sum(-1)
-        return each * self.is_used.sum() / np.maximum(used.sum(-1), 1)
-
-    def weights(self, squared: Array) -> Array:
-        """(..., K) robust weights of squared distances."""
-        return self.is_used / (1 + squared / FREEDOMS)
-
-
-@dataclass(frozen=True)
 class _Candidate:
     """Stated steps after something is undone.
 
@@ -140,7 +79,7 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         measured: the motion between some frames of it.
         frames: numbers of these frames, for texts. Default: 0, 1 and so on.
     """
-    shown = _Measured.of(measured)
+    shown = MeasuredSteps.of(measured)
     rows = Poses.of(stated).during(shown.times_ns[0] - LONGEST_NS, shown.times_ns[-1] + LONGEST_NS)
     poses, covered = rows.at(shown.times_ns)
     shown = replace(shown, is_used=shown.is_used & covered[:-1] & covered[1:])
@@ -169,30 +108,33 @@ def _error(code: str, message: str, found: str, expected: str, advice: str, is_e
     return Finding(code, "error" if is_error else "warning", None, message, found, expected, advice)
 
 
-def _candidate(measured: _Measured, steps: Array, findings: Iterable[Finding] = (), parameters: int = 0) -> _Candidate:
+def _candidate(
+    measured: MeasuredSteps, steps: Array, findings: Iterable[Finding] = (), parameters: int = 0
+) -> _Candidate:
     distances = measured.distances(steps)
     share = float((distances < FITS)[measured.is_used].mean())
     return _Candidate(steps, float(measured.cost(distances)) + PARAMETER * parameters, share, tuple(findings))
 
 
-def _candidates(measured: _Measured, rows: Poses, steps: Array) -> Iterator[_Candidate]:
+def _candidates(measured: MeasuredSteps, rows: Poses, steps: Array) -> Iterator[_Candidate]:
     """What may be wrong, the likelier first; with another scale too."""
     yield from _scaled(measured, [((), steps)])
     yield _turned(measured, steps)
     yield from _of_another_time(measured, rows)
     yield _of_another_point(measured, steps)
-    yield from _scaled(measured, [((_finding(each),), each.steps) for each in _mistakes(measured, rows)])
+    undone = mistakes(rows, measured.times_ns, measured.poses)
+    yield from _scaled(measured, [((_finding(measured, each, steps),), each.steps) for each in undone])
 
 
-def _mistakes(measured: _Measured, rows: Poses) -> Iterable[Mistake]:
-    return mistakes(rows, measured.times_ns, measured.poses)
+def _finding(measured: MeasuredSteps, mistake: Mistake, steps: Array) -> Finding:
+    fit, fit_undone = (
+        int((measured.distances(each) < FITS)[measured.is_used].sum()) for each in (steps, mistake.steps)
+    )
+    found = mistake.found or f"{fit} of {int(measured.is_used.sum())} steps fit, {fit_undone} where it is undone"
+    return _error(mistake.code, mistake.message, found, mistake.expected, mistake.advice)
 
 
-def _finding(mistake: Mistake) -> Finding:
-    return _error(mistake.code, mistake.message, mistake.found, mistake.expected, mistake.advice)
-
-
-def _scaled(measured: _Measured, undone: list[tuple[tuple[Finding, ...], Array]]) -> Iterator[_Candidate]:
+def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Array]]) -> Iterator[_Candidate]:
     """Each of the N undone steps (K, 4, 4) as it is, and with the scale that fits best."""
     stacked = np.stack([steps for _, steps in undone])
     covariances = np.linalg.inv(measured.precisions)
@@ -232,7 +174,7 @@ def _scale_finding(factor: float, deviation: float) -> tuple[Finding, ...]:
     return (_error("motion-scale", message, found, "1", advice, abs(factor - 1) > LARGE_SCALE),)
 
 
-def _turned(measured: _Measured, steps: Array) -> _Candidate:
+def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
     """The vehicle frame of the poses turned about z, by any angle."""
     lengths = (steps[:, :2, 3] ** 2).sum(1)
     across = np.linalg.inv(measured.precisions)[:, 4, 4]
@@ -257,7 +199,7 @@ def _turned(measured: _Measured, steps: Array) -> _Candidate:
     return _candidate(measured, undone, (finding,), 1)
 
 
-def _of_another_point(measured: _Measured, steps: Array) -> _Candidate:
+def _of_another_point(measured: MeasuredSteps, steps: Array) -> _Candidate:
     """The poses are those of another point of the vehicle than the ego origin."""
     # Steps between poses of the point p of the ego frame have the translation t + (R - 1) p.
     slopes = (steps[:, :3, :3] - np.eye(3))[:, :, :2]  # (K, 3, 2)
@@ -281,7 +223,7 @@ def _of_another_point(measured: _Measured, steps: Array) -> _Candidate:
     return _candidate(measured, undone, (finding,), 2)
 
 
-def _of_another_time(measured: _Measured, rows: Poses) -> Iterator[_Candidate]:
+def _of_another_time(measured: MeasuredSteps, rows: Poses) -> Iterator[_Candidate]:
     """The poses of another time, as they are and with another scale."""
     offset = _time_offset(measured, rows)
     if offset is None:
@@ -311,7 +253,7 @@ def _of_another_time(measured: _Measured, rows: Poses) -> Iterator[_Candidate]:
         yield replace(candidate, cost=candidate.cost * part + 2 * PARAMETER, share=share, findings=told)
 
 
-def _time_offset(measured: _Measured, rows: Poses) -> int | None:
+def _time_offset(measured: MeasuredSteps, rows: Poses) -> int | None:
     """The time to add to those of the frames at which the poses fit best, nanoseconds; None without other times."""
     chosen = np.flatnonzero(measured.is_used)[:SEARCHED]
     times_ns = np.stack([measured.times_ns[chosen], measured.times_ns[chosen + 1]], axis=-1)  # (K, 2)
@@ -335,7 +277,7 @@ def _time_offset(measured: _Measured, rows: Poses) -> int | None:
     return best
 
 
-def _wrong(measured: _Measured, steps: Array) -> Finding:
+def _wrong(measured: MeasuredSteps, steps: Array) -> Finding:
     """The finding where nothing fits: one of both stands still, or the poses are those of another drive."""
     used = measured.is_used
     fits = int((measured.distances(steps) < FITS)[used].sum())
@@ -355,11 +297,11 @@ def _wrong(measured: _Measured, steps: Array) -> Finding:
     return _error("motion-wrong-drive", message, found, "all steps fit", advice)
 
 
-def _stands(measured: _Measured, steps: Array) -> bool:
+def _stands(measured: MeasuredSteps, steps: Array) -> bool:
     return bool(np.median(np.linalg.norm(steps[measured.is_used, :3, 3], axis=1)) < STANDING_M)
 
 
-def _jumps(measured: _Measured, steps: Array, frames: Sequence[int]) -> tuple[Finding, ...]:
+def _jumps(measured: MeasuredSteps, steps: Array, frames: Sequence[int]) -> tuple[Finding, ...]:
     """The finding about single steps that do not fit, and that are not smooth either, where the measured ones are."""
     deviations, metres, radians = JUMP
     off = measured.differences(steps)

@@ -174,7 +174,7 @@ def _angles(rows: Poses, times_ns: NDArray[np.int64], poses: Array, measured: Ar
         turned = _with_yaws(poses, np.radians(from_deg) - yaws)
         yield Mistake(
             code, f"the yaw of the poses counts {words}", "", expected,
-            f"take {from_deg}° minus the angle", steps_between(turned),
+            f"take {from_deg}° minus the angle" if from_deg else "negate the angle", steps_between(turned),
         )  # fmt: skip
     row_yaws = np.arctan2(rows.rotations[:, 1, 0], rows.rotations[:, 0, 0])
     shown = np.unwrap(np.arctan2(measured[:, 1, 0], measured[:, 0, 0]))
