@@ -80,7 +80,7 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         frames: numbers of these frames, for texts. Default: 0, 1 and so on.
     """
     shown = MeasuredSteps.of(measured)
-    rows = Poses.of(stated).during(shown.times_ns[0] - LONGEST_NS, shown.times_ns[-1] + LONGEST_NS)
+    rows = Poses.of(stated)
     poses, covered = rows.at(shown.times_ns)
     shown = replace(shown, is_used=shown.is_used & covered[:-1] & covered[1:])
     if (used := int(shown.is_used.sum())) < FEWEST_STEPS:

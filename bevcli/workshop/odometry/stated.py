@@ -51,12 +51,6 @@ class Poses:
         rotations = Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1)).as_matrix()
         return cls(motion.timestamps_ns, rotations, motion.translations)
 
-    def during(self, first_ns: int, last_ns: int) -> "Poses":
-        """The rows of a period, with one more at each end."""
-        first = max(0, int(np.searchsorted(self.times_ns, first_ns)) - 1)
-        rows = slice(first, int(np.searchsorted(self.times_ns, last_ns, side="right")) + 1)
-        return Poses(self.times_ns[rows], self.rotations[rows], self.positions[rows])
-
     def at(self, times_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Poses (..., 4, 4) at times (...), and whether the rows cover them; between rows they are interpolated."""
         covered = (times_ns >= self.times_ns[0] - TOLERANCE_NS) & (times_ns <= self.times_ns[-1] + TOLERANCE_NS)
@@ -109,7 +103,8 @@ def mistakes(rows: Poses, times_ns: NDArray[np.int64], measured: Array) -> Itera
         "motion-inverted", "the poses are ego_from_world, the inverse", "", "world_from_ego", "invert them",
         steps_between(inverted.at(times_ns)[0]),
     )  # fmt: skip
-    backwards = Poses(times_ns[0] + times_ns[-1] - rows.times_ns[::-1], rows.rotations[::-1], rows.positions[::-1])
+    first_ns, last_ns = rows.times_ns[[0, -1]]
+    backwards = Poses(first_ns + (last_ns - rows.times_ns[::-1]), rows.rotations[::-1], rows.positions[::-1])
     yield Mistake(
         "motion-reversed", "the poses run backwards in time", "", "", "reverse the order of their rows",
         steps_between(backwards.at(times_ns)[0]),
