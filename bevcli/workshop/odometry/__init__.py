@@ -1,6 +1,11 @@
 """The vehicle's motion, measured from the images and the calibration alone.
 
 In the order of the work:
+    frames               what is kept of a frame: its images, their features, the road seen from above
+    above                how far the vehicle drove between two views of the road from above; points of it
+    unknowns, ground     what is estimated of a step, and the residuals of points of the road
+    steps                the motions that a step may have: those that fit matched points and points of the road
+    chain                the choice among them by the steps before and after
     measure              the entry point: reads a drive frame by frame; the measured motion, and the drive with it
     measured_steps       measured steps, and how far other steps are from them in standard deviations
     stated               stated poses at the times of frames, and common mistakes in them, undone one by one
@@ -17,8 +22,4 @@ class OdometryOptions:
     height_m: float = option(
         default=0.003, help="How far off the stated height of the cameras over the road may be: standard deviation, "
         "metres.", minimum=0.0001, maximum=0.5,
-    )  # fmt: skip
-    baseline_deg: float = option(
-        default=0.01, help="How far off the stated angle between two cameras that see the same may be: standard "
-        "deviation, degrees.", minimum=0.0001, maximum=5,
     )  # fmt: skip
