@@ -47,6 +47,9 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.poses": {
         "files": "bevcli.workshop.formats.poses:read_poses",
     },
+    "bevcli.motion": {
+        "images": "bevcli.workshop.odometry.live:LiveMotion",
+    },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
         "native": "bevcli.workshop.formats.output:NATIVE",
