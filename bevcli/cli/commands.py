@@ -214,7 +214,7 @@ def project_debug(
     """Find mistakes in a calibration.
 
     Checks the camera poses and lenses, the bev frame and, with a sequence, its ego-motion, its timestamps, and whether
-    the images fit how the vehicle moves (the short form of `bevcli calibrate`). Writes
+    the images fit how the vehicle moves (short forms of `bevcli odometry` and `bevcli calibrate`). Writes
     cameras.png (pillars, ground grid and horizon in each image), coverage.png (how many cameras see each BEV cell),
     recording.rrd (for bevcli viz) and findings.json. Existing files are overwritten.
 

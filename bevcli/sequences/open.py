@@ -80,7 +80,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         sequence = select_range(sequence, options.frames)
     if not options.odometry:
         return sequence
-    measured: Sequence = load("bevcli.odometry", "images")(sequence, whole, options.after_step)
+    measured: Sequence = load("bevcli.motion", "drive")(sequence, whole, options.after_step)
     return measured
 
 

@@ -47,8 +47,9 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.poses": {
         "files": "bevcli.workshop.formats.poses:read_poses",
     },
-    "bevcli.odometry": {
-        "images": "bevcli.workshop.odometry.run_option:with_measured_motion",
+    "bevcli.motion": {
+        "drive": "bevcli.workshop.odometry.run_option:with_measured_motion",
+        "live": "bevcli.workshop.odometry.live:LiveMotion",
     },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",

@@ -11,6 +11,11 @@ In the order of the work:
     seen_points          the points of a step that a recording shows
     picture, recording   the way on the road, and curves
     run_option           the option `odometry` of `open_sequence`
+    measured_steps       measured steps, and how far other steps are from them in standard deviations
+    stated               stated poses at the times of frames, and common mistakes in them, undone one by one
+    compare              stated poses against the measured motion: the mistake that explains their difference
+    check_motion         the check of `bevcli project-debug`: which steps are measured, and which findings are left out
+    live                 the motion of a live rig without poses, for `bevcli.Session`
 """
 
 from pathlib import Path

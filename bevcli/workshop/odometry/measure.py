@@ -123,6 +123,12 @@ class MotionMeter:
         self._before, self._guessed = (likeliest.state, seconds), 0
         return [] if decided is None else [_step(decided)]
 
+    @property
+    def newest(self) -> MeasuredStep | None:
+        """The step that is not decided, with the motion that is the likeliest so far; None where all are."""
+        likeliest = self._chain.likeliest
+        return None if likeliest is None else _step(likeliest)
+
     def finish(self) -> list[MeasuredStep]:
         """The step that is not decided, if there is one. Called after the last frame."""
         decided = self._chain.end()
