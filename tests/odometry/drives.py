@@ -43,7 +43,7 @@ class Plan:
         name: of its folder; the part before the first "-" is the rig.
         seed: of the street.
         first: frame of the simulation at which the drive begins.
-        tempo: factor of all speeds.
+        tempo: factor of all speeds; negative: time runs backwards.
         way: of the vehicle along its path; the traffic does not follow it.
         weather: None for that of the seed.
         look: "", "night", "rain", "bonnet" (a part of each image that never moves) or "black" (four black frames).
@@ -65,10 +65,6 @@ def _there_and_back(time_s: float) -> float:
     return time_s if time_s < 2 else 2.5 - (time_s - 3) ** 2 / 2 if time_s < 3.5 else 2.375 - (time_s - 3.5) / 2
 
 
-def _backwards(time_s: float) -> float:
-    return 6.0 - time_s
-
-
 PLANS = (
     Plan("six-turn", 1065000, 0),
     Plan("six-night", 1065018, 24, look="night"),
@@ -83,7 +79,7 @@ PLANS = (
     Plan("stereo-start", 1065025, 13, weather="noon"),
     Plan("stereo-sharp", 1065019, 4, tempo=2.0),
     Plan("fisheye-turn", 1065014, 4),
-    Plan("fisheye-reverse", 1065024, 5, way=_backwards),
+    Plan("fisheye-reverse", 1065024, 16, tempo=-1.0),
     Plan("fisheye-night", 1065013, 7, look="night"),
     Plan("fisheye-rain", 1065021, 17, look="rain", sway_deg=0.5),
     Plan("random-turn", 1065026, 18),
