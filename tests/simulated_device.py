@@ -375,6 +375,7 @@ def _provide_cuda(device: SimulatedDevice, monkeypatch: Any) -> None:
         "stream": lambda which: contextlib.nullcontext(),
         "Stream": lambda which: Stream(device),
         "current_stream": lambda which: stream,
+        "synchronize": lambda which=None: device.wait("synchronize"),
         "Event": partial(Event, device),
         "CUDAGraph": Graph,
         "graph_pool_handle": lambda: "pool",
