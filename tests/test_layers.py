@@ -43,9 +43,11 @@ LAYERS = (
 WINGS: dict[str, set[str]] = {
     "batch": set(),
     "benchmark": {"engines"},
-    "calibration": set(),
+    "calibration": {"correspondence", "odometry"},
+    "correspondence": set(),
     "engines": set(),
     "formats": set(),
+    "odometry": {"correspondence"},
     "robustness": {"calibration", "synth"},
     "synth": {"formats"},
     "scores": set(),
