@@ -21,6 +21,8 @@ Group = Literal[
     "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
+    "bevcli.hubs",
+    "bevcli.packings",
     "bevcli.commands",
     "bevcli.extensions",
 ]

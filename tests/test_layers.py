@@ -46,6 +46,7 @@ WINGS: dict[str, set[str]] = {
     "calibration": set(),
     "engines": set(),
     "formats": set(),
+    "hub": set(),
     "robustness": {"calibration", "synth"},
     "synth": {"formats"},
     "scores": set(),

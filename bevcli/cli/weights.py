@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option
+from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option, print_note
 from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, say
-from bevcli.weights.options import ModelFileOptions
+from bevcli.weights.options import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -148,6 +148,30 @@ def model_file(
     config, model = model_file_for(weights, out, options)
     say(f"{out}: {model} with {counted(len(config.classes), 'classes')}: {', '.join(config.classes)}")
     say(f"next: bevcli run SEQUENCE --model {out} --weights {weights}")
+
+
+@weights_app.command(cls=PlainCommand)
+@command
+def pack(
+    name: Annotated[str, argument("A name as --model takes it, or a FILE.toml.", reads=None, metavar="NAME|FILE")],
+    out: Annotated[Path, argument("The folder to write.", reads=None, metavar="DIR")],
+    options: PackOptions,
+) -> None:
+    """Write a model as a folder that the Hugging Face Hub takes: config.json, model.safetensors, README.md.
+
+    README.md is a model card with front matter; read it and add what only you know. Nothing is sent: `hf upload` of
+    huggingface_hub does that. `--model hf:OWNER/NAME` then loads the model, equal to the last bit, and
+    `--model hf:./DIR` before.
+    """
+    from bevcli.registry import load
+
+    files, notes = load("bevcli.packings", "hf")(name, out, options)
+    for note in notes:
+        print_note(note)
+    for file in files:
+        say(f"{file}: {file.stat().st_size:,} bytes")
+    shown = out if out.is_absolute() else f"./{out}"
+    say(f"next: bevcli run SEQUENCE --model hf:{shown}, and hf upload OWNER/NAME {out}")
 
 
 def _named_as_data(weights: "NamedWeights") -> dict[str, object]:
