@@ -44,6 +44,7 @@ WINGS: dict[str, set[str]] = {
     "batch": set(),
     "benchmark": {"engines"},
     "calibration": set(),
+    "checks": {"benchmark"},
     "engines": set(),
     "formats": set(),
     "hub": set(),

@@ -88,6 +88,7 @@ OWN: dict[Group, dict[str, str]] = {
         "batch": "bevcli.workshop.batch.commands:batch",
         "bench": "bevcli.workshop.benchmark.commands:bench",
         "calibrate": "bevcli.workshop.calibration.commands:calibrate",
+        "checks": "bevcli.workshop.checks.commands:checks",
         "convert": "bevcli.workshop.formats.commands:convert",
         "demo": "bevcli.workshop.synth.commands:demo",
         "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
