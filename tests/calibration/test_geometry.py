@@ -7,21 +7,12 @@ from scipy.spatial.transform import Rotation
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.adjustment import (
-    DELAYS_S,
-    HEIGHT,
-    OF_CAMERA,
-    EpipolarResiduals,
-    RoadResiduals,
-    Unknowns,
-    derivatives,
-    geometry_at,
-    solve,
-    spread,
-    values,
-)
-from bevcli.workshop.calibration.road import beside_way, level_corrections, sees_road
+from bevcli.workshop.calibration.adjustment import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
+from bevcli.workshop.calibration.road import level_corrections, sees_road
 from bevcli.workshop.calibration.views import View, Views, unknowns_of
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, RoadResiduals
+from bevcli.workshop.correspondence.road import beside_way
+from bevcli.workshop.correspondence.solver import derivatives, geometry_at, solve, spread, values
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 BLANK = np.zeros((2, 2), dtype=np.uint8)
@@ -159,7 +150,7 @@ def test_the_spread_of_residuals_is_that_of_their_camera(drive):
     turned[OF_CAMERA] = np.radians(1.0)  # camera B alone
     of_camera = unknowns.groups[shared.group]
     within = shared.where(of_camera[:, 1] == of_camera[:, 2])
-    found = spread(unknowns, within, turned)
+    found = spread(unknowns, within, turned, unknowns.groups[within.group, 1])
     b = unknowns.groups[within.group, 1] == 1
     assert found[b].min() > 10 * found[~b].max()
 
@@ -168,7 +159,8 @@ def test_the_spread_of_residuals_is_that_of_their_camera(drive):
 def test_a_drive_that_shows_no_road_keeps_what_is_stated(drive):
     views, unknowns = drive
     nothing = road_of(views, 0, ROAD[:0], beside_m=0.5)
-    solution = solve(unknowns, [(nothing, spread(unknowns, nothing, lowered(unknowns, 0)))], lowered(unknowns, 0))
+    x, cameras = lowered(unknowns, 0), unknowns.groups[nothing.group, 1]
+    solution = solve(unknowns, [(nothing, spread(unknowns, nothing, x, cameras))], x)
     assert not solution.x.any()
     assert not solution.information.any()
 

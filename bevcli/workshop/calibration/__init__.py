@@ -1,7 +1,7 @@
 """A calibration that is measured from the drive itself.
 
-In the order of the work:
-    adjustment           what is estimated, the geometry that follows from it, residuals, robust least squares
+In the order of the work, on top of the wing `correspondence`, which finds what two images share:
+    adjustment           what is estimated, and the geometry that follows from it
     views                the frame pairs that are used, their grey images, matched points
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig

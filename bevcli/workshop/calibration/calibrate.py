@@ -27,13 +27,15 @@ from bevcli.workshop.calibration.road import level_corrections, road_residuals, 
 from bevcli.workshop.calibration.views import (
     FEWEST_PAIRS,
     READING_STEPS,
-    WIDTH,
     PointMatches,
     Views,
     match_points,
     read_views,
     unknowns_of,
 )
+from bevcli.workshop.correspondence import solver
+from bevcli.workshop.correspondence.images import WIDTH
+from bevcli.workshop.correspondence.residuals import RoadResiduals
 from bevcli.writing import write_whole
 
 Triple = tuple[float, float, float]
@@ -208,9 +210,9 @@ class Measurement:
     views: Views
     matches: PointMatches  # of all pairs
     unknowns: adjustment.Unknowns
-    solution: adjustment.Solution
+    solution: solver.Solution
     points: PointMatches  # the matches that were used
-    road: adjustment.RoadResiduals
+    road: RoadResiduals
 
 
 def measure(
@@ -220,7 +222,7 @@ def measure(
     unknowns = unknowns_of(views, options)
     within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
-        x = adjustment.solve(unknowns, [(within, scale)], x).x
+        x = solver.solve(unknowns, [(within, scale)], x).x
     within = consistent(unknowns, within, x)
     progress()
     heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
@@ -231,7 +233,7 @@ def measure(
         road = road_residuals(views, unknowns, x, most_px)
         progress()
         for scale in ROAD_SCALES_PX:
-            x = adjustment.solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
+            x = solver.solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
         if most_px == FLOWS_PX[0]:
             levels = level_corrections(unknowns, road, ties, x)
             x = x + levels
@@ -240,17 +242,20 @@ def measure(
         progress()
     road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
     for _ in range(TURN_ROUNDS):
-        solution = adjustment.solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
+        solution = solver.solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
         x, unknowns = solution.x, adjustment.with_estimated_turns(unknowns, solution)
     return Measurement(views, matches, unknowns, solution, within, road)
 
 
 def _terms(
-    unknowns: adjustment.Unknowns, points: PointMatches, road: adjustment.RoadResiduals, x: Array, road_scale: float
-) -> list[adjustment.Term]:
+    unknowns: adjustment.Unknowns, points: PointMatches, road: RoadResiduals, x: Array, road_scale: float
+) -> list[solver.Term]:
     """Both kinds of residuals, with the spread that they have at x (P,)."""
-    scales = ((points, POINT_SCALE_PX), (road, road_scale))
-    return [(residuals, np.maximum(least, adjustment.spread(unknowns, residuals, x))) for residuals, least in scales]
+    terms: list[solver.Term] = []
+    for residuals, least in ((points, POINT_SCALE_PX), (road, road_scale)):
+        cameras = unknowns.groups[residuals.group, 1]
+        terms.append((residuals, np.maximum(least, solver.spread(unknowns, residuals, x, cameras))))
+    return terms
 
 
 def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) -> PointMatches:
@@ -258,7 +263,7 @@ def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) ->
 
     Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
     """
-    fits = np.abs(adjustment.values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
+    fits = np.abs(solver.values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
     count = len(unknowns.groups)
     fitting, matched = (np.bincount(group, minlength=count) for group in (points.group[fits], points.group))
     shares = fitting / np.maximum(matched, 1)
@@ -444,7 +449,7 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
-    residuals_px = np.abs(adjustment.values(measurement.unknowns, measurement.points, x)[mine])
+    residuals_px = np.abs(solver.values(measurement.unknowns, measurement.points, x)[mine])
     return float(np.median(residuals_px)) if residuals_px.size else 0.0
 
 
@@ -463,7 +468,7 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
     """
     unknowns, solution = measurement.unknowns, measurement.solution
     deviations, count = unknowns.deviations, adjustment.OF_CAMERA * unknowns.cameras
-    covariance = adjustment.honest_covariance(unknowns, solution)
+    covariance = solver.honest_covariance(unknowns, solution, unknowns.groups[:, 0])
     scale = deviations[:count]
     marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
     sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
