@@ -49,7 +49,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
 @weights_app.command(cls=PlainCommand)
 @command
 def fetch(
-    name: Annotated[str, argument("A name of `bevcli weights list`.", reads=None)],
+    name: Annotated[str, argument("A name of `bevcli weights list`, or hf:OWNER/NAME[@REVISION].", reads=None)],
     options: Annotated[ModelOptions, Part(only=("weights_dir",))],
     force: Annotated[bool, Option("Download a file once more that is there.")] = False,
 ) -> None:
@@ -59,8 +59,13 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.published import named_weights
+    from bevcli.published import hub_model, named_weights
+    from bevcli.registry import hub_of
 
+    if hub_of(name):
+        found = hub_model(name, fetch=True)
+        say(f"{found.source}\n{found.weights}\nnext: bevcli run SEQUENCE --model {name}")
+        return
     fetched = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
     rows = [
         ("weights", f"{fetched.path} ({fetched.known.bytes:,} bytes)"),

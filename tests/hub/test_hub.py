@@ -77,6 +77,7 @@ def test_the_model_of_the_package_is_the_same_from_a_folder(tmp_path):
     there, here = load_model(f"hf:{tmp_path}/demo"), load_model("demo")
     assert (there.config, there.tracker, there.facts) == (here.config, here.tracker, here.facts)
     assert there.weights_hash == here.weights_hash
+    assert there.source.endswith("rendered streets (`bevcli render`) and do not work on real images.")
     stored = [safetensors.torch.load_file(path) for path in (there.weights, bundled_weights("demo"))]
     assert {key: (t.dtype, t.tolist()) for key, t in stored[0].items() if t.ndim < 2} == {
         key: (t.dtype, t.tolist()) for key, t in stored[1].items() if t.ndim < 2
@@ -106,8 +107,11 @@ def test_a_model_is_downloaded_once_then_used_from_the_cache(hub, versions, monk
     assert hub.asked == []
 
 
-def test_fetch_looks_for_a_newer_version_and_a_commit_stays(hub, versions):
-    load_model("hf:team/model")
+def test_fetch_looks_for_a_newer_version_and_a_commit_stays(hub, versions, tmp_path):
+    assert (
+        f"model hf:team/model, commit {FIRST[:12]} (main)\n"
+        in command(tmp_path, "weights", "fetch", "hf:team/model").stdout
+    )
     hub.commits[SECOND] = versions[1]
     assert same_weights(load_model("hf:team/model", fetch=True), versions[1]["model.safetensors"])
     assert same_weights(load_model("hf:team/model"), versions[1]["model.safetensors"])
@@ -177,9 +181,19 @@ def test_a_folder_of_ones_own_model_has_a_card(tmp_path):
     files = ["own/mini.toml", "own/packed", "--weights", "own/w.safetensors"]
     done = command(tmp_path, "weights", "pack", *files)
     assert "own/packed/config.json: already exists; choose another folder, or pass --force" in done.stderr
-    stated = ["--scores", "scores.json", "--scored-on", "our drives", "--datasets", "ours, nuscenes", "--force"]
+    stated = [
+        "--licence",
+        "Our own terms",
+        "--scores",
+        "scores.json",
+        "--scored-on",
+        "our drives",
+        "--datasets",
+        "ours, nuscenes",
+        "--force",
+    ]
     done = command(tmp_path, "weights", "pack", *files, *stated)
-    assert "note: the model card states no licence: others may not use the weights: pass --licence" in done.stderr
+    assert done.stderr == ""
     assert "next: bevcli run SEQUENCE --model hf:./own/packed, and hf upload OWNER/NAME own/packed" in done.stdout
     _, front, text = (tmp_path / "own/packed/README.md").read_text().split("---\n", 2)
     front = yaml.safe_load(front)
@@ -191,9 +205,20 @@ def test_a_folder_of_ones_own_model_has_a_card(tmp_path):
     )
     assert result["dataset"] == {"type": "ours", "name": "our drives"}
     assert result["metrics"] == [{"type": "mAP", "value": 0.25}, {"type": "NDS", "value": 0.5}]
-    assert "license" not in front
+    assert (front["license"], front["license_name"]) == ("other", "Our own terms")
     assert "| mAP | 0.250 |" in text
     assert "car, truck, construction_vehicle" in text
+
+
+def test_what_a_card_lacks_is_said(tmp_path):
+    own = packed_mini(tmp_path / "own", 0).parent
+    done = command(tmp_path, "weights", "pack", own / "mini.toml", "out", "--weights", own / "w.safetensors")
+    assert done.stderr.splitlines() == [
+        "note: the model card states no licence: others may not use the weights: pass --licence NAME",
+        "note: the model card states no data of the training: pass --datasets NAME",
+        "note: the model card states no scores: pass --scores FILE.json",
+    ]
+    assert "license" not in yaml.safe_load((tmp_path / "out/README.md").read_text().split("---\n")[1])
 
 
 def test_the_hub_reads_the_front_matter(tmp_path):

@@ -224,7 +224,8 @@ def _size(folder: Path) -> str:
     total = count = 0
     for place, _, files in os.walk(folder):
         for file in files:
-            total += os.lstat(os.path.join(place, file)).st_size
+            with suppress(OSError):  # it is gone
+                total += os.lstat(os.path.join(place, file)).st_size
             count += 1
         if count > MOST_FILES:
             return f"over {total / 1e6:.0f} MB"

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,8 +149,12 @@ model = bevcli.load_model("hf:OWNER/NAME")
 
 
 def _front_matter(config: ModelConfig, facts: CardFacts) -> dict[str, Any]:
+    licence = facts.licence.lower()
+    named = {"license": licence}
+    if not re.fullmatch(r"[a-z0-9.-]*", licence):  # no identifier of the Hub
+        named = {"license": "other", "license_name": facts.licence}
     front: dict[str, Any] = {
-        "license": facts.licence.lower(),
+        **named,
         "library_name": "bevcli",
         "pipeline_tag": "object-detection",
         "tags": ["bevcli", config.architecture.lower(), "3d-object-detection", "bird-eye-view", "multi-camera"],

@@ -24,6 +24,7 @@ class PackedConfig(msgspec.Struct, frozen=True, kw_only=True):
         format: FORMAT.
         weights: hash and size of model.safetensors.
         model: contents of the model file, as TOML would have them.
+        limit: a sentence on what the weights are not for, which a run prints; "" for none.
     """
 
     library_name: str
@@ -31,6 +32,7 @@ class PackedConfig(msgspec.Struct, frozen=True, kw_only=True):
     format: int
     weights: Known
     model: dict[str, Any]
+    limit: str = ""
 
 
 def read_folder(folder: Path, source: str, mend: str = "pack the model anew") -> HubModel:
@@ -62,7 +64,7 @@ def read_folder(folder: Path, source: str, mend: str = "pack the model anew") ->
             f"{weights}: has the SHA-256 {found.sha256} and {found.bytes:,} bytes (expected {config.weights.sha256} "
             f"and {config.weights.bytes:,}, as config.json states): {mend}"
         )
-    return HubModel(config.model, path, weights, source)
+    return HubModel(config.model, path, weights, f"{source}: {config.limit}" if config.limit else source)
 
 
 @lru_cache(maxsize=8)

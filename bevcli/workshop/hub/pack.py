@@ -58,8 +58,15 @@ def pack_model(
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
     weights = safetensors.torch.save(tensors, dict(checkpoint.facts))
     known = Known(hashlib.sha256(weights).hexdigest(), len(weights))
-    packed = PackedConfig(library_name="bevcli", bevcli_version=__version__, format=FORMAT, weights=known, model=table)
     facts = facts_of(name, checkpoint, chosen)
+    packed = PackedConfig(
+        library_name="bevcli",
+        bevcli_version=__version__,
+        format=FORMAT,
+        weights=known,
+        model=table,
+        limit=facts.limit,
+    )
     texts = [
         json.dumps(msgspec.to_builtins(packed), indent=1, ensure_ascii=False) + "\n",
         model_card(config, facts, checkpoint.parameters),
