@@ -107,8 +107,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     notes = list(drive.notes)
     if model.untrained:
         notes.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
-    if model.engine_note:
-        notes.append(model.engine_note)
+    notes += [note for note in (model.source, model.engine_note) if note]
     if model.is_exported:
         notes.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:

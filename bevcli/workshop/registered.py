@@ -81,10 +81,18 @@ OWN: dict[Group, dict[str, str]] = {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
         "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",
     },
+    # A function of a model's name after "hf:": see `bevcli.published.hub_model`.
+    "bevcli.hubs": {
+        "hf": "bevcli.workshop.hub.download:open_model",
+    },
+    "bevcli.packings": {
+        "hf": "bevcli.workshop.hub.pack:pack_model",
+    },
     "bevcli.commands": {
         "batch": "bevcli.workshop.batch.commands:batch",
         "bench": "bevcli.workshop.benchmark.commands:bench",
         "calibrate": "bevcli.workshop.calibration.commands:calibrate",
+        "checks": "bevcli.workshop.checks.commands:checks",
         "convert": "bevcli.workshop.formats.commands:convert",
         "demo": "bevcli.workshop.synth.commands:demo",
         "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
