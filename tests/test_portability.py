@@ -4,7 +4,6 @@ import ast
 import re
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,13 +23,8 @@ NAMES = {
         "SIG_BLOCK", "SIG_SETMASK", "alarm", "pause", "pthread_sigmask", "setitimer", "sigwait",
     },
 }  # fmt: skip
+MENTIONED = re.compile(rf"\b({'|'.join(MODULES.union(*NAMES.values()))})\b")
 GUARD = re.compile(r"sys\.platform|os\.name|hasattr\(|getattr\(|except ImportError")
-
-
-@cache
-def parsed(path: Path) -> tuple[str, ast.Module]:
-    text = path.read_text(encoding="utf-8")
-    return text, ast.parse(text)
 
 
 def parents(tree: ast.AST) -> dict[ast.AST, ast.AST]:
@@ -46,8 +40,10 @@ def is_guarded(node: ast.AST, above: dict[ast.AST, ast.AST], text: str) -> bool:
 
 
 def needed_from_posix(path: Path) -> list[str]:
-    text, tree = parsed(path)
-    wrong = list[str]()
+    text = path.read_text(encoding="utf-8")
+    if not MENTIONED.search(text):
+        return []
+    tree, wrong = ast.parse(text), list[str]()
     above = parents(tree)
     for node in ast.walk(tree):
         names = []
@@ -78,7 +74,9 @@ def test_text_files_state_their_encoding() -> None:
     """Windows reads and writes text in its own encoding unless it is stated."""
     wrong = []
     for path in FILES:
-        for node in ast.walk(parsed(path)[1]):
+        text = path.read_text(encoding="utf-8")
+        calls = ast.walk(ast.parse(text)) if re.search(r"_text\(|\bopen\(", text) else ()
+        for node in calls:
             if not isinstance(node, ast.Call) or any(keyword.arg in ("encoding", None) for keyword in node.keywords):
                 continue
             function = node.func
