@@ -7,7 +7,13 @@
 # make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv
+ifeq ($(OS),Windows_NT)
+BIN := $(VENV)/Scripts
+PYTHON := python
+else
 BIN := $(VENV)/bin
+PYTHON := python3
+endif
 USER := $(VENV)/.user
 DEVELOPER := $(VENV)/.developer
 WRITER := $(VENV)/.docs
@@ -25,7 +31,7 @@ endif
 install: $(DEVELOPER)
 
 $(USER): pyproject.toml constraints.txt
-	test -x $(BIN)/python || python3 -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --editable .
 	touch $@
 

@@ -36,7 +36,7 @@ SECTIONS = {
     "Calibrate": ["docs/calibration"],
     "Score": ["docs/scoring", "docs/compare", "docs/robustness"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
-    "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
+    "Deploy": ["docs/deploy", "docs/containers", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/service", "docs/extend", "docs/reference"],
     "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG"],
