@@ -54,7 +54,7 @@ def run(
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
-    without_poses = not (format_options["ego_motion_file"] or format_of(sequence).has_poses)
+    without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
     if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)

@@ -70,6 +70,10 @@ python_maximum_signature_line_length = 88
 html_theme = "furo"
 html_title = f"bevcli {version}"
 html_extra_path = ["index.html"]
+templates_path = ["templates"]
+# Those of furo, and the link to the list of versions that versions.py writes.
+_SCROLLED = ["sidebar/scroll-start.html", "sidebar/navigation.html", "sidebar/scroll-end.html"]
+html_sidebars = {"**": ["sidebar/brand.html", "versions.html", "sidebar/search.html", *_SCROLLED]}
 html_show_sourcelink = False
 html_copy_source = False
 html_math_renderer = "mathml"
