@@ -13,6 +13,7 @@ Group = Literal[
     "bevcli.model_uses",
     "bevcli.sequences",
     "bevcli.poses",
+    "bevcli.motion",
     "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",

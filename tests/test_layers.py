@@ -47,7 +47,7 @@ WINGS: dict[str, set[str]] = {
     "correspondence": set(),
     "engines": set(),
     "formats": set(),
-    "odometry": {"correspondence"},
+    "odometry": {"correspondence", "formats"},
     "robustness": {"calibration", "synth"},
     "synth": {"formats"},
     "scores": set(),

@@ -43,7 +43,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, load_with_bar
+        from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.rig.standing_check import IMAGES_MOVE, StandingCheck
@@ -55,10 +55,11 @@ def run(
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
     without_poses = not (format_options["ego_motion_file"] or format_of(sequence).has_poses)
-    if source.ego_motion == "required" and without_poses:
+    if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
-    drive = open_sequence(sequence, reading, **format_options)
+    with odometry_bar() as show_steps:
+        drive = open_sequence(sequence, replace(reading, after_step=show_steps), **format_options)
     for step in first:
         drive = step(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))

@@ -47,6 +47,10 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.poses": {
         "files": "bevcli.workshop.formats.poses:read_poses",
     },
+    "bevcli.motion": {
+        "drive": "bevcli.workshop.odometry.run_option:with_measured_motion",
+        "live": "bevcli.workshop.odometry.live:LiveMotion",
+    },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
         "native": "bevcli.workshop.formats.output:NATIVE",
@@ -84,6 +88,7 @@ OWN: dict[Group, dict[str, str]] = {
         "convert": "bevcli.workshop.formats.commands:convert",
         "demo": "bevcli.workshop.synth.commands:demo",
         "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
+        "odometry": "bevcli.workshop.odometry.commands:odometry",
         "quantize": "bevcli.workshop.engines.commands:quantize",
         "render": "bevcli.workshop.synth.commands:render",
         "reproduce": "bevcli.workshop.batch.commands:reproduce",

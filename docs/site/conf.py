@@ -29,6 +29,7 @@ SECTIONS = {
         "docs/weights",
         "docs/other-inputs",
         "docs/video",
+        "docs/odometry",
         "docs/recording",
         "docs/rendered-drives",
     ],
