@@ -35,9 +35,7 @@ def test_the_motion_of_a_rendered_drive_is_found() -> None:
     assert max(degrees) < 0.03
     assert not any(step.reason for step in motion.steps)
     way = sum(float(np.linalg.norm(step[:3, 3])) for step in true)
-    end = (
-        inverse(inverse(drive.load(0).world_from_ego.matrix) @ drive.load(7).world_from_ego.matrix) @ motion.poses[-1]
-    )
+    end = inverse(inverse(drive.load(0).world_from_ego.matrix) @ drive.load(7).world_from_ego.matrix) @ motion.poses[-1]
     assert np.linalg.norm(end[:3, 3]) < 0.005 * way
     moved = MeasuredDrive(drive, motion).load(4)
     np.testing.assert_allclose(moved.kinematics.velocity, drive.load(4).kinematics.velocity, atol=0.15)

@@ -13,7 +13,10 @@ from bevcli.workshop.odometry.twist import exponential, logarithm
 TURN, PLACE, SLOPES, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 8), 8  # the indices of the unknowns
 COUNT = 9
 STATE = slice(0, 8)  # those that a start has
-SUSPENSION_RAD, SUSPENSION_M = np.radians(0.7), 0.01  # of pitch and roll, and of the height, between two frames
+SUSPENSION_RAD, SUSPENSION_M = (
+    np.radians(0.7),
+    (0.01, 0.01),
+)  # of pitch and roll, and of the height (and as a share of the way), between two frames
 YAW_RAD, ALONG = np.radians(3.0), 0.3  # by which the start may be wrong, the second as a share of the distance
 SHORTEST_M = 0.5  # distance for that share
 SLOPE_RAD, CHANGE_RAD = np.radians(1.0), np.radians(0.2)  # of the road under the vehicle, and its change in a step
@@ -84,7 +87,6 @@ def deviations_at(start: Array, height_m: float, slope_rad: float, *, known_dist
     known_distance: hold the distance of the start, and let the direction be anything.
     """
     wide = max(float(np.hypot(*start[3:5])), SHORTEST_M) * ALONG
+    over = SUSPENSION_M[0] + SUSPENSION_M[1] * float(np.hypot(*start[3:5]))
     along = 1e-3 if known_distance else wide
-    return np.array(
-        [SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, SUSPENSION_M, slope_rad, slope_rad, height_m]
-    )
+    return np.array([SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, over, slope_rad, slope_rad, height_m])
