@@ -19,7 +19,7 @@ from bevcli.workshop.correspondence.road import contrast, flow_at, sampled
 
 CELL_M = 0.08
 BEGIN_M, SHAPE = (-24.0, -9.0), (225, 640)  # the smallest x and y; cells along y and x
-SLOPE_STEP, KEPT = np.radians(0.1), 3  # of grids
+SLOPE_STEP, KEPT = np.radians(0.25), 3  # of grids
 MOST_BLUR_M = 0.45  # of the road in one pixel, along the ray
 MARGIN = 9  # cells, between cameras
 TILE, ASIDE = 25, 2  # cells: side of a tile, and by how much it may lie beside the way

@@ -11,7 +11,7 @@ from bevcli.workshop.correspondence.images import GreyImage, grey_image, reduced
 from bevcli.workshop.correspondence.points import Features, features
 from bevcli.workshop.odometry.above import RoadGrids, RoadPicture
 
-PIXELS, WIDEST = 2.2e6, 1250  # of all reduced images of a frame together, and the width of one
+PIXELS, WIDEST = 1.8e6, 1250  # of all reduced images of a frame together, and the width of one
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,11 @@ class StepUnknowns:
     def geometry(self, local: Array) -> GroupGeometry:
         """The geometry of all groups."""
         x, (times, of_group) = local[0], self._times
-        poses = exponential(times[:, None] * logarithm(self.motion(x)))  # in the first ego frame
+        motion = self.motion(x)
+        if set(times.tolist()) <= {0.0, 1.0}:
+            poses = np.where(times[:, None, None] > 0, motion, np.eye(4))
+        else:
+            poses = exponential(times[:, None] * logarithm(motion))  # in the first ego frame
         between = inverse(poses)[:, None] @ poses  # (T, T, 4, 4)
         raised = rigid((0, 0, x[HEIGHT]))
         a, b = (raised @ side for side in self.sides)
