@@ -14,6 +14,7 @@ from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.workshop.odometry import OdometryOptions
 from bevcli.workshop.odometry.chain import Chain
 from bevcli.workshop.odometry.frames import FrameView, Viewer
+from bevcli.workshop.odometry.seen_points import SeenPoints
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, StepViews, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.twist import exponential, logarithm
 from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
@@ -37,6 +38,7 @@ class MeasuredStep:
             it was measured.
         matches: number of matched points that were used.
         road_points: number of points of the road that were used.
+        seen: some of both, for recordings; None where nothing was measured.
     """
 
     ego_a_from_ego_b: Array
@@ -44,6 +46,7 @@ class MeasuredStep:
     reason: str = ""
     matches: int = 0
     road_points: int = 0
+    seen: SeenPoints | None = None
 
     @property
     def deviations(self) -> Array:
@@ -112,15 +115,21 @@ class MotionMeter:
         step = StepViews(last, view)
         found = candidates(step, Guess(self._expected(seconds), self._options.height_m))
         if not found:
-            return [*self.finish(), self._guess(seconds, reason_of(step))]
+            before, self._guessed = self.finish(), self._guessed + 1
+            return [*before, self._guess(seconds, reason_of(step))]
         decided = self._chain.add(found, seconds)
         likeliest = self._chain.likeliest
         assert likeliest is not None
-        before = [] if decided is None else [self._decided(decided)]
-        self._seconds = seconds
+        steps, self._seconds = [] if decided is None else [self._decided(decided)], seconds
         if is_measured(likeliest):
             self._before = likeliest.state, seconds
-        return before
+        return steps
+
+    @property
+    def newest(self) -> MeasuredStep | None:
+        """The step that is not decided, with the motion that is the likeliest so far; None where all are."""
+        likeliest = self._chain.likeliest
+        return None if likeliest is None else self._step(likeliest)
 
     def finish(self) -> list[MeasuredStep]:
         """The step that is not decided, if there is one. Called after the last frame."""
@@ -128,15 +137,19 @@ class MotionMeter:
         return [] if decided is None else [self._decided(decided)]
 
     def _decided(self, candidate: Candidate) -> MeasuredStep:
+        self._guessed = 0 if is_measured(candidate) else self._guessed + 1
+        return self._step(candidate)
+
+    def _step(self, candidate: Candidate) -> MeasuredStep:
         """A motion as measured, or a guess where the images do not tell it."""
         if not is_measured(candidate):
             return self._guess(self._seconds, NOT_TOLD)
-        self._guessed = 0
         return MeasuredStep(
             motion_of(candidate.state),
             candidate.covariance,
             matches=candidate.matches,
             road_points=candidate.road_points,
+            seen=candidate.seen,
         )
 
     def _expected(self, seconds: float) -> Array | None:
@@ -150,8 +163,7 @@ class MotionMeter:
 
     def _guess(self, seconds: float, reason: str) -> MeasuredStep:
         state = self._expected(seconds)
-        self._guessed += 1
-        wide = seconds * np.sqrt(self._guessed) if state is not None else seconds * UNKNOWN
+        wide = seconds * np.sqrt(max(1, self._guessed)) if state is not None else seconds * UNKNOWN
         deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
         motion = np.eye(4) if state is None else motion_of(state)
         return MeasuredStep(motion, np.diag(deviations**2), reason)
@@ -208,6 +220,7 @@ class MeasuredDrive(DerivedSequence):
     def __init__(self, sequence: Sequence, motion: MeasuredMotion) -> None:
         super().__init__(sequence)
         self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
+        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
 
     def load(self, place: int) -> Frame:
         return self._moved(self.sequence.load(place))
@@ -226,4 +239,5 @@ class MeasuredDrive(DerivedSequence):
             ground_truth=None if truth is None else truth.transformed(moved),
             world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
             kinematics=motion.kinematics_at(time),
+            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
         )

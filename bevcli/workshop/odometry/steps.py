@@ -13,6 +13,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
     COUNT,
@@ -26,7 +27,7 @@ from bevcli.workshop.odometry.unknowns import (
     next_slopes,
 )
 
-YAWS = np.radians(np.arange(-30, 30.1, 2.0))  # that are tried, besides those of the last step
+YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
 STILL_PX, STILL_SHARE = 0.6, 0.7  # of matched points of a vehicle that stands
 STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
@@ -45,12 +46,11 @@ MOST_PX = (30.0, 8.0)  # of points of two cameras
 LEAST_SHARE = 0.3  # of the points of two cameras that fit; where fewer do, both see nothing in common
 LEAST_SPREAD, MOST_SPREAD = 0.3, 2.0  # of residuals, while the motion is searched
 CANDIDATES = 3  # distances of a step that are measured
-SLOPES_TRIED, LEVEL = (
-    np.radians([-2.0, -1, 0, 1, 2]),
-    0.9,
-)  # along x, while none is known; factor of the votes of a slope
+SLOPES_TRIED = np.radians([-1.25, 0.0, 1.25])  # of the road along x, while none is known
+LEVEL = 0.9  # factor of the votes of such a slope
 LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
 APART_M = 0.4  # between them
+FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
 
@@ -69,6 +69,7 @@ class Candidate:
         votes: of the road for its distance.
         matches: number of matched points.
         road_points: number of points of the road.
+        seen: some of both, for recordings.
     """
 
     state: Array
@@ -76,6 +77,7 @@ class Candidate:
     votes: float
     matches: int
     road_points: int
+    seen: SeenPoints | None = None
 
     def speed_and_rate(self, seconds: float) -> Array:
         """(2,) the speed (m/s, negative backwards) and the yaw rate (radians a second) of a step of some seconds."""
@@ -216,12 +218,13 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
         votes[np.sign(distances) == -sense] = 0
         rounds.append((votes.max() * (1.0 if slope == 0 else LEVEL), tried, roads, distances, votes))
     _, tried, roads, distances, votes = max(rounds, key=lambda each: each[0])
-    found = []
+    starts = []
     for index in _peaks(votes)[:CANDIDATES]:
         start = tried.copy()
         start[3:5] = distances[index] * np.array([np.cos(heading), np.sin(heading)])
-        found.append(measured(step, points, start, guess, float(votes[index]), roads))
-    return found
+        starts.append((start, float(votes[index])))
+    # Without road, two cameras may still tell the distance.
+    return [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
 
 
 def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
@@ -269,8 +272,10 @@ def measured(
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
     covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance)
-    return Candidate(state, motion, votes, len(fitting.group), len(road.group))
+    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + FLOOR
+    kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
+    seen = seen_points(step.second.cameras, *kinds)
+    return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
 
 
 @dataclass(frozen=True)
