@@ -22,6 +22,8 @@ Group = Literal[
     "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
+    "bevcli.hubs",
+    "bevcli.packings",
     "bevcli.commands",
     "bevcli.extensions",
 ]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
@@ -31,7 +32,8 @@ CPU = torch.device("cpu")
 # Functions that read numbers back, to answer with a Python value or to find out a shape.
 READING = {
     torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.cpu, torch.Tensor.__bool__, torch.Tensor.__int__,
-    torch.Tensor.__float__, torch.Tensor.__index__, torch.Tensor.nonzero, torch.nonzero, torch.equal,
+    torch.Tensor.__float__, torch.Tensor.__complex__, torch.Tensor.__index__, torch.Tensor.__contains__,
+    torch.Tensor.__format__, torch.Tensor.__repr__, torch.Tensor.nonzero, torch.nonzero, torch.equal,
     torch.Tensor.equal, torch.masked_select, torch.Tensor.masked_select, torch.unique, torch.Tensor.unique,
     torch.unique_consecutive, torch.allclose, torch.isin, torch.argwhere, torch.bincount, torch.is_nonzero,
     torch.linalg.solve, torch.linalg.inv, torch.inverse,
@@ -51,6 +53,10 @@ class OnDevice(torch.Tensor):
 
     held: Tensor
     home: SimulatedDevice
+
+    def record_stream(self, stream: Any) -> None:
+        """Memory is never given away too early."""
+        assert isinstance(stream, Stream)
 
 
 class SimulatedDevice(TorchFunctionMode):
@@ -91,6 +97,8 @@ class SimulatedDevice(TorchFunctionMode):
         kwargs = dict(kwargs or {})
         if function is torch.Tensor.to and not any(isinstance(x, Tensor) for x in args[1:]):
             return self._to(*args, **kwargs)
+        if function is torch.Tensor.__deepcopy__:
+            return self._copied(*args)
         tensors = [leaf for leaf in tree_flatten((args, kwargs))[0] if isinstance(leaf, Tensor)]
         ours = {id(x.held): x for x in tensors if isinstance(x, OnDevice)}
         device = None if kwargs.get("device") is None else torch.device(kwargs["device"])
@@ -144,6 +152,9 @@ class SimulatedDevice(TorchFunctionMode):
                 self.wait("index of the CPU")
             if any(isinstance(x, Tensor) and x.dtype == torch.bool for x in parts):
                 self.wait("index of a mask")
+            ends = [end for x in parts if isinstance(x, slice) for end in (x.start, x.stop, x.step)]
+            if any(isinstance(x, OnDevice) and not x.ndim and x.dtype != torch.bool for x in (*parts, *ends)):
+                self.wait("index of one element")
         elif any(not isinstance(x, OnDevice) and (x.ndim or self.tape is not None) for x in tensors):
             raise RuntimeError(f"{name}: tensors on {self.device} and on the CPU")
         by_tensor = function in REPEATING and isinstance(args[1], Tensor) and kwargs.get("output_size") is None
@@ -151,6 +162,14 @@ class SimulatedDevice(TorchFunctionMode):
         one_hot = function is torch.nn.functional.one_hot and len(args) == 1 and "num_classes" not in kwargs
         if function in READING or by_tensor or by_condition or one_hot:
             self.wait(name)
+
+    def _copied(self, tensor: Tensor, copies: dict[int, Any]) -> Tensor:
+        """A deep copy. copies: of other tensors, on any device."""
+        if not isinstance(tensor, OnDevice):
+            return tensor.__deepcopy__(copies)
+        copy = self.tensor(tensor.held.__deepcopy__({}))
+        copy._is_param = isinstance(tensor, torch.nn.Parameter)  # what makes it one
+        return copies.setdefault(id(tensor), copy)
 
     def _to(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         kwargs.pop("copy", None)
@@ -168,7 +187,7 @@ class SimulatedDevice(TorchFunctionMode):
             if self.tape is not None or not (non_blocking and is_pinned(tensor)):
                 self.wait("upload")
             return self.tensor(changed.detach().clone())
-        if there:
+        if there and (self.tape is not None or not non_blocking):  # the latter copies to pinned memory
             self.wait("copy to the CPU")
         return changed
 
@@ -218,14 +237,18 @@ class Graph:
 class Event:
     """An event that takes no time."""
 
-    def __init__(self, *, enable_timing: bool) -> None:
-        assert enable_timing
+    def __init__(self, device: SimulatedDevice, *, enable_timing: bool = False) -> None:
+        self.device, self.enable_timing = device, enable_timing
 
-    def record(self, stream: Stream) -> None:
-        assert isinstance(stream, Stream)
+    def record(self, stream: Stream | None = None) -> None:
+        assert stream is None or isinstance(stream, Stream)
+
+    def synchronize(self) -> None:
+        self.device.wait("event")
 
     def elapsed_time(self, later: Event) -> float:
-        assert isinstance(later, Event)
+        assert self.enable_timing
+        assert later.enable_timing
         return 0.0
 
 
@@ -282,6 +305,11 @@ def convolution_add_relu(x, weight, shortcut, alpha, bias, *rest):  # type: igno
     return (F.conv2d(x, weight, bias, *rest) + alpha * shortcut).relu()
 
 
+def in_turn(work: Any, items: Any, *_options: int, load: Callable[..., Any] = lambda item: item) -> Iterator[Any]:
+    """As `read_ahead`, without threads: a mode of PyTorch's functions is one thread's."""
+    return (work(load(item)) for item in items)
+
+
 def provide_triton(monkeypatch: Any) -> None:
     """Puts the parts of Triton that surround a kernel in the place of a Triton that is not installed."""
     if find_spec("triton") is not None:
@@ -310,6 +338,7 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     device = SimulatedDevice(name)
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
     monkeypatch.setattr("bevcli.inference.pipeline.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
+    monkeypatch.setattr("bevcli.inference.runner.read_ahead", in_turn)
     monkeypatch.setattr(torch.mps, "synchronize", lambda: None)
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
@@ -346,10 +375,29 @@ def _provide_cuda(device: SimulatedDevice, monkeypatch: Any) -> None:
         "stream": lambda which: contextlib.nullcontext(),
         "Stream": lambda which: Stream(device),
         "current_stream": lambda which: stream,
-        "Event": Event,
+        "synchronize": lambda which=None: device.wait("synchronize"),
+        "Event": partial(Event, device),
         "CUDAGraph": Graph,
         "graph_pool_handle": lambda: "pool",
         "graph": capture,
     }
     for part, value in parts.items():
         monkeypatch.setattr(torch.cuda, part, value)
+
+
+def provide_training(device: SimulatedDevice, monkeypatch: Any) -> None:
+    """Replaces what else a training asks of a GPU: autocast, random numbers, the kernel with gradients."""
+    from bevcli.model.kernels import triton_attention
+
+    monkeypatch.setattr(triton_attention, "TritonSampling", GridSampling)
+    grouped = torch.nn.utils.clip_grad._group_tensors_by_device_and_dtype
+
+    def grouped_there(lists: Any, **options: Any) -> Any:
+        return {(device.device, dtype): found for (_, dtype), found in grouped(lists, **options).items()}
+
+    monkeypatch.setattr(torch.nn.utils.clip_grad, "_group_tensors_by_device_and_dtype", grouped_there)
+    autocast, generator = torch.autocast, torch.Generator
+    monkeypatch.setattr(torch, "autocast", lambda kind, *args, **options: autocast("cpu", *args, **options))
+    monkeypatch.setattr(torch, "Generator", lambda which=CPU: generator())
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda which: torch.get_rng_state())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, which: None)

@@ -230,7 +230,7 @@ class Session:
     def _measured(self, frame: Frame, kinematics: Kinematics | None) -> Frame:
         """The frame with its measured pose. The history gets the pose of the frame before as it is known now."""
         if self._meter is None:
-            self._meter = load("bevcli.motion", "images")()
+            self._meter = load("bevcli.motion", "live")()
         before, pose = self._meter.add(frame)
         if before is not None and self.frame is not None:
             memory = with_pose(self._state.memory, self.frame.world_from_ego, before)

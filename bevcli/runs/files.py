@@ -95,6 +95,7 @@ class RunFiles:
             "classes": list(config.classes),
             **({"class_settings": settings} if settings else {}),
             "range_m": grid.nearest_side_m,
+            **({"ego_motion": "measured"} if sequence.facts.motion_measured else {}),
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
         with self._stack:  # closes what is open if the next one cannot be opened
@@ -122,8 +123,8 @@ class RunFiles:
 
             restore_index(self._out / RECORDING)
 
-    def write(self, frame: Frame, prediction: Prediction) -> None:
-        """Add a frame to every file."""
+    def write(self, frame: Frame, prediction: Prediction, *, more: bool = False) -> None:
+        """Add a frame to every file. more: see `Recording.log`."""
         if prediction.segmentation is not None:
             maps = self._out / SEGMENTATION
             self._folder.add(map_path(maps, frame.stamp.index))
@@ -132,7 +133,7 @@ class RunFiles:
         if self._options.save_bev is not None and prediction.bev is not None:
             _save_bev(self._options.save_bev, prediction, self._model)
             self._bev_frames.append(frame.stamp.index)
-        self._recording.log(frame, prediction)
+        self._recording.log(frame, prediction, more=more)
         extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
         if prediction.not_finite:
             extras["not_finite"] = prediction.not_finite

@@ -82,6 +82,7 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
         "frames of the input": f"{len(sequence.stamps)}, {digest(sequence.stamps)[:DIGITS]}",
         "calibration": digest(sequence.rig)[:DIGITS],
+        "ego-motion": "measured from the images" if sequence.facts.motion_measured else "of the input",
         "files of the input": digest(tuple(map(_file_facts, sequence.input_files)))[:DIGITS],
         "images of the input": _image_facts(sequence),
     }
@@ -128,10 +129,10 @@ class RunWriter(contextlib.AbstractContextManager["RunWriter"]):
         if self._is_whole and self._after is not None:
             self.save(self._after)
 
-    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any]) -> None:
-        """Write the next frame. after: the state of the runner after it."""
+    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any], *, more: bool = False) -> None:
+        """Write the next frame. after: the state of the runner after it. more: see `Recording.log`."""
         self._is_whole, began = False, time.perf_counter()
-        self._files.write(frame, prediction)
+        self._files.write(frame, prediction, more=more)
         now = time.perf_counter()
         self._summary.add(frame, prediction, recording_s=now - began, whole_s=now - self._frame_began)
         self._after, self._is_whole, self._frame_began = after, True, now

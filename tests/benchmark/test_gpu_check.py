@@ -8,6 +8,7 @@ import math
 import gpu_check
 import pytest
 import torch
+from simulated_device import simulated
 
 CPU = torch.device("cpu")
 
@@ -34,6 +35,20 @@ def test_a_device_that_agrees_with_the_cpu_passes(small_model_file, monkeypatch)
     assert "error" not in fp32
     assert fp32["wall, ms"] > 0
     assert bf16["largest difference, m"] > fp32["largest difference, m"]
+
+
+@pytest.mark.slow
+def test_a_model_is_measured_as_on_a_gpu(small_model_file, monkeypatch):
+    """On a simulated GPU, so that no line fails first where a GPU is at hand for minutes only."""
+    monkeypatch.setattr(gpu_check, "COMPARED_ON_CPU", (str(small_model_file),))
+    monkeypatch.setattr(gpu_check, "RUNS_S", 1.0)
+    with simulated("cuda:0", monkeypatch, lambda *_, **__: None) as device:
+        on_cpu, *rows = gpu_check.measure_model(str(small_model_file), device.device)
+    assert on_cpu["boxes within 0.1 m"] == 1
+    assert [row["precision"] for row in rows] == ["fp16", "bf16", "fp32"]
+    assert not [row["error"] for row in rows if "error" in row]
+    assert rows[0].keys() == gpu_check.COLUMNS.keys() - {"error"}
+    assert all(row["wall, ms"] > 0 for row in rows)
 
 
 def test_numbers_that_are_too_far_apart_are_an_error():
@@ -78,9 +93,9 @@ def test_a_part_that_fails_does_not_end_the_others(monkeypatch, tmp_path, capsys
 def test_a_process_that_hangs_ends_with_the_time(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "BUDGET_S", 0.1)
     check = gpu_check.Check(CPU, tmp_path / "report.md")
-    with pytest.raises(gpu_check.CheckFailed, match=r"b: not done when the 0\.1 s of the check were over"):
+    with pytest.raises(gpu_check.CheckFailed, match=r"b: not done when its part of the 0\.1 s of the check was over"):
         list(check.process(["sleep", "5"], "b"))
-    with pytest.raises(gpu_check.CheckFailed, match=r"c: not run, because the 0\.1 s of the check are over"):
+    with pytest.raises(gpu_check.CheckFailed, match=r"c: not run, because its part of the 0\.1 s of the check is over"):
         list(check.process(["sleep", "5"], "c"))
 
 

@@ -172,6 +172,14 @@ def test_a_step_with_a_tensor_on_another_device_is_stopped():
         assert device.waits == []
         there[[0, 2]], there.sum().item(), there.cpu(), there[there > 0]
         assert device.waits == ["index of the CPU", "item", "cpu", "index of a mask"]
+        device.waits.clear()
+        count = there.sum().int()
+        there[count], there[:count], there[0, ...], 1.0 in there, f"{count}", there.to(CPU), range(count)
+        assert device.waits == [
+            "index of one element", "index of one element", "__contains__", "__format__", "copy to the CPU", "__index__"
+        ]  # fmt: skip
+        there.to(CPU, non_blocking=True), torch.cat([there, there])  # to pinned memory
+        assert len(device.waits) == 6
     with SimulatedDevice("mps"), pytest.raises(TypeError, match="no float64"):
         torch.zeros(3, device="mps").double()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from simulated_device import sample_hits_plainly
@@ -15,9 +16,11 @@ from torch import Tensor, nn
 
 from bevcli.config import known_models, load_config
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import GridSampling
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, predicted_deformable_convolution
+from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.compiled import Hits
+from bevcli.model.network import build_network
 from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
@@ -25,17 +28,33 @@ FAR = 1e6  # where positions have no gradients
 SCALE = 32  # channels are divided by it
 
 
-def attention_shapes(config: ModelConfig) -> set[tuple[int, int, int, int, bool]]:
-    """(heads, channels of a head, levels, points, whether the values are image features) of a model's attentions."""
-    encoder, decoder, segmentation = config.encoder, config.decoder, config.segmentation
-    found = {
-        (encoder.attention_heads, 1, encoder.temporal_points, False),
-        (encoder.attention_heads, config.encoder_levels, encoder.spatial_points, True),
-        (decoder.attention_heads, 1, decoder.points, False),
-    }
-    if "segmentation" in config.heads:
-        found.add((segmentation.attention_heads, 1, segmentation.points, False))
-    return {(heads, config.channels // heads, levels, points, images) for heads, levels, points, images in found}
+class AttentionShape(NamedTuple):
+    """Of a deformable attention. depth: channels of a head. maps: that a query samples, each with its own points.
+
+    pillar_points: reference points of a hit.
+    """
+
+    heads: int
+    depth: int
+    levels: int
+    points: int
+    maps: int = 1
+    pillar_points: int = 1
+
+
+def attention_shapes(config: ModelConfig) -> set[AttentionShape]:
+    """The shapes of a model's attentions."""
+    with torch.device("meta"):
+        parts = list(build_network(config).modules())
+    pillars = {id(part.attention) for part in parts if isinstance(part, SpatialCrossAttention)}
+    found = set()
+    for part in parts:
+        if isinstance(part, DeformableAttention):
+            heads, maps, levels, points = part.shape
+            depth = part.value_projection.out_features // heads
+            of_hit = config.bev_grid.pillar_points if id(part) in pillars else 1
+            found.add(AttentionShape(heads, depth, levels, points, maps, of_hit))
+    return found
 
 
 def convolution_shapes(config: ModelConfig) -> set[tuple[int, int, int]]:
@@ -104,8 +123,9 @@ def main() -> None:
     def sampling(module: nn.Module, levels: int, counts: Sequence[int]) -> Callable[..., Tensor]:
         return lambda values, locations, weights: module(values, LEVEL_SHAPES[:levels], locations, weights, counts)
 
-    samplings = {(*shape[:1], 6, *shape[2:4], (0, 5, 0, 2)) for each in configs for shape in attention_shapes(each)}
-    for heads, depth, levels, points, counts in [*sorted(samplings), (2, 8, 1, 4, (1,)), (2, 8, 1, 4, (0, 0))]:
+    attentions = sorted(set().union(*map(attention_shapes, configs)))
+    samplings = sorted({(*shape[:4], (0, 5, 0, 2)) for shape in attentions})
+    for heads, depth, levels, points, counts in [*samplings, (2, 6, 1, 4, (1,)), (2, 6, 1, 4, (0, 0))]:
         inputs = attention_case(heads, depth, levels, points, counts)
         both = [sampling(module, levels, counts) for module in (GridSampling(), TritonSampling())]
         compare(f"attention {heads, depth, levels, points, counts}", inputs, *both)
@@ -115,8 +135,10 @@ def main() -> None:
         "attention in half precision", inputs, *(sampling(each(), 1, (3,)) for each in (GridSampling, TritonSampling))
     )
 
-    for case in ((2, 6, 4, 8, 1, 4), (2, 6, 1, 4, 2, 1), (1, 8, 3, 5, 1, 1)):
-        compare_hits(*case)
+    for shape in (*attentions, AttentionShape(1, 6, 3, 5)):
+        compare_hits(shape, (0, 40, 0, 3))
+    for counts in ((1,), (0,), (0, 0, 1)):
+        compare_hits(AttentionShape(2, 6, 1, 4, 2), counts)
 
     def convolutions(stride: int) -> list[Callable[..., Tensor]]:
         versions = (predicted_deformable_convolution, convolution.deformable_convolution)
@@ -131,11 +153,11 @@ def main() -> None:
     compare_stems()
 
 
-def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: int, pillar_points: int) -> None:
-    """Compare the sums of hits with those by tables; some hits lie far outside."""
+def compare_hits(shape: AttentionShape, counts: Sequence[int]) -> None:
+    """Compare the sums of hits with those by tables; some hits lie far outside. counts: of the hits of each map."""
     from bevcli.model.kernels.triton_attention import sample_hits
 
-    counts, queries = (0, 40, 0, 3), 9
+    (heads, depth, levels, points, predictions, pillar_points), queries = shape, 9
     values, locations, _ = attention_case(heads, depth, levels, points, counts)
     reference_points = locations[:, 0, 0, :pillar_points].contiguous()
     random = torch.Generator().manual_seed(levels)
@@ -147,7 +169,7 @@ def compare_hits(heads: int, depth: int, levels: int, points: int, predictions: 
     found = sample_hits(values, shapes, Hits(query, reference_points, counts, prediction), offsets, logits)
     read = (values, reference_points, offsets, logits, query, prediction)
     torch.testing.assert_close(found, sample_hits_plainly(*read, shapes, counts), rtol=1e-4, atol=1e-4)
-    print(f"hits {heads, depth, levels, points, predictions, pillar_points}", flush=True)
+    print(f"hits {tuple(shape), counts}", flush=True)
 
 
 def compare_stems() -> None:

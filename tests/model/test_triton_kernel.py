@@ -6,10 +6,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import product
 from typing import Any
 
 import pytest
-from interpreted_kernels import attention_shapes, convolution_shapes
+from interpreted_kernels import AttentionShape, attention_shapes, convolution_shapes
 
 from bevcli.config import known_models, load_config
 
@@ -19,15 +20,12 @@ pytest.importorskip("triton", reason="Triton is not installed: make test-all ins
 GENERATIONS = (75, 80, 86, 89, 90, 100)
 WARP = 32  # threads
 CONFIGS = [load_config(name) for name in known_models()]
-ATTENTIONS = sorted(
-    (*shape[:4], dtype)
-    for shape in set().union(*map(attention_shapes, CONFIGS))
-    for dtype in (("fp32", "bf16", "fp16") if shape[4] else ("fp32",))
-)
+DTYPES = ("fp32", "bf16", "fp16")
+ATTENTIONS = sorted(product(set().union(*map(attention_shapes, CONFIGS)), DTYPES))
 CONVOLUTIONS = sorted(
     (*shape, dtype)
     for shape in {(c, s) for config in CONFIGS for c, _, s in convolution_shapes(config)}
-    for dtype in ("fp32", "bf16", "fp16")
+    for dtype in DTYPES
 )
 
 
@@ -49,18 +47,19 @@ def compile_kernel(kernel: Any, generation: int, types: dict[str, str], constant
     return triton.compile(source, target=GPUTarget("cuda", generation, WARP), options=options).asm["cubin"]
 
 
-def compile_attention(generation: int, heads: int, depth: int, levels: int, points: int, dtype: str) -> list[bytes]:
+def compile_attention(generation: int, shape: AttentionShape, dtype: str) -> list[bytes]:
     """The machine codes of the results, of those of hits, and of the gradients."""
     from bevcli.model.kernels.triton_attention import _sample, _sample_backward, _sample_hits, constants
 
     types = dict.fromkeys(("locations", "weights", "out", "out_gradient"), "fp32")
     types |= dict.fromkeys(("values_gradient", "locations_gradient", "weights_gradient"), "fp32")
     types |= {"values": dtype, "shapes": "i32", "ends": "i32"}
-    chosen = constants(heads, depth, levels, points)
+    chosen = constants(*shape[:4])
     codes = [compile_kernel(kernel, generation, types, chosen) for kernel in (_sample, _sample_backward)]
     types |= dict.fromkeys(("reference_points", "offsets", "logits"), "fp32")
     types |= dict.fromkeys(("query_of_hit", "prediction_of_hit"), "i64")
-    chosen |= {"PREDICTIONS": 2, "PILLAR_POINTS": 1, "SAMPLES": 1 << (levels * points - 1).bit_length()}
+    samples = 1 << (shape.levels * shape.points - 1).bit_length()
+    chosen |= {"PREDICTIONS": shape.maps, "PILLAR_POINTS": shape.pillar_points, "SAMPLES": samples}
     return [*codes, compile_kernel(_sample_hits, generation, types, chosen)]
 
 

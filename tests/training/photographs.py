@@ -107,6 +107,9 @@ def main() -> int:
     asked.out.mkdir(parents=True, exist_ok=True)
     model = model_file(asked.out / "photographs.toml")
     seeds = rendered(model, asked.seeds, asked.out / "drives", asked.render_s)
+    if len(seeds) < 2:
+        say(f"error: found {len(seeds)} drives in {asked.out / 'drives'} (expected 2 or more): use a larger --render-s")
+        return 1
     train(model, seeds, asked)
     return 0
 

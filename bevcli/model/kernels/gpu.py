@@ -20,7 +20,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model import segmentation, upload
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
-from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton, in_place_of
 from bevcli.model.kernels.compiled import in_threads
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
@@ -141,15 +141,37 @@ class MapOnDevice(segmentation.SegmentationHead):
         return replace(outputs, map_layers=segmentation.map_layers(masks, classes, self.config, self.grid))
 
 
-class PaddedPillars(Pillars):
-    """`Pillars` on a GPU: nobody waits for the GPU to count the hits, whose tensors keep their shapes.
+class PillarsOfCpu(Pillars):
+    """`Pillars` on a GPU, for training: the CPU finds the hits, so that it never waits for the GPU to count them.
 
     Attributes:
         points_on_cpu: the points, on the CPU.
-        sizes: by number of cameras and size of the images, the number of hits of each camera, added ones included.
     """
 
     points_on_cpu: Tensor
+
+    def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
+        """As `Pillars.forward`; the hits are on the device."""
+        hits = hits_on_cpu(image_from_bev, self.points_on_cpu, image_size, has_image)
+        return upload.upload_together(hits, self.points.device)
+
+
+def find_hits_on_cpu(network: nn.Module, device: torch.device) -> None:
+    """Lets the CPU find the hits of a network that is trained on a GPU, in place. Nothing changes on a CPU."""
+    if device.type == "cpu":
+        return
+    for name, module in list(network.named_modules()):
+        if type(module) is Pillars:
+            network.set_submodule(name, in_place_of(module, PillarsOfCpu, points_on_cpu=module.points.cpu()))
+
+
+class PaddedPillars(PillarsOfCpu):
+    """`Pillars` on a GPU, for inference: the tensors of the hits keep their shapes too.
+
+    Attributes:
+        sizes: by number of cameras and size of the images, the number of hits of each camera, added ones included.
+    """
+
     sizes: dict[tuple[int, tuple[int, int]], tuple[int, ...]]
 
     def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:

@@ -14,6 +14,7 @@ from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.workshop.odometry import OdometryOptions
 from bevcli.workshop.odometry.chain import Chain
 from bevcli.workshop.odometry.frames import FrameView, Viewer
+from bevcli.workshop.odometry.seen_points import SeenPoints
 from bevcli.workshop.odometry.steps import Candidate, Guess, StepViews, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.twist import exponential, logarithm
 from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
@@ -37,6 +38,7 @@ class MeasuredStep:
             it was measured.
         matches: number of matched points that were used.
         road_points: number of points of the road that were used.
+        seen: some of both, for recordings; None where nothing was measured.
     """
 
     ego_a_from_ego_b: Array
@@ -44,6 +46,7 @@ class MeasuredStep:
     reason: str = ""
     matches: int = 0
     road_points: int = 0
+    seen: SeenPoints | None = None
 
     @property
     def deviations(self) -> Array:
@@ -155,6 +158,7 @@ def _step(candidate: Candidate) -> MeasuredStep:
         candidate.covariance,
         matches=candidate.matches,
         road_points=candidate.road_points,
+        seen=candidate.seen,
     )
 
 
@@ -209,6 +213,7 @@ class MeasuredDrive(DerivedSequence):
     def __init__(self, sequence: Sequence, motion: MeasuredMotion) -> None:
         super().__init__(sequence)
         self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
+        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
 
     def load(self, place: int) -> Frame:
         return self._moved(self.sequence.load(place))
@@ -227,4 +232,5 @@ class MeasuredDrive(DerivedSequence):
             ground_truth=None if truth is None else truth.transformed(moved),
             world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
             kinematics=motion.kinematics_at(time),
+            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
         )

@@ -13,6 +13,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
     COUNT,
@@ -62,6 +63,7 @@ class Candidate:
         votes: of the road for its distance.
         matches: number of matched points.
         road_points: number of points of the road.
+        seen: some of both, for recordings.
     """
 
     state: Array
@@ -69,6 +71,7 @@ class Candidate:
     votes: float
     matches: int
     road_points: int
+    seen: SeenPoints | None = None
 
     def speed_and_rate(self, seconds: float) -> Array:
         """(2,) the speed (m/s, negative backwards) and the yaw rate (radians a second) of a step of some seconds."""
@@ -248,7 +251,9 @@ def measured(step: StepViews, points: EpipolarResiduals, start: Array, guess: Gu
     solution = solve(unknowns, _terms(step, unknowns, (fitting, road), x), x)
     covariance = honest_covariance(unknowns, solution, np.arange(len(unknowns.columns)))
     state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance)
-    return Candidate(state, motion, votes, len(fitting.group), len(road.group))
+    kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
+    seen = seen_points(step.second.cameras, *kinds)
+    return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
+from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network, build_network
 from bevcli.model.resnet import Backbone
@@ -227,6 +228,7 @@ class Teacher:
             raise ConfigError(f"{config.model}: cannot teach {model.config.name}: it has {other} (expected {own})")
         self._network.eval().requires_grad_(False).to(device)
         choose_kernels(self._network, device)
+        find_hits_on_cpu(self._network, device)
 
     @torch.no_grad()
     def lessons(self, clip: Batch) -> Iterator[Lesson]:

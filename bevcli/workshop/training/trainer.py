@@ -21,6 +21,7 @@ from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.kernels.choose import choose_kernels
+from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.network import Network
 from bevcli.parsing.pth import read_pth
 from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
@@ -124,6 +125,7 @@ class Trainer:
         if resume:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
+        find_hits_on_cpu(job.model, job.device)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self.maker = BatchMaker(
