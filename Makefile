@@ -1,17 +1,26 @@
 # make demo       run the model on samples/street; installs what a user needs; the recording is runs/street/recording.rrd
 # make install    what a developer needs
 # make test       the fast tests, in two processes of one thread each; make test-all: all tests
-# make docs       the site of the documents in build/site
+# make docs       the site of the documents of this version in build/site/VERSION, and the list of versions in build/site
+# make dist       the sdist and the wheel of the last commit in dist
 # make fuzz       15,500 broken files and wrong contents of every kind, up to 25 minutes on two cores
 # make check      lint and types; make format: fix what ruff can fix
 # make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv
+ifeq ($(OS),Windows_NT)
+BIN := $(VENV)/Scripts
+PYTHON := python
+else
 BIN := $(VENV)/bin
+PYTHON := python3
+endif
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' bevcli/_version.py)
 USER := $(VENV)/.user
 DEVELOPER := $(VENV)/.developer
 WRITER := $(VENV)/.docs
 VIEWERS := $(VENV)/.viewers
+PACKAGER := $(VENV)/.packager
 # Files are compiled when they are first imported: a demo imports few of them.
 PIP := $(BIN)/pip install --quiet --no-compile --constraint constraints.txt
 
@@ -20,12 +29,12 @@ ifneq ($(wildcard ../shared),)
 export BEVCLI_SHARED ?= $(abspath ../shared)
 endif
 
-.PHONY: install demo test test-all docs fuzz check format bench gpu-check clean
+.PHONY: install demo test test-all docs dist fuzz check format bench gpu-check clean
 
 install: $(DEVELOPER)
 
 $(USER): pyproject.toml constraints.txt
-	test -x $(BIN)/python || python3 -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --editable .
 	touch $@
 
@@ -37,8 +46,12 @@ $(WRITER): $(USER)
 	$(PIP) --editable '.[docs]'
 	touch $@
 
+$(PACKAGER): $(USER)
+	$(PIP) --editable '.[dist]'
+	touch $@
+
 $(VIEWERS): $(DEVELOPER)
-	$(PIP) --editable '.[dev,docs,notebook,onnx,openvino,triton]' playwright
+	$(PIP) --editable '.[dev,dist,docs,notebook,onnx,openvino,triton]' playwright
 	.ci/install-viewers
 	touch $@
 
@@ -56,7 +69,12 @@ test-all: $(VIEWERS)
 	$(BIN)/pytest
 
 docs: $(WRITER)
-	$(BIN)/sphinx-build --fail-on-warning --quiet -c docs/site -d build/doctrees -b html . build/site
+	$(BIN)/sphinx-build --fail-on-warning --quiet -c docs/site -d build/doctrees -b html . build/site/$(VERSION)
+	$(BIN)/python docs/site/versions.py build/site
+
+dist: $(PACKAGER)
+	rm -rf dist
+	PATH="$(abspath $(BIN)):$$PATH" .ci/build-dist dist
 
 bench: $(DEVELOPER)
 	$(BIN)/python docs/site/speed_table.py docs/speed.md

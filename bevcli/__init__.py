@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
+    from bevcli.workshop.hub.pack import pack_model as pack_model
+    from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
@@ -76,6 +78,8 @@ _NAMES = {
     "bevcli.workshop.batch.batch": "batch",
     "bevcli.workshop.engines.write_model": "export_onnx quantize",
     "bevcli.workshop.formats.convert": "convert",
+    "bevcli.workshop.hub.pack": "pack_model",
+    "bevcli.workshop.odometry.measure": "measure_motion",
     "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.workshop.training.train": "train validate",

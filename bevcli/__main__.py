@@ -15,7 +15,8 @@ def main() -> None:
     os.close(descriptor)
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115, open until the program ends
+            stream = open(number, "w", encoding="utf-8", closefd=False)  # noqa: SIM115, open until the program ends
+            setattr(sys, name, stream)
     signals = EndSignals()
     signals.start()
     atexit.register(signals.stop)  # Python waits for threads before this

@@ -21,7 +21,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.registry import entries, known_models, load
+from bevcli.registry import entries, hub_of, known_models, load
 
 T = TypeVar("T")
 
@@ -118,9 +118,15 @@ def _plain(settings: Any) -> dict[str, Any]:
 def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     """Contents and name of the TOML file of a model. This is the one place that knows what the name of a model means.
 
-    name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
-    Raises ConfigError where there is no such file, or where it is no TOML.
+    name: a known model; a name of the table of published weights, whose model gets that name; a FILE.toml; or a model
+        of a hub, such as "hf:OWNER/NAME".
+    Raises ConfigError where there is no such file, or where it is no TOML, and WeightsError for a hub.
     """
+    if hub_of(name):
+        from bevcli.published import hub_model
+
+        of_hub = hub_model(name)
+        return dict(of_hub.contents), str(of_hub.file)
     models, published = known_models(), {}
     has_own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file()
     if not name.endswith(".toml") and not has_own_weights:  # a name of the package is not in the table

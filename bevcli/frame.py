@@ -214,10 +214,12 @@ class DriveFacts:
     Attributes:
         rendered: whether `bevcli render` made its images.
         geo_origin: where its world frame is on Earth, None if it does not say.
+        motion_measured: whether its poses are measured from its images.
     """
 
     rendered: bool = False
     geo_origin: GeoOrigin | None = None
+    motion_measured: bool = False
 
 
 class Sequence(Protocol):

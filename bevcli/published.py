@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import msgspec
@@ -17,6 +18,7 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
+from bevcli.registry import hub_of, load
 from bevcli.writing import user_cache, user_folder, write_whole
 
 FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
@@ -148,6 +150,32 @@ class NamedWeights:
         hashes = {**_read_hashes(self.folder), self.source.source: known}
         content = msgspec.json.format(msgspec.json.encode(hashes), indent=1)
         write_whole(self.folder / HASHES, content + b"\n", parents=True, shared=True)
+
+
+@dataclass(frozen=True)
+class HubModel:
+    """A model of a hub, such as "hf:OWNER/NAME", on this machine.
+
+    Attributes:
+        contents: of its model file, as TOML would have them.
+        file: the file that states them, for errors.
+        weights: the file of its weights.
+        source: its name and revision, for texts.
+    """
+
+    contents: Mapping[str, Any]
+    file: Path
+    weights: Path
+    source: str
+
+
+def hub_model(name: str, *, fetch: bool = False) -> HubModel:
+    """The model of a hub, downloaded if it is not on this machine.
+
+    name: of which `hub_of` gives the hub. fetch: look for a newer version of a model that is here. Raises BevcliError.
+    """
+    model: HubModel = load("bevcli.hubs", hub_of(name))(name, fetch=fetch)
+    return model
 
 
 def own_table() -> Path:

@@ -13,6 +13,7 @@ Group = Literal[
     "bevcli.model_uses",
     "bevcli.sequences",
     "bevcli.poses",
+    "bevcli.motion",
     "bevcli.true_results",
     "bevcli.drive_writers",
     "bevcli.box_formats",
@@ -21,6 +22,8 @@ Group = Literal[
     "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
+    "bevcli.hubs",
+    "bevcli.packings",
     "bevcli.commands",
     "bevcli.extensions",
 ]

@@ -73,6 +73,12 @@ def load_form(group: Group, form: str) -> Any:
     return load(group, form)
 
 
+def hub_of(name: str) -> str:
+    """The hub that the name of a model begins with, such as "hf" of "hf:OWNER/NAME"; "" for another name."""
+    hub, colon, _ = name.partition(":")
+    return hub if colon and hub in entries("bevcli.hubs") else ""
+
+
 def known_models() -> tuple[str, ...]:
     """The names of the models whose TOML files come with the package."""
     files = resources.files("bevcli").joinpath("configs").iterdir()

@@ -49,7 +49,7 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
     """A path to write to, in the folder of `path`.
 
         with whole_file(out) as unfinished:
-            unfinished.write_text(text)
+            unfinished.write_text(text, encoding="utf-8")
 
     At the end of the block the file takes the place of `path`, also of a link. After an error it is deleted, and `path`
     stays as it was. A device or a pipe, and what is in /dev, is written directly.

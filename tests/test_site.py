@@ -8,6 +8,7 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from runpy import run_path
 from urllib.parse import unquote
 
 import pytest
@@ -15,6 +16,16 @@ import pytest
 import bevcli
 
 ROOT = Path(__file__).parents[1]
+write_pages = run_path(str(ROOT / "docs/site/versions.py"))["write_pages"]
+
+
+def test_the_first_page_leads_to_the_newest_version(tmp_path):
+    for name in ("0.9.1", "0.10.0", "0.2.0", "doctrees"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "README.html").touch()
+    write_pages(tmp_path)
+    assert Links(tmp_path / "index.html").links == ["0.10.0/README.html"]
+    assert Links(tmp_path / "versions.html").links == [f"{name}/README.html" for name in ("0.10.0", "0.9.1", "0.2.0")]
 
 
 def test_reference_names_every_public_name():
@@ -47,7 +58,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     build = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--quiet", "-c", "docs/site"]
     done = subprocess.run(
-        [*build, "-d", folder / "doctrees", "-b", "html", ".", folder / "html"],
+        [*build, "-d", folder / "doctrees", "-b", "html", ".", folder / "html" / bevcli.__version__],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -55,7 +66,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stderr
     shutil.rmtree(folder / "doctrees")
-    return folder / "html"
+    write_pages(folder / "html")
+    return folder / "html" / bevcli.__version__
 
 
 @pytest.mark.slow
@@ -66,7 +78,7 @@ def test_site_has_every_document(site):
 
 @pytest.mark.slow
 def test_links_of_the_site_lead_to_pages(site):
-    pages = {page: Links(page) for page in site.rglob("*.html")}
+    pages = {page: Links(page) for page in site.parent.rglob("*.html")}
     assert len(pages) > 20
     for page, found in pages.items():
         for link in found.links:

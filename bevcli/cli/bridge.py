@@ -21,7 +21,7 @@ from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
 from bevcli.printing import one_line, say
 from bevcli.registered import Group
-from bevcli.registry import entries, load
+from bevcli.registry import entries, hub_of, load
 from bevcli.sequences.format import option_classes
 
 EXTENSIONS: Group = "bevcli.extensions"
@@ -214,7 +214,7 @@ def _require(value: Any, flag: _Flag) -> None:
     """
     reads, complete = flag.option.reads, flag.option.complete
     for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
-        if not text or "://" in text:
+        if not text or "://" in text or (reads == "path or name" and hub_of(text)):
             continue
         try:
             Path(text).stat()

@@ -120,7 +120,7 @@ def _record_drive(
     path: Path, options: ViewOptions, recording: RecordingOptions, source: SequenceOptions, format_options: FormatValues
 ) -> None:
     """Record a drive and boxes, and show the recording."""
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.cli.run import input_warnings
     from bevcli.recording.record import names_of, record
     from bevcli.sequences.open import open_sequence
@@ -130,7 +130,8 @@ def _record_drive(
     if options.out is not None and options.out.suffix.lower() != ".rrd":
         raise InputError(f"{options.out}: the file must end in .rrd")
     boxes = names_of(options.boxes)
-    drive = open_sequence(path, source, **format_options)
+    with odometry_bar() as show_steps:
+        drive = open_sequence(path, replace(source, after_step=show_steps), **format_options)
     indices = [stamp.index for stamp in drive.stamps]
     if options.frame is not None and options.frame not in indices:
         raise InputError(f"`frame={options.frame}`: the drive has frames {min(indices)} to {max(indices)}")
@@ -213,7 +214,7 @@ def project_debug(
     """Find mistakes in a calibration.
 
     Checks the camera poses and lenses, the bev frame and, with a sequence, its ego-motion, its timestamps, and whether
-    the images fit how the vehicle moves (the short form of `bevcli calibrate`). Writes
+    the images fit how the vehicle moves (short forms of `bevcli odometry` and `bevcli calibrate`). Writes
     cameras.png (pillars, ground grid and horizon in each image), coverage.png (how many cameras see each BEV cell),
     recording.rrd (for bevcli viz) and findings.json. Existing files are overwritten.
 

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, TextIO
 
@@ -138,6 +138,22 @@ def download_bar() -> "Iterator[DownloadReport]":
                 raise
             say("stopped; the same command goes on from here", err=True)
             raise typer.Exit(STOPPED) from None
+
+
+@contextmanager
+def odometry_bar() -> Iterator[Callable[[int, int], None]]:
+    """Shows the steps that the option `odometry` measures, one bar a drive: those that are done, and of how many."""
+    with ExitStack() as shown:
+        bar: Progress | None = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal bar
+            if bar is None or done == 0:
+                shown.close()
+                bar = shown.enter_context(Progress(total, "steps of the ego-motion"))
+            bar.reach(done)
+
+        yield show
 
 
 def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":

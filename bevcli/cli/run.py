@@ -43,7 +43,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, load_with_bar
+        from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.rig.sequence_checks import CheckedDrive
         from bevcli.rig.standing_check import IMAGES_MOVE, StandingCheck
@@ -54,11 +54,12 @@ def run(
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
-    without_poses = not (format_options["ego_motion_file"] or format_of(sequence).has_poses)
-    if source.ego_motion == "required" and without_poses:
+    without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
+    if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
-    drive = open_sequence(sequence, reading, **format_options)
+    with odometry_bar() as show_steps:
+        drive = open_sequence(sequence, replace(reading, after_step=show_steps), **format_options)
     for step in first:
         drive = step(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
@@ -106,8 +107,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     notes = list(drive.notes)
     if model.untrained:
         notes.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
-    if model.engine_note:
-        notes.append(model.engine_note)
+    notes += [note for note in (model.source, model.engine_note) if note]
     if model.is_exported:
         notes.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option
+from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option, print_note
 from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, say
-from bevcli.weights.options import ModelFileOptions
+from bevcli.weights.options import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -49,7 +49,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
 @weights_app.command(cls=PlainCommand)
 @command
 def fetch(
-    name: Annotated[str, argument("A name of `bevcli weights list`.", reads=None)],
+    name: Annotated[str, argument("A name of `bevcli weights list`, or hf:OWNER/NAME[@REVISION].", reads=None)],
     options: Annotated[ModelOptions, Part(only=("weights_dir",))],
     force: Annotated[bool, Option("Download a file once more that is there.")] = False,
 ) -> None:
@@ -59,8 +59,13 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.published import named_weights
+    from bevcli.published import hub_model, named_weights
+    from bevcli.registry import hub_of
 
+    if hub_of(name):
+        found = hub_model(name, fetch=True)
+        say(f"{found.source}\n{found.weights}\nnext: bevcli run SEQUENCE --model {name}")
+        return
     fetched = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
     rows = [
         ("weights", f"{fetched.path} ({fetched.known.bytes:,} bytes)"),
@@ -148,6 +153,30 @@ def model_file(
     config, model = model_file_for(weights, out, options)
     say(f"{out}: {model} with {counted(len(config.classes), 'classes')}: {', '.join(config.classes)}")
     say(f"next: bevcli run SEQUENCE --model {out} --weights {weights}")
+
+
+@weights_app.command(cls=PlainCommand)
+@command
+def pack(
+    name: Annotated[str, argument("A name as --model takes it, or a FILE.toml.", reads=None, metavar="NAME|FILE")],
+    out: Annotated[Path, argument("The folder to write.", reads=None, metavar="DIR")],
+    options: PackOptions,
+) -> None:
+    """Write a model as a folder that the Hugging Face Hub takes: config.json, model.safetensors, README.md.
+
+    README.md is a model card with front matter; read it and add what only you know. Nothing is sent: `hf upload` of
+    huggingface_hub does that. `--model hf:OWNER/NAME` then loads the model, equal to the last bit, and
+    `--model hf:./DIR` before.
+    """
+    from bevcli.registry import load
+
+    files, notes = load("bevcli.packings", "hf")(name, out, options)
+    for note in notes:
+        print_note(note)
+    for file in files:
+        say(f"{file}: {file.stat().st_size:,} bytes")
+    shown = out if out.is_absolute() else f"./{out}"
+    say(f"next: bevcli run SEQUENCE --model hf:{shown}, and hf upload OWNER/NAME {out}")
 
 
 def _named_as_data(weights: "NamedWeights") -> dict[str, object]:

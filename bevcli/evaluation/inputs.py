@@ -195,6 +195,8 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         paired = {id(true) for _, true in pairs}
         missing = [true for true in ground_truth.frames if id(true) not in paired]
         pairs += [(replace(true, world_from_ego=None, boxes=Boxes3D.empty()), true) for true in missing]
+    if predictions.extras.get("ego_motion") == "measured" and predictions.frame_of_reference == "world":
+        pairs = [(_in_world_of(prediction, true), true) for prediction, true in pairs]
     reference = _common_frame_of_reference(predictions, ground_truth)
     ego_from_bev = predictions.ego_from_bev or ground_truth.ego_from_bev
     poses = [true.world_from_ego or prediction.world_from_ego for prediction, true in pairs]
@@ -212,6 +214,15 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         matched_by=key,
         notes=notes,
     )
+
+
+def _in_world_of(prediction: FrameBoxes, true: FrameBoxes) -> FrameBoxes:
+    """A frame whose pose is measured from the images, in the world frame of the ground truth."""
+    pose, measured = true.world_from_ego, prediction.world_from_ego
+    if pose is None or measured is None:
+        return prediction
+    boxes = prediction.boxes.transformed(pose.matrix @ inverse(measured.matrix))
+    return replace(prediction, world_from_ego=pose, boxes=boxes)
 
 
 def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D | None], FramePairs]:

@@ -31,7 +31,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.registry import entries, load
+from bevcli.registry import entries, hub_of, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
 from bevcli.weights import DownloadReport
@@ -59,6 +59,7 @@ class Model:
         file: the exported file that another engine runs; None for PyTorch, and before `in_engine` has made it.
         calibrate_with: drive whose first frames calibrate INT8; None for the drive that is run.
         engine_note: engine, precision and file of an exported model; "" for other models.
+        source: name and revision of a model of a hub; "" for other models.
     """
 
     network: TemporalModel
@@ -74,6 +75,7 @@ class Model:
     file: Path | None = None
     calibrate_with: Path | None = None
     engine_note: str = ""
+    source: str = ""
 
     def __repr__(self) -> str:
         source = self.weights or self.file
@@ -248,8 +250,9 @@ def load_model(
 
     Args:
         model: a known model, one of `bevcli.config.known_models()` such as "tiny" or "demo", a name of the table of
-            weights ("tiny-fp16"), a FILE.toml, or an exported FILE.onnx, which holds its weights and runs on the CPU in
-            the precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
+            weights ("tiny-fp16"), a FILE.toml, a model of the Hugging Face Hub ("hf:OWNER/NAME" or
+            "hf:OWNER/NAME@REVISION"), or an exported FILE.onnx, which holds its weights and runs on the CPU in the
+            precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
@@ -278,13 +281,18 @@ def load_model(
     if Path(str(chosen.model)).suffix in WEIGHTS_SUFFIXES:
         raise WeightsError(f"`model={chosen.model}`: is a file of weights: pass it as `weights={chosen.model}`")
     name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
+    of_hub = None
+    if hub_of(name):  # here, because `fetch` looks for a newer version
+        from bevcli.published import hub_model
+
+        of_hub = hub_model(name, fetch=chosen.fetch)
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
     tracker = tracker_of_table(contents, config, file)
     path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
         untrained = ", or pass `untrained=True` to try the program with random weights"
-        path = bundled or _published(name, chosen, report, untrained)
+        path = bundled or (of_hub.weights if of_hub else _published(name, chosen, report, untrained))
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -302,12 +310,17 @@ def load_model(
         engine=engine,
         facts={} if loaded is None else loaded.facts,
         calibrate_with=chosen.calibrate_with,
+        source=of_hub.source if of_hub else "",
     )
 
 
 def weights_file(path_or_name: Path) -> Path:
     """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
     name = str(path_or_name)
+    if hub_of(name):
+        from bevcli.published import hub_model
+
+        return hub_model(name).weights
     if path_or_name.suffix or path_or_name.is_file():
         return path_or_name
     if name not in known_models():

@@ -67,7 +67,7 @@ def describe_machine(device: "torch.device") -> str:
     if device.type == "cuda":
         return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
     cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text().splitlines() if cpu.is_file() else []
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     name = names[0] if names else platform.processor() or platform.machine()
     capability = torch.backends.cpu.get_cpu_capability()
@@ -75,11 +75,13 @@ def describe_machine(device: "torch.device") -> str:
 
 
 def peak_memory(device: "torch.device") -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
+    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU. 0 on Windows, which does not tell."""
     if device.type == "cuda":
         import torch
 
         return torch.cuda.max_memory_allocated(device)
-    import resource
-
+    try:
+        import resource
+    except ImportError:
+        return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

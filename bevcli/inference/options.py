@@ -26,8 +26,9 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help=f"{', '.join(known_models())}, a name of `bevcli weights list`, a FILE.toml or a FILE.onnx of `bevcli "
-        "export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        help=f"{', '.join(known_models())}, a name of `bevcli weights list`, hf:OWNER/NAME[@REVISION] of the "
+        "Hugging Face Hub, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, "
+        "else demo.",
         metavar="NAME|FILE",
         complete=complete_model,
     )
@@ -37,7 +38,9 @@ class ModelOptions:
         help="An official .pth file or a .safetensors file. Default: the weights in the package (demo), or those that "
         "`bevcli weights fetch` has downloaded.",
     )
-    fetch: bool = option(default=False, help="Download the weights of MODEL if they are not there yet.")
+    fetch: bool = option(
+        default=False, help="Download the weights of MODEL if they are not there yet; of a hub, the newest version."
+    )
     weights_dir: Path | None = option(
         default=None,
         help="Folder of downloaded weights. Default: $BEVCLI_WEIGHTS_DIR, else ~/.cache/bevcli/weights.",

@@ -1,7 +1,7 @@
 """Run a model: `run` over a drive, a `Session` over frames from memory, such as those of a vehicle or a simulator."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from bevcli.inference.frames_from_memory import (
 )
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState, one_command, read_commands
+from bevcli.registry import load
 
 
 def run(
@@ -79,10 +80,14 @@ class Session:
     The results are those of `run` on the same frames. A `Recording` takes the session in place of a sequence, and
     `recording.log(session.frame, prediction)` follows it. A session belongs to one thread.
 
+    Without poses, `session.step(images, None, timestamp_ns)` measures the motion from the images.
+
     Attributes:
         name: of the drive, for titles.
         rig: the cameras.
         frame: the newest frame; None before the first one.
+        motion: the `MeasuredStep` from the frame before to the newest one, with its deviations and, where it could not
+            be measured, the reason; None where poses are given, and for the first frame.
         notes: warnings where the rig lies outside the training distribution.
         stamps: none, because no frame is known in advance.
         has_ego_motion: True.
@@ -137,13 +142,19 @@ class Session:
         self._prepare = self._runner.preparation(self._runner.preprocessor(cameras))
         self._state: RunnerState[Any] = RunnerState()
         self._poses = RecentPoses()
+        self._meter: Any = None  # of a session without poses
         self._drive = 1
         self._last_ns: int | None = None
+
+    @property
+    def motion(self) -> Any:
+        """See the class."""
+        return None if self._meter is None else self._meter.step
 
     def step(
         self,
         images: Mapping[str, NDArray[Any]],
-        world_from_ego: Pose | ArrayLike,
+        world_from_ego: Pose | ArrayLike | None,
         timestamp_ns: int,
         *,
         world_from_ego_at: Mapping[str, Pose | ArrayLike] | None = None,
@@ -160,16 +171,21 @@ class Session:
                 before `frame` was used.
             world_from_ego: the vehicle's pose at the frame's time: a `Pose` or (4, 4), metres, in a world frame that
                 does not move. Ego frame: x forward, y left, z up, origin on the ground under the rear axle.
+                None: it is measured from the images, which must be of one moment, and so are the kinematics. The world
+                frame is then the ego frame of the first frame. The step from the frame before is measured at once, and
+                again when the next frame is there: the history then has the better pose.
             timestamp_ns: the frame's time; later than that of the frame before.
             world_from_ego_at: camera -> the vehicle's pose when its image was taken. Default: `world_from_ego`.
             kinematics: acceleration, angular rate and velocity at the frame's time. Default: derived from the poses.
             command: of the driver, from this frame on. Default: the one before.
 
         Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid,
-        and a time that is not later than the one before. The session is then as it was before the call.
+        poses for some frames only, and a time that is not later than the one before. The session is then as it was
+        before the call.
         """
         stamp = self._next_stamp(timestamp_ns)
-        pose = _pose(world_from_ego, "`world_from_ego`")
+        self._check_all_or_none(world_from_ego is None, world_from_ego_at)
+        pose = Pose.identity() if world_from_ego is None else _pose(world_from_ego, "`world_from_ego`")
         poses = self._poses.with_pose(stamp.timestamp_ns, pose)
         given = (world_from_ego_at or {}).items()
         at = {
@@ -189,14 +205,42 @@ class Session:
         if command is not None:
             commands = one_command(command, self._runner.config)
             self._runner.options = replace(self._runner.options, commands=commands)
+        if world_from_ego is None:
+            frame = self._measured(frame, kinematics)
         self._state, prediction = self._runner.step(self._state, self._prepare(frame))
         self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
         return prediction
 
     def reset(self) -> None:
         """Forget the history: the next frame begins a new drive, at any time and place. Its number goes on."""
-        self._state, self._poses = RunnerState(), RecentPoses()
+        self._state, self._poses, self._meter = RunnerState(), RecentPoses(), None
         self._drive, self._last_ns = self._drive + 1, None
+
+    def _check_all_or_none(self, is_measured: bool, world_from_ego_at: Mapping[str, Any] | None) -> None:
+        """Raise InputError for a frame without pose after one with a pose, the other way round, or with other poses."""
+        if is_measured and world_from_ego_at:
+            raise InputError("`world_from_ego_at`: needs `world_from_ego`, which is None: leave it out, or pass both")
+        if self._last_ns is not None and is_measured != (self._meter is not None):
+            found, before = ("None", "a pose") if is_measured else ("a pose", "None")
+            raise InputError(
+                f"`world_from_ego`: is {found}, but for the frame before it was {before}: pass poses for all frames or "
+                "for none, or call reset() where a new drive begins"
+            )
+
+    def _measured(self, frame: Frame, kinematics: Kinematics | None) -> Frame:
+        """The frame with its measured pose. The history gets the pose of the frame before as it is known now."""
+        if self._meter is None:
+            self._meter = load("bevcli.motion", "live")()
+        before, pose = self._meter.add(frame)
+        if before is not None and self.frame is not None:
+            memory = with_pose(self._state.memory, self.frame.world_from_ego, before)
+            self._state = replace(self._state, memory=memory)
+        return replace(
+            frame,
+            world_from_ego=pose,
+            world_from_ego_at=dict.fromkeys(self.rig.names, pose),
+            kinematics=self._meter.kinematics if kinematics is None else kinematics,
+        )
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
         time = whole_nanoseconds(timestamp_ns)
@@ -207,6 +251,20 @@ class Session:
             )
         number = 0 if self.frame is None else self.frame.stamp.index + 1
         return FrameStamp(number, str(self._drive) if self._drive > 1 else "", time)
+
+
+def with_pose(memory: Any, known: Pose, better: Pose) -> Any:
+    """The memory of a model with another pose in place of a known one, which is found by its identity."""
+    if memory is known:
+        return better
+    if type(memory) is tuple:
+        return tuple(with_pose(each, known, better) for each in memory)
+    if not is_dataclass(memory) or isinstance(memory, type | Pose):
+        return memory
+    parts = {part.name: getattr(memory, part.name) for part in fields(memory)}
+    changed = {name: with_pose(value, known, better) for name, value in parts.items()}
+    changed = {name: value for name, value in changed.items() if value is not parts[name]}
+    return replace(memory, **changed) if changed else memory
 
 
 def _pose(given: Pose | ArrayLike, argument: str) -> Pose:

@@ -26,7 +26,7 @@ MOVING = 0.3  # share of the corners that stay, below which the images move
 
 IMAGES_MOVE = (
     'the images move as if the vehicle drove, but `ego_motion="static"` says that it stands, so the history is wrong '
-    "and boxes are missed: pass `temporal=False` in its place"
+    "and boxes are missed: pass `odometry=True` in its place, which measures the motion, or `temporal=False`"
 )
 
 

@@ -95,6 +95,7 @@ class RunFiles:
             "classes": list(config.classes),
             **({"class_settings": settings} if settings else {}),
             "range_m": grid.nearest_side_m,
+            **({"ego_motion": "measured"} if sequence.facts.motion_measured else {}),
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
         with self._stack:  # closes what is open if the next one cannot be opened

@@ -123,7 +123,7 @@ def folder_lock(out: Path) -> Iterator[None]:
             (out / OWN).mkdir(parents=True, exist_ok=True)
             path, is_ours = out / OWN / "lock", False
             while not is_ours:  # else the run before has just ended and removed its lock file
-                file = stack.enter_context(path.open("a+", errors="replace"))
+                file = stack.enter_context(path.open("a+", encoding="utf-8", errors="replace"))
                 if not lock(file.fileno()):
                     file.seek(0)
                     holder = file.read(500).strip() or "an unknown process"

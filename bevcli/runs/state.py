@@ -82,6 +82,7 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
         "frames of the input": f"{len(sequence.stamps)}, {digest(sequence.stamps)[:DIGITS]}",
         "calibration": digest(sequence.rig)[:DIGITS],
+        "ego-motion": "measured from the images" if sequence.facts.motion_measured else "of the input",
         "files of the input": digest(tuple(map(_file_facts, sequence.input_files)))[:DIGITS],
         "images of the input": _image_facts(sequence),
     }

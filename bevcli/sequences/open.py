@@ -13,6 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
+from bevcli.registry import load
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive
 from bevcli.sequences.options import SequenceOptions
@@ -34,10 +35,11 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         drive = open_sequence("my_drive", rate_hz=2.0, frames=slice(0, 40))
         drive = open_sequence("nuscenes", version="v1.0-mini", scene="scene-0103")
         drive = open_sequence("ddad_train_val", scene="000150")  # a folder of drives
+        drive = open_sequence("dash.mp4", fov_deg=70, height=1.4, odometry=True)  # poses measured from the images
         for place, stamp in enumerate(drive.stamps):
             frame = drive.load(place)
 
-    Only calibration, times and poses are read here. `load` decodes the images of a frame.
+    Only calibration, times and poses are read here, and with `odometry` all images. `load` decodes those of a frame.
 
     Args:
         path: the folder or file.
@@ -52,6 +54,8 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     options = gather(SequenceOptions, options, {name: changes.pop(name) for name in common if name in changes})
     if options.scene is not None and (drive := _drive_of(path, options.scene)):
         path, options = drive, replace(options, scene=None)
+    if options.odometry:
+        options = replace(options, ego_motion="measured")
     chosen = format_of(path)
     check_options(changes, [chosen], f"{path}: is {chosen.name}")
     own_defaults = defaults(chosen.options)
@@ -64,6 +68,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         sequence = WithoutGroundTruth(sequence)
     if options.scene is not None:
         sequence = select_scene(sequence, options.scene)
+    whole = sequence
     if options.every is not None:
         sequence = select_every(sequence, options.every)
     rate_hz = options.rate_hz
@@ -71,7 +76,12 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         rate_hz = options.model_rate_hz
     if rate_hz is not None and rate_hz != "all":
         sequence = select_rate(sequence, rate_hz)
-    return sequence if options.frames is None else select_range(sequence, options.frames)
+    if options.frames is not None:
+        sequence = select_range(sequence, options.frames)
+    if not options.odometry:
+        return sequence
+    measured: Sequence = load("bevcli.motion", "drive")(sequence, whole, options.after_step)
+    return measured
 
 
 def _drive_of(root: Path, name: str) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from bevcli.sequences.files.calibration_file import RigDraft
 
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
-# static: the vehicle stands, and the ego-motion is not read.
-EgoMotionUse = Literal["required", "optional", "static"]
+# static: the vehicle stands, and the ego-motion is not read. measured: as optional, and `odometry` replaces it.
+EgoMotionUse = Literal["required", "optional", "static", "measured"]
 
 
 def parse_frames(text: str) -> slice:
@@ -89,6 +89,10 @@ class SequenceOptions(ClassOptions):
         flag="--static",
         flag_value="static",
     )
+    odometry: bool = option(
+        default=False,
+        help="Measure the ego-motion from the images first, as `bevcli odometry` does, in place of that of the input.",
+    )
     strict: bool = option(default=False, help="Treat a missing or unreadable image as an error.")
     scene: str | None = option(
         default=None, help="Only this scene, such as scene-0103; of a folder of drives, this drive."
@@ -106,6 +110,9 @@ class SequenceOptions(ClassOptions):
     classes: tuple[str, ...] | None = option(
         default=None, help="The classes of a model. Default: nuScenes' ten.", hidden=True
     )
+    after_step: Callable[[int, int], None] | None = option(
+        default=None, help="Called with the steps that `odometry` has measured, and the number of all.", hidden=True
+    )
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None and self.every is not None:
@@ -114,6 +121,8 @@ class SequenceOptions(ClassOptions):
             raise InputError(f"`rate_hz={self.rate_hz:g}`: expected frames per second, above 0")
         if self.every is not None and self.every < 1:
             raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
+        if self.odometry and self.ego_motion == "static":
+            raise InputError('`odometry` and `ego_motion="static"` exclude each other: pass one of them')
 
     def refuse_static(self, path: Path) -> None:
         """Raise InputError for `ego_motion="static"`. path: of an input that has its own ego-motion."""

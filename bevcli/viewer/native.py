@@ -65,7 +65,7 @@ def start_viewer(*arguments: str) -> subprocess.Popen[bytes]:
 def stop(process: subprocess.Popen[bytes]) -> None:
     """Stops a viewer like Ctrl-C, so that it removes its temporary folder; kills it if it runs on for 3 s."""
     if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM if sys.platform == "win32" else signal.SIGINT)
         try:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:

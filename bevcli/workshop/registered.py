@@ -47,6 +47,10 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.poses": {
         "files": "bevcli.workshop.formats.poses:read_poses",
     },
+    "bevcli.motion": {
+        "drive": "bevcli.workshop.odometry.run_option:with_measured_motion",
+        "live": "bevcli.workshop.odometry.live:LiveMotion",
+    },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",
         "native": "bevcli.workshop.formats.output:NATIVE",
@@ -77,13 +81,22 @@ OWN: dict[Group, dict[str, str]] = {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
         "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",
     },
+    # A function of a model's name after "hf:": see `bevcli.published.hub_model`.
+    "bevcli.hubs": {
+        "hf": "bevcli.workshop.hub.download:open_model",
+    },
+    "bevcli.packings": {
+        "hf": "bevcli.workshop.hub.pack:pack_model",
+    },
     "bevcli.commands": {
         "batch": "bevcli.workshop.batch.commands:batch",
         "bench": "bevcli.workshop.benchmark.commands:bench",
         "calibrate": "bevcli.workshop.calibration.commands:calibrate",
+        "checks": "bevcli.workshop.checks.commands:checks",
         "convert": "bevcli.workshop.formats.commands:convert",
         "demo": "bevcli.workshop.synth.commands:demo",
         "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
+        "odometry": "bevcli.workshop.odometry.commands:odometry",
         "quantize": "bevcli.workshop.engines.commands:quantize",
         "render": "bevcli.workshop.synth.commands:render",
         "reproduce": "bevcli.workshop.batch.commands:reproduce",

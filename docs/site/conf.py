@@ -29,13 +29,14 @@ SECTIONS = {
         "docs/weights",
         "docs/other-inputs",
         "docs/video",
+        "docs/odometry",
         "docs/recording",
         "docs/rendered-drives",
     ],
     "Calibrate": ["docs/calibration"],
     "Score": ["docs/scoring", "docs/compare", "docs/robustness"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
-    "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
+    "Deploy": ["docs/deploy", "docs/containers", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/service", "docs/extend", "docs/reference"],
     "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG"],
@@ -69,6 +70,10 @@ python_maximum_signature_line_length = 88
 html_theme = "furo"
 html_title = f"bevcli {version}"
 html_extra_path = ["index.html"]
+templates_path = ["templates"]
+# Those of furo, and the link to the list of versions that versions.py writes.
+_SCROLLED = ["sidebar/scroll-start.html", "sidebar/navigation.html", "sidebar/scroll-end.html"]
+html_sidebars = {"**": ["sidebar/brand.html", "versions.html", "sidebar/search.html", *_SCROLLED]}
 html_show_sourcelink = False
 html_copy_source = False
 html_math_renderer = "mathml"

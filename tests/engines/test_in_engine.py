@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from bevcli.inference.load import Model, installed_engines, load_model
 from bevcli.inference.run import Session, run
 from bevcli.sequences.open import select_range
 from bevcli.workshop.engines import engine as module
-from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine
+from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine, RoundingOpenVinoEngine
 from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
@@ -77,6 +78,25 @@ def test_the_boxes_in_an_engine_are_those_of_torch(steps, drive, network):
     for engine in installed_engines():
         for mine, theirs in zip(boxes(chosen(network, engine), drive), expected, strict=True):
             np.testing.assert_allclose(mine.scores, theirs.scores, atol=1e-3)
+
+
+def test_openvino_rounds_where_bfloat16_is_asked_for(steps, drive, network):
+    try:
+        RoundingOpenVinoEngine.require_packages()
+    except BevcliError as error:
+        pytest.skip(str(error))
+    exact, rounded = (chosen(network, "openvino", precision) for precision in ("fp32", "bf16"))
+    assert rounded.in_engine(drive.rig, drive).file == exact.in_engine(drive.rig, drive).file
+    for mine, theirs in zip(boxes(rounded, drive), boxes(exact, drive), strict=True):
+        np.testing.assert_allclose(np.sort(mine.scores), np.sort(theirs.scores), atol=0.03)
+        assert not np.array_equal(mine.scores, theirs.scores)
+    assert rounded.in_engine(drive.rig, drive).engine_note.startswith("engine openvino, bf16; the exported file is /")
+
+
+def test_a_processor_without_bfloat16_is_named(monkeypatch):
+    monkeypatch.setattr(module, "_openvino_core", lambda: SimpleNamespace(get_property=lambda *_: ["FP32", "INT8"]))
+    with pytest.raises(BevcliError, match="OpenVINO has no bfloat16 on this processor"):
+        load_model("demo", engine="openvino", precision="bf16")
 
 
 def test_the_first_time_says_what_it_does(steps, drive, network):
@@ -142,7 +162,7 @@ def test_probes_need_torch(drive, network):
     ("options", "message"),
     [
         ({"engine": "openvinno"}, "unknown engine .expected torch, onnxruntime, openvino"),
-        ({"engine": "openvino", "precision": "bf16"}, "`engine=openvino` computes in fp32 or int8"),
+        ({"engine": "openvino", "precision": "fp16"}, "`engine=openvino` computes in fp32 or bf16 or int8"),
         ({"engine": "openvino", "device": "mps"}, "PyTorch sees no Apple GPU|runs on the CPU"),
         ({"engine": "torch", "precision": "int8"}, "PyTorch has no INT8"),
         ({"calibrate_with": STREET}, "`calibrate_with`: is for `precision=int8`"),

@@ -20,12 +20,14 @@ from mistakes import (
     turned,
     xyzw,
 )
+from stated_mistakes import MISTAKES, SHOWN
 from test_project_debug import calibration, write_drive, write_motion
 
 import bevcli
 from bevcli.rig.check_calibration import check_calibration
 from bevcli.rig.sequence_checks import check_ego_motion
 from bevcli.workshop.calibration.calibrate import CameraEstimate, Verdict, findings_of, motion_findings
+from bevcli.workshop.odometry.compare import compare, not_compared
 
 DOCUMENT = Path(bevcli.__file__).parents[1] / "docs" / "calibration.md"
 CODE = r"`([a-z]+(?:-[a-z]+)+)`"
@@ -103,7 +105,9 @@ def motion_codes():
         "CAM_FRONT", Verdict.CORRECTED, "", (2, 0, 0), (0.1, 0.1, 0.1), (0, 0, 0), (0.1, 0.1, 0.1), 100, 5,
         500, 500, 9, 1, np.zeros(6), np.eye(6),
     )  # fmt: skip
-    return {finding.code for finding in (*findings_of([late]), *motion_findings(MemorySequence(count=1)))}
+    of_poses = [finding for poses, *_ in MISTAKES.values() for finding in compare(poses, SHOWN)]
+    of_calibration = (*findings_of([late]), *motion_findings(MemorySequence(count=1)))
+    return {finding.code for finding in (*of_calibration, *of_poses, not_compared(""))}
 
 
 @pytest.fixture(scope="module")

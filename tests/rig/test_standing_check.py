@@ -108,5 +108,6 @@ def test_a_run_advises_no_history(static, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     run = ("run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "4:10", "--no-track")
     said = command(tmp_path, *run, *static).stderr
-    advice = "the images move as if the vehicle drove, but --static says that it stands"
-    assert (advice in said and "pass --no-temporal in its place" in said) == (static == ("--static",))
+    warning = "the images move as if the vehicle drove, but --static says that it stands"
+    advice = "pass --odometry in its place, which measures the motion, or --no-temporal"
+    assert (warning in said and advice in said) == (static == ("--static",))

@@ -151,10 +151,11 @@ def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
     if not is_there(file) and use == "required":
         raise InputError(
             f"{file}: the file is missing (expected the vehicle's poses): add it, "
-            'pass `ego_motion="static"` if the vehicle stands, or pass `temporal=False` to run without history'
+            'pass `odometry=True` to measure them from the images, `ego_motion="static"` if the vehicle stands, or '
+            "`temporal=False` to run without history"
         )
     if not is_there(file):
-        return ReadPoses(None, ("ego_motion.csv is missing: boxes are in the ego frame",))
+        return ReadPoses(None, () if use == "measured" else ("ego_motion.csv is missing: boxes are in the ego frame",))
     return read_poses(file, drive)
 
 

@@ -410,7 +410,7 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
     facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
     fingerprint = json.dumps({"format": CACHE_FORMAT, "tables": facts})
     with suppress(OSError, ValueError, EOFError):  # there is no cache, or it is damaged
-        if (folder / FINGERPRINT).read_text() == fingerprint:
+        if (folder / FINGERPRINT).read_text(encoding="utf-8") == fingerprint:
             return _load(folder), ""
     index = build_index(tables, dialect)
     try:
@@ -428,7 +428,7 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     for part, table in vars(index).items():
         for name, values in vars(table).items():
             np.save(unfinished / f"{part}.{name}.npy", values, allow_pickle=False)
-    (unfinished / FINGERPRINT).write_text(fingerprint)
+    (unfinished / FINGERPRINT).write_text(fingerprint, encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
 

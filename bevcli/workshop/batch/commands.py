@@ -183,7 +183,7 @@ def reproduce(
             (text for one in summary.records if (text := one.get("error") or one.get("not_scored"))), "no frames"
         )
         raise InputError(f"{options.data}: no scene could be scored: {why}")
-    metrics = json.loads((out / METRICS).read_text())
+    metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     comparison = compare_with_published(metrics, named.source.published)
     say(json.dumps(comparison, indent=1) if as_json else table_of(comparison["scores"]))
     for note in comparison["notes"]:

@@ -134,7 +134,7 @@ class Worker:
                 "input_errors": "; ".join(summary.input_errors),
             }
             _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")
-            (aside / storage.RECORD).write_text(json.dumps(record, indent=1) + "\n")
+            (aside / storage.RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
             landed = read_record(self._out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result)
             if landed is not None:
                 return landed
@@ -235,9 +235,9 @@ def _with_final_paths(message: str, *pairs: tuple[Path, str]) -> str:
 def _rewrite_paths(aside: Path, where: str) -> None:
     """Names the final paths in summary.json."""
     path = aside / SUMMARY
-    facts = json.loads(path.read_text())
+    facts = json.loads(path.read_text(encoding="utf-8"))
     facts["files"] = [_with_final_paths(name, (aside, where)) for name in facts["files"]]
-    path.write_text(json.dumps(facts, indent=1) + "\n")
+    path.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def _read_marker(content: bytes | None) -> tuple[int, str]:

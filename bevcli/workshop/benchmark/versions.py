@@ -4,7 +4,6 @@ import copy
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, product
 from statistics import median
 from typing import Any
 
@@ -267,8 +266,9 @@ def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], No
     versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []
     network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
-    pairs: Iterable[tuple[str, Any]] = chain(
-        product([TORCH], ("fp32", "bf16")), product(installed_engines(), ("fp32", "int8"))
+    kinds: dict[str, Any] = {name: kind.precisions for name, kind in installed_engines().items()}
+    pairs = (
+        (engine, precision) for engine, known in ({TORCH: ("fp32", "bf16")} | kinds).items() for precision in known
     )
     for engine, precision in pairs:
         model = Model(network, engine=engine, precision=precision)

@@ -37,11 +37,11 @@ class CalibrateOptions:
 
 @options()
 class CheckMotionOptions:
-    """Whether a check of a calibration measures it too."""
+    """Whether a check of a calibration measures the motion and the calibration too."""
 
     motion: bool = option(
         default=True,
-        help="With a sequence, also measure the calibration from its motion, in the short form of `bevcli calibrate`.",
+        help="With a sequence, also measure its motion and its calibration from its images, and compare.",
         flag="--motion/--no-motion",
     )
 

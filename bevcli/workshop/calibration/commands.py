@@ -49,17 +49,22 @@ def calibrate(
 
 
 def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Sequence"]) -> "tuple[Finding, ...]":
-    """Findings of a short calibration of the drive, where it has ego-motion and is no calibration alone."""
+    """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone."""
     if not options.motion:
         return ()
     from bevcli.errors import InputError
+    from bevcli.findings import errors_of
     from bevcli.workshop.calibration.calibrate import motion_findings
+    from bevcli.workshop.odometry.check_motion import stated_motion_findings, without_consequences
 
     try:
         drive = open_drive()
     except InputError:  # the check has said so
         return ()
-    return motion_findings(drive)
+    motion = stated_motion_findings(drive)
+    if errors_of(motion):  # which make a calibration wrong
+        return motion
+    return without_consequences(motion, motion_findings(drive), len(drive.rig.cameras))
 
 
 CHECK_MOTION = Extension(CheckMotionOptions, _motion_findings)

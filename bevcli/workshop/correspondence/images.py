@@ -25,9 +25,9 @@ class GreyImage:
     texture: NDArray[np.uint8]  # (h, w) fine structure with even contrast, without light and shade
 
 
-def reduced(camera: Camera) -> Camera:
+def reduced(camera: Camera, width: int = WIDTH) -> Camera:
     """The camera of the reduced image. Its pixel (0, 0) is the centre of a larger pixel, so that coordinates shift."""
-    width = min(WIDTH, MOST_ENLARGED * camera.width)
+    width = min(width, MOST_ENLARGED * camera.width)
     size = (width, round(camera.height * width / camera.width))
     scaled = camera.scaled(size[0] / camera.width, size[1] / camera.height)
     scaled.intrinsics[:2, 2] += (np.array([scaled.width / camera.width, scaled.height / camera.height]) - 1) / 2

@@ -68,12 +68,14 @@ class Engine(LoadedFile):
     Attributes:
         packages: that it needs.
         extra: of bevcli, which installs them.
+        precisions: that a named model can have in it, see `in_precision`.
         rank: of the engines that are installed, the lowest is taken for INT8 where none is named.
         deformable_convolution: as `OnnxOptions.deformable_convolution`, for files that are exported for it.
     """
 
     packages: ClassVar[tuple[str, ...]] = ()
     extra: ClassVar[str] = "onnx"
+    precisions: ClassVar[tuple[str, ...]] = ("fp32", "int8")
     rank: ClassVar[int] = 2
     deformable_convolution: ClassVar[DeformableConvolution] = "operator"
 
@@ -86,6 +88,11 @@ class Engine(LoadedFile):
     def require_packages(cls) -> None:
         """Raises BevcliError where a package that it needs is not installed."""
         require(*cls.packages, extra=cls.extra)
+
+    @classmethod
+    def in_precision(cls, precision: str) -> "type[Engine]":
+        """The class that computes in one of `precisions`. Files in INT8 state it themselves."""
+        return cls
 
     @classmethod
     def open(cls, file: Path, threads: int | None = None) -> ExportedModel:
@@ -127,11 +134,12 @@ class Engine(LoadedFile):
     @classmethod
     def check_options(cls, name: str, options: ModelOptions, config: ModelConfig) -> None:
         """Raises BevcliError where the engine, `name`, is not installed or cannot run a model with these options."""
-        if options.precision not in (None, "fp32", "int8"):
-            raise BevcliError(f"`precision={options.precision}`: `engine={name}` computes in fp32 or int8")
+        if options.precision not in (None, *cls.precisions):
+            known = " or ".join(cls.precisions)
+            raise BevcliError(f"`precision={options.precision}`: `engine={name}` computes in {known}")
         if str(options.device) not in ("auto", "cpu"):
             raise BevcliError(f"`device={options.device}`: `engine={name}` runs on the CPU: leave out the option")
-        cls.require_packages()
+        cls.in_precision(options.precision or "fp32").require_packages()
         require(*EXPORTERS, *(QUANTIZERS if options.precision == "int8" else ()))
         export_form(config, len(config.cameras))
 
@@ -156,8 +164,8 @@ class Engine(LoadedFile):
             quantize(network.file, images, path)
             return frames.name
 
-        if model.precision == "fp32":
-            network, calibrated_with = exact.get(cls.open, write)
+        if model.precision != "int8":
+            network, calibrated_with = exact.get(cls.in_precision(model.precision).open, write)
         else:
             file = CachedFile(_key(sized, options, "int8", CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
             if not file.stamp:  # then of this drive: longer ones do not use the file of a short one
@@ -201,8 +209,10 @@ class OpenVinoEngine(Engine):
 
     packages = ("openvino", "onnx")
     extra = "openvino"
+    precisions = ("fp32", "bf16", "int8")
     rank = 0  # the fastest one in INT8 on every processor that was measured
     deformable_convolution = "gridsample"  # it lacks DeformConv
+    hint: ClassVar[str] = "f32"
 
     def __init__(self, file: Path, threads: int) -> None:
         super().__init__(file, threads)
@@ -210,7 +220,7 @@ class OpenVinoEngine(Engine):
 
         settings: dict[str, Any] = {
             # By default OpenVINO rounds everything to bfloat16 where the CPU has it, which moves boxes by decimetres.
-            "INFERENCE_PRECISION_HINT": "f32",
+            "INFERENCE_PRECISION_HINT": self.hint,
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             # A thread that is bound to a core waits for it while another process computes there.
@@ -231,6 +241,23 @@ class OpenVinoEngine(Engine):
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
         outputs = self.request.infer(dict(feed), share_inputs=True)
         return {name: outputs[name] for name in self.outputs}
+
+    @classmethod
+    def in_precision(cls, precision: str) -> type[Engine]:
+        return RoundingOpenVinoEngine if precision == "bf16" else cls
+
+
+class RoundingOpenVinoEngine(OpenVinoEngine):
+    """OpenVINO on the CPU; it rounds what a file in float32 computes to bfloat16, in the whole model."""
+
+    hint = "bf16"
+
+    @classmethod
+    def require_packages(cls) -> None:
+        """As `Engine.require_packages`; raises BevcliError for a processor without bfloat16 too."""
+        super().require_packages()
+        if "BF16" not in _openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+            raise BevcliError("`precision=bf16`: OpenVINO has no bfloat16 on this processor: leave it out")
 
 
 def import_openvino() -> Any:

@@ -1,5 +1,6 @@
 """`bevcli convert`: writes any input as a drive of another format."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +13,13 @@ if TYPE_CHECKING:
     from bevcli.frame import Frame
 
 PANEL = "Start"
+CONVERTED = ("strict", "scene", "ground_truth", "allow_outside", "class_map", "odometry")
 
 
 def convert(
     input: InputDrive,
     out: Annotated[Path, argument("The folder or file to write.", reads=None)],
-    options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
+    options: Annotated[SequenceOptions, Part(only=CONVERTED)],
     labels: LabelOptions,
     format_options: FormatValues,
     written: WriteOptions,
@@ -27,10 +29,12 @@ def convert(
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.workshop.formats.convert import drive_to_convert, write_drive
 
-    sequence = drive_to_convert(input, out, options, labels, format_options)
+    with odometry_bar() as show_steps:
+        reading = replace(options, after_step=show_steps)
+        sequence = drive_to_convert(input, out, reading, labels, format_options)
 
     def show(frame: "Frame") -> None:
         for camera, reason in frame.dropped.items():

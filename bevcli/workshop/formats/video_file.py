@@ -41,8 +41,9 @@ def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> Liste
         poses = read_poses(own.ego_motion_file, DrivePoses(rig, own, video.times_ns))
     elif common.ego_motion == "required":
         raise InputError(
-            f"{path}: a video has no poses of the vehicle: pass `ego_motion_file=FILE`, `temporal=False` to run "
-            'without history, or `ego_motion="static"` if the vehicle stands'
+            f"{path}: a video has no poses of the vehicle: pass `ego_motion_file=FILE`, `odometry=True` to measure "
+            'them from the images, `temporal=False` to run without history, or `ego_motion="static"` if the vehicle '
+            "stands"
         )
     motion = poses.motion
     if motion is not None and own.ego_motion_file is not None:
@@ -50,8 +51,9 @@ def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> Liste
         check_covered(own.ego_motion_file, poses, entries, "state the time of the first image by `start_ns`")
     assumed = bev_frame_notes(rig, "the calibration")
     notes = (*given.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
-    if motion is None:
-        notes += ("a video has no poses: no history is used, and boxes are in the ego frame",)
+    if motion is None and common.ego_motion != "measured":
+        without = "no history is used, and boxes are in the ego frame"
+        notes += (f"a video has no poses: {without} (`odometry=True` measures them from the images)",)
     sequence = ListedSequence(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
     sequence.facts = replace(given.facts, geo_origin=given.facts.geo_origin or poses.geo_origin)

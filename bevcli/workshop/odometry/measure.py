@@ -1,19 +1,30 @@
 """The measured motion of a drive, and the drive with it."""
 
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Sequence as Items
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.workshop.odometry import OdometryOptions
+from bevcli.workshop.odometry.chain import Chain
+from bevcli.workshop.odometry.frames import FrameView, Viewer
+from bevcli.workshop.odometry.seen_points import SeenPoints
+from bevcli.workshop.odometry.steps import Candidate, Guess, StepViews, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.twist import exponential, logarithm
+from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
 
 SUBSTEP_NS = 25_000_000  # between the poses of `MeasuredMotion.ego_motion`
 BEYOND_NS = 100_000_000  # of constant velocity before the first and after the last frame, for cameras with other times
+
+# Deviations of a guess, for a second: of pitch and roll, of yaw (radians) and of the speed along the way (metres).
+ROCKING, TURNING, SPEEDING = np.radians(3.0), np.radians(15.0), 4.0
+UNKNOWN = 4.0  # factor of the deviations of a guess where nothing was measured before
 
 
 @dataclass(frozen=True)
@@ -27,6 +38,7 @@ class MeasuredStep:
             it was measured.
         matches: number of matched points that were used.
         road_points: number of points of the road that were used.
+        seen: some of both, for recordings; None where nothing was measured.
     """
 
     ego_a_from_ego_b: Array
@@ -34,6 +46,7 @@ class MeasuredStep:
     reason: str = ""
     matches: int = 0
     road_points: int = 0
+    seen: SeenPoints | None = None
 
     @property
     def deviations(self) -> Array:
@@ -81,6 +94,108 @@ class MeasuredMotion:
         return motion_of_keyframes(_table(list(zip(times.tolist(), poses, strict=True))), _table(between))
 
 
+class MotionMeter:
+    """Measures the motion frame by frame. It keeps the views of the last frame, and one step that is not decided."""
+
+    def __init__(self, options: OdometryOptions | None = None) -> None:
+        """options: see `OdometryOptions`."""
+        self._options = options or OdometryOptions()
+        self._viewer, self._chain = Viewer(), Chain()
+        self._last: FrameView | None = None
+        self._before: tuple[Array, float] | None = None  # the state of the step before and its seconds
+        self._guessed = 0  # steps in a row
+
+    def add(self, frame: Frame) -> list[MeasuredStep]:
+        """The steps that are certain now: of the frame before at the latest."""
+        view, last = self._viewer.view(frame), self._last
+        self._last = view
+        if last is None:
+            return []
+        seconds = (view.timestamp_ns - last.timestamp_ns) / 1e9
+        step = StepViews(last, view)
+        found = candidates(step, Guess(self._expected(seconds), self._options.height_m))
+        usable = [each for each in found if is_measured(each)]
+        if not usable:
+            return [*self.finish(), self._guess(seconds, reason_of(step, found))]
+        decided = self._chain.add(usable, seconds)
+        likeliest = self._chain.likeliest
+        assert likeliest is not None
+        self._before, self._guessed = (likeliest.state, seconds), 0
+        return [] if decided is None else [_step(decided)]
+
+    @property
+    def newest(self) -> MeasuredStep | None:
+        """The step that is not decided, with the motion that is the likeliest so far; None where all are."""
+        likeliest = self._chain.likeliest
+        return None if likeliest is None else _step(likeliest)
+
+    def finish(self) -> list[MeasuredStep]:
+        """The step that is not decided, if there is one. Called after the last frame."""
+        decided = self._chain.end()
+        return [] if decided is None else [_step(decided)]
+
+    def _expected(self, seconds: float) -> Array | None:
+        """(8,) the state of a step at constant velocity."""
+        if self._before is None:
+            return None
+        state, lasted = self._before
+        expected = state * seconds / lasted
+        expected[SLOPES], expected[5] = next_slopes(state), 0
+        return expected
+
+    def _guess(self, seconds: float, reason: str) -> MeasuredStep:
+        state = self._expected(seconds)
+        self._guessed += 1
+        wide = seconds * np.sqrt(self._guessed) if state is not None else seconds * UNKNOWN
+        deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
+        motion = np.eye(4) if state is None else motion_of(state)
+        return MeasuredStep(motion, np.diag(deviations**2), reason)
+
+
+def _step(candidate: Candidate) -> MeasuredStep:
+    return MeasuredStep(
+        motion_of(candidate.state),
+        candidate.covariance,
+        matches=candidate.matches,
+        road_points=candidate.road_points,
+        seen=candidate.seen,
+    )
+
+
+def measure_motion(
+    drive: Sequence,
+    options: OdometryOptions | None = None,
+    after_step: Callable[[], None] = lambda: None,
+) -> MeasuredMotion:
+    """Measure the motion of a drive from its images and its calibration.
+
+        motion = measure_motion(open_sequence("my_drive"))
+        print(motion.poses)
+
+    Poses that the drive states are not used. Steps that cannot be measured are guesses, and state the reason.
+
+    Args:
+        drive: of `open_sequence`, one scene.
+        options: see `OdometryOptions`.
+        after_step: called after each frame but the first.
+
+    Raises InputError where the drive has one frame, or several scenes.
+    """
+    scenes = {stamp.scene for stamp in drive.stamps}
+    if len(scenes) > 1:
+        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one): choose a `scene`")
+    if len(drive.stamps) < 2:
+        raise InputError(f"{drive.name}: has {len(drive.stamps)} frames (expected 2 or more): choose more frames")
+    meter, steps = MotionMeter(options), list[MeasuredStep]()
+    for place in range(len(drive.stamps)):
+        steps += meter.add(drive.load(place))
+        if place:
+            after_step()
+    steps += meter.finish()
+    times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
+    return MeasuredMotion(drive.name, times, tuple(steps))
+
+
 def _table(poses: Items[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
     """Times, translations and quaternions of N poses, as `motion_of_keyframes` takes them."""
     matrices = [Pose.from_matrix(matrix) for _, matrix in poses]
@@ -90,11 +205,15 @@ def _table(poses: Items[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, A
 
 
 class MeasuredDrive(DerivedSequence):
-    """A drive with its measured motion: poses and kinematics of every frame, and poses at each camera's own time."""
+    """A drive with its measured motion: poses and kinematics of every frame, and poses at each camera's own time.
+
+    Ground truth in the world frame is moved with the vehicle.
+    """
 
     def __init__(self, sequence: Sequence, motion: MeasuredMotion) -> None:
         super().__init__(sequence)
         self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
+        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
 
     def load(self, place: int) -> Frame:
         return self._moved(self.sequence.load(place))
@@ -105,9 +224,13 @@ class MeasuredDrive(DerivedSequence):
     def _moved(self, frame: Frame) -> Frame:
         motion, time = self.motion.ego_motion, frame.stamp.timestamp_ns
         times = {name: frame.images[name].timestamp_ns if name in frame.images else time for name in frame.rig.names}
+        pose, truth = motion.pose_at(time), frame.ground_truth
+        moved = pose.matrix @ inverse(frame.world_from_ego.matrix)
         return replace(
             frame,
-            world_from_ego=motion.pose_at(time),
+            world_from_ego=pose,
+            ground_truth=None if truth is None else truth.transformed(moved),
             world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
             kinematics=motion.kinematics_at(time),
+            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
         )

@@ -3,29 +3,34 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bevcli.geometry.transforms import Array, rigid
+from bevcli.geometry.transforms import Array
 
-SMALLEST = 1e-8  # radians; below it an arc is a line
+SMALLEST = 1e-7  # radians; below it an arc is a line
 
 
-def _skew(vector: Array) -> Array:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def _skew(vectors: Array) -> Array:
+    """(..., 3, 3) of vectors (..., 3): the matrix of the cross product."""
+    return np.asarray(np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2))
 
 
 def _along(turn: Array) -> Array:
-    """(3, 3) from the velocity of a unit of time to the translation of an arc with a turn (3,)."""
-    angle, skew = float(np.linalg.norm(turn)), _skew(turn)
-    if angle < SMALLEST:
-        return np.eye(3) + skew / 2
-    return np.asarray(
-        np.eye(3) + (1 - np.cos(angle)) / angle**2 * skew + (angle - np.sin(angle)) / angle**3 * skew @ skew
-    )
+    """(..., 3, 3) from the velocity of a unit of time to the translation of an arc with a turn (..., 3)."""
+    angle, skew = np.linalg.norm(turn, axis=-1)[..., None, None], _skew(turn)
+    safe = np.maximum(angle, SMALLEST)
+    first = np.where(angle < SMALLEST, 0.5, (1 - np.cos(safe)) / safe**2)
+    second = np.where(angle < SMALLEST, 0.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + first * skew + second * skew @ skew)
 
 
 def exponential(twist: Array) -> Array:
-    """(4, 4) the motion of a twist (6,): rotation vector (radians) and velocity (metres) of a unit of time."""
-    return rigid(_along(twist[:3]) @ twist[3:], Rotation.from_rotvec(twist[:3]).as_matrix())
+    """(..., 4, 4) the motions of twists (..., 6): rotation vector (radians) and velocity (metres) of a unit of time."""
+    motion = np.zeros((*twist.shape[:-1], 4, 4))
+    motion[..., :3, :3] = (
+        Rotation.from_rotvec(twist[..., :3].reshape(-1, 3)).as_matrix().reshape(*twist.shape[:-1], 3, 3)
+    )
+    motion[..., :3, 3] = (_along(twist[..., :3]) @ twist[..., 3:, None])[..., 0]
+    motion[..., 3, 3] = 1
+    return motion
 
 
 def logarithm(motion: Array) -> Array:

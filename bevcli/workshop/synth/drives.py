@@ -10,7 +10,7 @@ import os
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence as Items
+from collections.abc import Callable, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -59,6 +59,10 @@ class FolderDrives:
         self.folders = tuple(folders)
         self._options = SequenceOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
         self._of_thread = threading.local()  # a Sequence must be read from one thread
+
+    def measure_motion(self, after_step: Callable[[int, int], None]) -> None:
+        """Open every drive with the motion that its images show. after_step: of `SequenceOptions`."""
+        self._options = replace(self._options, odometry=True, after_step=after_step)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what belongs to this process, so that other processes can open the drives."""

@@ -123,13 +123,16 @@ def validate(
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.inference.load import load_model
     from bevcli.workshop.synth.drives import count_frames
     from bevcli.workshop.training.train import drives_to_score, score_drives
 
     loaded = load_model(model, options=model_options)
-    drives, notes, loaded = drives_to_score(loaded, model or loaded.name, drive_options, options, print_note)
-    with Progress(count_frames(drives), "frames", notes) as progress:
+    with odometry_bar() as show_steps:
+        name = model or loaded.name
+        drives, notes, loaded = drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
+        frames = count_frames(drives)
+    with Progress(frames, "frames", notes) as progress:
         scores = score_drives(loaded, drives, options, temporal=run_options.temporal, after_frame=progress.advance)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")

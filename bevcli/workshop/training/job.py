@@ -264,7 +264,7 @@ def free_memory(root: Path = Path("/")) -> int:
 
 def _number(path: Path, pattern: str = r"^(\d+)$") -> int:
     """The number in a file of the system. Raises OSError, and ValueError where there is none."""
-    match = re.search(pattern, path.read_text())
+    match = re.search(pattern, path.read_text(encoding="utf-8"))
     if match is None:
         raise ValueError
     return int(match[1])

@@ -96,3 +96,6 @@ class ValidationOptions:
     )
     tracking: bool = option(default=False, help="Also run the tracker and score its tracks: AMOTA, identity switches.")
     each: bool = option(default=False, help="Also score each drive alone, with the mean and the lowest mAP.")
+    odometry: bool = option(
+        default=False, help="Run with the motion that `bevcli odometry` measures of each drive, not with stated poses."
+    )

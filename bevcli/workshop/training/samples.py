@@ -11,6 +11,7 @@ import os
 import pickle
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence as Items
@@ -439,7 +440,9 @@ class _Packed:
     def unpack(self) -> Batch:
         """The clip; its tensors are views of the file, which loses its name."""
         with open(self.path, "r+b") as file:
-            contents = memoryview(mmap.mmap(file.fileno(), 0))
+            # Windows keeps the name of a file that is mapped.
+            whole = bytearray(file.read()) if sys.platform == "win32" else mmap.mmap(file.fileno(), 0)
+            contents = memoryview(whole)
         self.path.unlink()
         batch: Batch = pickle.loads(self.rest, buffers=[contents[start:end] for start, end in self.ends])
         return batch
@@ -482,6 +485,9 @@ def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
 @contextmanager
 def blocked_interrupts() -> Iterator[None]:
     """Processes that start in the block never see Ctrl-C: it reaches their parent, which ends them."""
+    if sys.platform == "win32":  # it cannot block signals
+        yield
+        return
     resource_tracker.ensure_running()  # it would be started with the first process, and unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

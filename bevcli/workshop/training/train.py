@@ -107,11 +107,21 @@ def validate(
 
 
 def drives_to_score(
-    model: Model, name: str, drive_options: DriveOptions, options: ValidationOptions, report: Report
+    model: Model,
+    name: str,
+    drive_options: DriveOptions,
+    options: ValidationOptions,
+    report: Report,
+    after_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Drives, tuple[str, ...], Model]:
-    """The drives of a validation, notes on them, and the model in its engine. name: of the model, or its file."""
+    """The drives of a validation, notes on them, and the model in its engine.
+
+    name: of the model, or its file. after_step: called after each step that `odometry` measures, see `SequenceOptions`.
+    """
     rig = None if options.rig is None else rig_for_drives(options.rig, name)
     drives = scored_drives(drive_options, model.config, rig)
+    if options.odometry:
+        drives.measure_motion(after_step)
     notes = check_scored_drives(drive_options, drives, model.config)
     if model.needs_export:
         drive = drives.open(0)

@@ -366,7 +366,7 @@ def _read_rows(path: Path) -> list[Row]:
 
 
 def _write_rows(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
-    with output_errors(path), path.open(mode, newline="") as file:
+    with output_errors(path), path.open(mode, newline="", encoding="utf-8") as file:
         if rows:
             writer = csv.DictWriter(file, list(rows[0]))
             if header:

@@ -346,10 +346,12 @@ class VehicleReader:
         if use == "required":
             raise InputError(
                 f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
-                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
-                "the vehicle stands, or `temporal=False` to run without history"
+                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `odometry=True` to '
+                'measure them from the images, `ego_motion="static"` if the vehicle stands, or `temporal=False` to run '
+                "without history"
             )
-        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
+        note = "the bag has no poses of the vehicle: boxes are in the ego frame"
+        return None, "", () if use == "measured" else (note,)
 
     def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""

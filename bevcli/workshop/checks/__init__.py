@@ -1,0 +1,1 @@
+"""The facts about an installation and its machine, to paste into an issue."""

@@ -1,0 +1,257 @@
+"""The checks of `bevcli checks`: each returns a text, or texts by name, and may raise anything."""
+
+import getpass
+import os
+import platform
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+from bevcli._version import __version__
+from bevcli.printing import one_line, reason_of
+from bevcli.writing import user_cache
+
+Facts = str | dict[str, str]
+WIDTH, INDENT = 80, 11
+TIED = "\xa0"  # a space where no line ends
+SHORT = 16  # characters; a fact whose texts are no longer stands on one line
+MOST_FILES = 100_000  # of a cache that are counted
+# Extras that a user of bevcli installs; the others are for its developers.
+NOT_FOR_USERS = ("dev", "docs")
+_REQUIREMENT = re.compile(r"([\w.-]+).*?(?:extra == ['\"]([\w-]+)['\"])?$")
+
+
+def tell(check: Callable[[], Facts]) -> Facts:
+    """The facts of a check without the user's name, or why they cannot be told."""
+    try:
+        facts = check()
+    except Exception as error:  # a broken package may raise anything, and the other checks go on
+        return without_user(f"cannot be told ({type(error).__name__}: {reason_of(error):.200})")
+    if isinstance(facts, str):
+        return without_user(facts)
+    return {without_user(name): without_user(text) for name, text in facts.items()}
+
+
+def without_user(text: str) -> str:
+    """The text with ~ in place of the user's home folder, and USER in place of the user's name in other paths."""
+    names = set()
+    with suppress(Exception):  # no entry in the system's list of users
+        names.add(getpass.getuser())
+    with suppress(RuntimeError):  # no home
+        home = Path.home()
+        names.add(home.name)
+        text = text.replace(str(home), "~") if home.name else text
+    for name in names - {""}:
+        text = re.sub(rf"(?<=[/\\]){re.escape(name)}(?![\w.-])", "USER", text)
+    return one_line(text)
+
+
+def as_text(facts: dict[str, Facts]) -> str:
+    """All facts, for a terminal."""
+    return "\n".join(line for title, fact in facts.items() for line in _lines(title, fact))
+
+
+def _lines(title: str, fact: Facts) -> Iterator[str]:
+    if isinstance(fact, dict) and all(len(text) <= SHORT for text in fact.values()):
+        fact = ", ".join(f"{name}{TIED}{text}" for name, text in fact.items())
+    texts = [fact] if isinstance(fact, str) else [f"{name}: {text}" for name, text in fact.items()]
+    for index, text in enumerate(texts):
+        head = f"{'' if index else title:<{INDENT}}"
+        indent = " " * (INDENT if len(texts) == 1 else INDENT + 2)
+        how = {"subsequent_indent": indent, "break_on_hyphens": False, "break_long_words": False}
+        lines = textwrap.wrap(head + text, WIDTH, **how)  # type: ignore[arg-type]
+        yield from (line.replace(TIED, " ") for line in lines)
+
+
+def versions() -> Facts:
+    """Those of bevcli, Python and the system."""
+    kind = " of a checkout" if (Path(__file__).parents[3] / "pyproject.toml").is_file() else ""
+    return f"{__version__}{kind}, Python {platform.python_version()}, {platform.platform()}"
+
+
+def required() -> Iterator[tuple[str, str]]:
+    """The packages that bevcli requires, each with the extra that does, "" for none."""
+    for text in requires("bevcli") or ():
+        match = _REQUIREMENT.match(text)
+        if match:
+            yield match[1], match[2] or ""
+
+
+def installed(package: str) -> str:
+    """The version of a package, "" for one that is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def packages() -> Facts:
+    """Versions of the packages that bevcli needs, and of those of its extras that are installed."""
+    of_extras = [name for name, extra in required() if extra and extra not in NOT_FOR_USERS]
+    found = {name: installed(name) or "NOT INSTALLED" for name, extra in required() if not extra}
+    return found | {name: installed(name) for name in of_extras if installed(name)}
+
+
+def processor() -> Facts:
+    """Name, cores, memory, and what multiplies bfloat16."""
+    import torch
+
+    from bevcli.inference.machine import describe_machine
+    from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
+
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = f"{len(affinity(0)) if affinity else os.cpu_count()} of {os.cpu_count()} cores"
+    meminfo = Path("/proc/meminfo")
+    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
+    memory = f", {int(total[1]) / 2**20:.0f} GiB" if total else ""
+    rounds = "instructions for bfloat16" if has_onednn(torch.bfloat16) else "no instructions for bfloat16"
+    amx = "AMX" if has_matrix_unit() else "no AMX"
+    return f"{describe_machine(torch.device('cpu'))}; {cores}{memory}; {rounds}, {amx}"
+
+
+def gpu() -> Facts:
+    """The GPUs that PyTorch sees, and the CUDA that it was built for."""
+    import torch
+
+    if not torch.cuda.is_available():
+        build = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a build without CUDA"
+        mps = "; an Apple GPU is there (mps)" if torch.backends.mps.is_available() else ""
+        return f"none that PyTorch sees ({build}){mps}"
+    found = {}
+    for index in range(torch.cuda.device_count()):
+        device = torch.cuda.get_device_properties(index)
+        capability = f"compute capability {device.major}.{device.minor}"
+        found[f"cuda:{index}"] = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, {capability}"
+    return found | {"CUDA": f"{torch.version.cuda} of PyTorch"}
+
+
+def kernels() -> Facts:
+    """The faster parts that a model gets on the default device, and why these."""
+    import torch
+
+    from bevcli.config import load_config
+    from bevcli.inference.load import choose_device
+    from bevcli.model.kernels.choose import choose_kernels, has_triton
+    from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
+    from bevcli.model.network import build_network
+
+    device = choose_device("auto")
+    with torch.device("meta"):
+        network = build_network(load_config("demo")).eval()
+    choose_kernels(network, device)
+    kinds = {type(part) for part in network.modules()}
+    kinds |= {type(sampling) for part in network.modules() if (sampling := getattr(part, "sampling", None)) is not None}
+    chosen = sorted(kind.__name__ for kind in kinds if kind.__module__.startswith("bevcli.model.kernels"))
+    if device.type == "cpu":
+        why = "loops compiled by numba, as no GPU is there"
+        products = "oneDNN" if has_onednn(torch.float32) else "plain PyTorch, as this build lacks operators of oneDNN"
+    else:
+        why = "Triton" if has_triton(device) else "plain PyTorch, as Triton is not installed or the GPU is not of CUDA"
+        products = "PyTorch, replayed as CUDA graphs" if device.type == "cuda" else "PyTorch"
+    found = {"attention": f"{', '.join(chosen) or 'as in the paper'} ({why})", "convolutions": products}
+    if device.type == "cpu":
+        parts = "images and products of encoder and decoder (AMX)" if has_matrix_unit() else "images only (no AMX)"
+        found["bf16"] = (
+            f"for {parts}" if has_onednn(torch.bfloat16) else "slow: the processor lacks instructions for it"
+        )
+    return found
+
+
+def engines() -> Facts:
+    """The other engines that are installed, and INT8."""
+    from bevcli.inference.load import installed_engines
+
+    found = ", ".join(installed_engines())
+    return f"torch, {found}; INT8 runs in {found.partition(',')[0]}" if found else "torch only, so no INT8"
+
+
+def viewer() -> Facts:
+    """The viewer, and whether it can open a window and draw for a screenshot."""
+    from bevcli.viewer.native import display_is_there, viewer_binary
+
+    binary = f"rerun {installed('rerun-sdk')}" if viewer_binary().is_file() else "the executable of rerun is missing"
+    window = "in a window" if display_is_there() else "in the browser, as there is no display"
+    return f"{binary}, opens {window}; screenshots: {_vulkan()}"
+
+
+def _vulkan() -> str:
+    if not sys.platform.startswith("linux"):
+        return "by the system's graphics driver"
+    given = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    folders = [Path(folder, "vulkan/icd.d") for folder in ("/usr/share", "/usr/local/share", "/etc")]
+    files = given.split(":") if given else [str(file) for folder in folders for file in sorted(folder.glob("*.json"))]
+    if not files:
+        return "no Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
+    return f"Vulkan drivers {', '.join(Path(file).name.partition('.')[0] for file in files)}"
+
+
+def video() -> Facts:
+    """What decodes videos, and writes H.264."""
+    import cv2
+
+    built = dict(re.findall(r"^\s+(FFMPEG|avcodec):\s+(.*?)\s*$", cv2.getBuildInformation(), re.MULTILINE))
+    ffmpeg = built.get("avcodec", "").removeprefix("YES ") if built.get("FFMPEG", "").startswith("YES") else ""
+    opencv = (
+        f"OpenCV with FFmpeg (avcodec {ffmpeg.strip('()')})" if ffmpeg else "OpenCV without FFmpeg: it reads no MP4"
+    )
+    pyav = f"PyAV {installed('av')}" if installed("av") else "no PyAV: recordings with AV1 and H.264 need bevcli[video]"
+    return f"{opencv}; {pyav}"
+
+
+def caches() -> Facts:
+    """The folders that keep files from run to run, with their sizes."""
+    from bevcli.model.kernels.loops import __file__ as loops
+    from bevcli.published import weights_folder
+
+    home = Path.home()
+    hub = os.environ.get("HF_HUB_CACHE") or Path(os.environ.get("HF_HOME") or home / ".cache/huggingface", "hub")
+    folders = [user_cache(), Path(hub), Path(os.environ.get("NUMBA_CACHE_DIR") or Path(loops).parent / "__pycache__")]
+    if not weights_folder().is_relative_to(user_cache()):
+        folders.append(weights_folder())
+    names = {
+        folder: f"{folder} (compiled loops)" if index == 2 else str(folder) for index, folder in enumerate(folders)
+    }
+    return {name: _size(folder) for folder, name in names.items()}
+
+
+def _size(folder: Path) -> str:
+    if not folder.is_dir():
+        return "none"
+    total = count = 0
+    for place, _, files in os.walk(folder):
+        for file in files:
+            with suppress(OSError):  # it is gone
+                total += os.lstat(os.path.join(place, file)).st_size
+            count += 1
+        if count > MOST_FILES:
+            return f"over {total / 1e6:.0f} MB"
+    return f"{total / 1e6:.0f} MB"
+
+
+def missing() -> Facts:
+    """The extras that are not installed whole, and how to install them."""
+    lacking: dict[str, list[str]] = {}
+    for package, extra in required():
+        if extra and extra not in NOT_FOR_USERS and not installed(package):
+            lacking.setdefault(extra, []).append(package)
+    return {
+        extra: f"pip install 'bevcli[{extra}]' ({', '.join(names)})" for extra, names in lacking.items()
+    } or "nothing"
+
+
+CHECKS: dict[str, Callable[[], Facts]] = {
+    "bevcli": versions,
+    "packages": packages,
+    "processor": processor,
+    "GPU": gpu,
+    "kernels": kernels,
+    "engines": engines,
+    "viewer": viewer,
+    "video": video,
+    "caches": caches,
+    "missing": missing,
+}

@@ -1,0 +1,159 @@
+"""The road of a frame seen from above, and how the vehicle drove between two such pictures.
+
+Tiles of the first picture are compared with the second one at all distances along the way; those that look alike vote.
+Near the motion that they tell, optical flow gives points of the road.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.geometry.cameras import OUTSIDE, Camera
+from bevcli.geometry.transforms import Array
+from bevcli.workshop.correspondence.images import GreyImage, texture
+from bevcli.workshop.correspondence.residuals import Indices
+from bevcli.workshop.correspondence.road import contrast, flow_at, sampled
+
+CELL_M = 0.08
+BEGIN_M, SHAPE = (-24.0, -9.0), (225, 640)  # the smallest x and y; cells along y and x
+MOST_BLUR_M = 0.45  # of the road in one pixel, along the ray
+MARGIN = 9  # cells, between cameras
+TILE, ASIDE = 25, 2  # cells: side of a tile, and by how much it may lie beside the way
+LEAST_SEEN, LEAST_CONTRAST = 0.8, 8.0  # of a tile: share, and grey levels of standard deviation
+NOTHING, MOST = 0.15, 2.0  # of the vote of a tile, less of which is chance, and which is the largest
+SPACING, WINDOW = 8, 21  # cells: between points of the flow, and the side of what is compared
+WAY_M = 5.0  # tiles farther beside the vehicle count less: they are less often road
+
+
+@dataclass(frozen=True)
+class RoadPicture:
+    """The road around the vehicle in the ego frame; rows along y, columns along x."""
+
+    texture: NDArray[np.uint8]  # (225, 640), 128 where nothing is seen
+    seen: NDArray[np.bool_]  # (225, 640)
+    of: NDArray[np.int8]  # (225, 640) the camera of each cell, -1 for none
+
+
+class RoadGrid:
+    """The cells of a road picture in the images of a rig."""
+
+    def __init__(self, cameras: Items[Camera]) -> None:
+        rows, columns = np.indices(SHAPE)
+        x, y = BEGIN_M[0] + CELL_M * columns, BEGIN_M[1] + CELL_M * rows
+        points = np.stack([x, y, np.zeros_like(x)], axis=-1)
+        self._maps, distances = [], []
+        for camera in cameras:
+            pixels, depth = camera.project_ego(points)
+            away = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=-1)
+            blur = away**2 / max(camera.ego_from_camera[2, 3] * camera.intrinsics[0, 0], 1e-3)
+            usable = camera.contains(pixels, depth) & (blur < MOST_BLUR_M)
+            distances.append(np.where(usable, away, np.inf))
+            self._maps.append(np.nan_to_num(pixels, nan=OUTSIDE).astype(np.float32))
+        nearest = np.argmin(distances, axis=0)
+        none = np.isinf(np.min(distances, axis=0))
+        self._of = np.where(none, -1, nearest).astype(np.int8)
+
+    def picture(self, images: Items[GreyImage | None], masks: Items[NDArray[np.bool_] | None]) -> RoadPicture:
+        """The road in the images of a frame. masks: of each image, the part that shows more than the vehicle itself."""
+        grey, seen = np.zeros(SHAPE, dtype=np.float32), np.zeros(SHAPE, dtype=bool)
+        for index, (image, mask, pixels) in enumerate(zip(images, masks, self._maps, strict=True)):
+            mine = self._of == index
+            if image is None or not mine.any():
+                continue
+            grey[mine] = sampled(image.pixels, pixels)[mine]
+            if mask is not None:
+                mine &= sampled(mask.astype(np.uint8), pixels) > 0
+            seen |= cv2.erode(mine.astype(np.uint8), np.ones((MARGIN, MARGIN))) > 0
+        return RoadPicture(texture(grey, seen), seen, self._of)
+
+
+def distance_votes(
+    first: RoadPicture, second: RoadPicture, heading: float, yaw: float, cells: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Distances (D,) in metres, and the votes (D,) of the tiles of the road for each.
+
+    heading: direction of the way in the first ego frame. yaw: by which the vehicle turned. cells: least and largest
+    distance, a negative one is driven backwards.
+    """
+    a, b = _turned(first, heading), _turned(second, heading - yaw)
+    shifts = np.arange(cells[0], cells[1] + 1)
+    distances = np.asarray(CELL_M * shifts, dtype=np.float64)
+    correlations, weights = [], []
+    (height, width), last = SHAPE, SHAPE[1] - TILE
+    for row in range(ASIDE, height - TILE - ASIDE + 1, TILE):
+        strip = np.ascontiguousarray(b.texture[row - ASIDE : row + TILE + ASIDE])
+        covered = cv2.boxFilter(b.seen[row : row + TILE].mean(0, dtype=np.float32)[None], -1, (TILE, 1), anchor=(0, 0))
+        beside = BEGIN_M[1] + (row + TILE / 2) * CELL_M
+        for column in range(0, width - TILE + 1, TILE):
+            part = np.s_[row : row + TILE, column : column + TILE]
+            if a.seen[part].mean() < LEAST_SEEN or a.texture[part].std() < LEAST_CONTRAST:
+                continue
+            found = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[part]), cv2.TM_CCOEFF_NORMED).max(0)
+            at = column - shifts
+            inside = (at >= 0) & (at <= last)
+            usable = inside & (covered[0, at.clip(0, last)] >= LEAST_SEEN)
+            correlations.append(np.where(usable, found[at.clip(0, last)], np.nan))
+            weights.append(np.exp(-((beside / WAY_M) ** 2)))
+    if not correlations:
+        return distances, np.zeros(len(shifts))
+    return distances, _summed(np.stack(correlations), np.array(weights))
+
+
+def _summed(correlations: Array, weights: Array) -> Array:
+    """(D,) votes of tiles with correlations (tiles, D): what a tile says of a distance beyond what it says of all."""
+    seen = np.isfinite(correlations)
+    votes = -np.log(1.001 - np.clip(np.nan_to_num(correlations), 0, 1))
+    usual = np.array([np.median(vote[mask]) if mask.any() else 0.0 for vote, mask in zip(votes, seen, strict=True)])
+    votes = np.where(seen, np.clip(votes - usual[:, None] - NOTHING, 0, MOST), 0)
+    return np.asarray((weights[:, None] * votes).sum(0) / np.sqrt(1 + (weights[:, None] * seen).sum(0)))
+
+
+def _turned(picture: RoadPicture, angle: float) -> RoadPicture:
+    """The picture in a frame that is turned about the origin of the ego frame."""
+    return moved_picture(picture, angle, np.zeros(2))
+
+
+def moved_picture(picture: RoadPicture, yaw: float, shift: Array) -> RoadPicture:
+    """The picture in a frame; its points are turned by a yaw and then shifted (2,) to be those of the picture's."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn, begin = np.array([[c, -s], [s, c]]), np.array(BEGIN_M)
+    matrix = np.column_stack([turn, (turn @ begin + shift - begin) / CELL_M])
+    size, inverse = SHAPE[::-1], cv2.WARP_INVERSE_MAP
+    grey = cv2.warpAffine(picture.texture, matrix, size, flags=inverse | cv2.INTER_LINEAR, borderValue=128)
+    seen = cv2.warpAffine(picture.seen.astype(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST)
+    return RoadPicture(np.asarray(grey, dtype=np.uint8), seen > 0, picture.of)
+
+
+@dataclass(frozen=True)
+class RoadFlow:
+    """Points of the road in two pictures."""
+
+    first: Array  # (n, 2) x and y in the first ego frame, metres
+    second: Array  # (n, 2) in the second one
+    contrast: Array  # (n, 2, 2) symmetric: 0 to 1 along each axis of the contrast, in the first ego frame
+    cameras: Indices  # (n, 2) that see them
+
+
+def road_flow(first: RoadPicture, second: RoadPicture, yaw: float, shift: Array, most_m: float) -> RoadFlow:
+    """Points of the road, at most `most_m` from where a motion puts them: a yaw and a shift (2,), ego_a_from_ego_b."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    back = np.array([[c, s], [-s, c]])  # from the first frame to the second one, about the shift
+    warped = moved_picture(second, -yaw, -back @ shift)
+    both = cv2.erode((first.seen & warped.seen).astype(np.uint8), np.ones((WINDOW, WINDOW)))
+    at = np.argwhere(both[::SPACING, ::SPACING] > 0)[:, ::-1].astype(np.float32) * SPACING
+    if not len(at):
+        return RoadFlow(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2), dtype=np.int64))
+    flow, kept = flow_at(first.texture, warped.texture, at)
+    kept &= np.linalg.norm(flow, axis=-1) * CELL_M < most_m
+    at, flow = at[kept], flow[kept]
+    points, moved = BEGIN_M + CELL_M * at, BEGIN_M + CELL_M * (at + flow)
+    there = (moved - shift) @ back.T
+    columns, rows = np.rint((there - BEGIN_M) / CELL_M).astype(int).T
+    cameras = [first.of[at[:, 1].astype(int), at[:, 0].astype(int)],
+               second.of[rows.clip(0, SHAPE[0] - 1), columns.clip(0, SHAPE[1] - 1)]]  # fmt: skip
+    seen = np.minimum(*cameras) >= 0
+    told = contrast(first.texture, at)
+    return RoadFlow(points[seen], there[seen], told[seen], np.stack(cameras, -1)[seen].astype(np.int64))

@@ -1,0 +1,265 @@
+"""odometry.png: the way on the road from above, and speed and yaw rate over time with their deviations.
+
+The road is stitched of what each frame shows of it near the vehicle, by the measured poses: edges that break or double
+show an error of the motion or of the calibration.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.workshop.correspondence.road import sampled
+from bevcli.workshop.odometry.measure import MeasuredMotion
+from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg
+from bevcli.writing import whole_file
+
+Pixels = NDArray[np.uint8]
+CELL_M, REACH_M = 0.1, 15.0  # of the road around one frame
+SIDE = round(2 * REACH_M / CELL_M)  # pixels
+BLUR_M = 0.4  # ground that a pixel covers: cells that a camera sees less sharply are left out
+BODY_M = (-1.2, 4.2, 1.1)  # of the vehicle: back and front, and half its width, from the origin of the ego frame
+MOST_PIXELS = 1600  # of a side of the stitched road
+SHOWN_WIDTH, MOST_SHOWN = 320, 100  # of images in the recording: pixels, and frames
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+WAY, STATED, GUESSED = "#ff8c1a", "#2a7de1", "#d62728"
+
+
+class GroundView:
+    """Looks at the road around the vehicle from above, by the cameras of one rig.
+
+    Attributes:
+        weight: (SIDE, SIDE) closeness of each cell to the camera that sees it, 0 where none does.
+    """
+
+    def __init__(self, rig: CameraRig) -> None:
+        self.rig = rig
+        shape = SIDE, SIDE
+        self._camera, self._pixels = np.full(shape, -1), np.zeros((*shape, 2), np.float32)
+        nearest = np.full(shape, np.inf)
+        cells = ground_cells()
+        back, front, half = BODY_M
+        body = (cells[..., 0] > back) & (cells[..., 0] < front) & (np.abs(cells[..., 1]) < half)
+        for index, camera in enumerate(rig.cameras):
+            pixels, distance = _seen_from(camera, cells)
+            closer = (distance < nearest) & ~body
+            self._camera[closer], self._pixels[closer], nearest[closer] = index, pixels[closer], distance[closer]
+        seen = cv2.erode(np.isfinite(nearest).astype(np.float32), np.ones((5, 5)))  # an edge mixes with black
+        self.weight = np.asarray(seen / (1 + nearest), dtype=np.float32)
+
+    def of(self, frame: Frame) -> Pixels:
+        """(SIDE, SIDE, 3) BGR, the road around the vehicle; ahead is up. Black where no image shows it."""
+        road = np.zeros((SIDE, SIDE, 3), np.uint8)
+        for index, name in enumerate(self.rig.names):
+            mine = self._camera == index
+            if name in frame.images and mine.any():
+                road[mine] = sampled(frame.images[name].pixels_bgr, self._pixels)[mine]
+        return road
+
+
+def ground_cells() -> Array:
+    """(SIDE, SIDE, 3) centres of the cells on the ground, ego frame: the first row is farthest ahead, left first."""
+    along = REACH_M - CELL_M * (np.arange(SIDE) + 0.5)
+    return np.stack([*np.meshgrid(along, along, indexing="ij"), np.zeros((SIDE, SIDE))], axis=-1)
+
+
+def _seen_from(camera: Camera, cells: Array) -> tuple[Array, Array]:
+    """Pixels (SIDE, SIDE, 2) of the cells, and their distances to the camera; infinite where it does not see them."""
+    pixels, depth = camera.project_ego(cells)
+    offset = cells - camera.ego_from_camera[:3, 3]
+    distance = np.linalg.norm(offset, axis=-1)
+    blur = distance**2 / (np.abs(offset[..., 2]) * camera.intrinsics[0, 0])
+    sharp = camera.contains(pixels, depth) & (blur < BLUR_M) & (distance < REACH_M)
+    return pixels, np.where(sharp, distance, np.inf)
+
+
+def _small(image: Pixels) -> bytes:
+    """JPEG of an image, SHOWN_WIDTH wide."""
+    height = round(SHOWN_WIDTH * image.shape[0] / image.shape[1])
+    small = cv2.resize(image, (SHOWN_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", small, JPEG)[1].tobytes()
+
+
+class WatchedDrive(DerivedSequence):
+    """A drive that keeps what is drawn of each frame that is loaded: the road from above, and its stated pose.
+
+    Attributes:
+        road: place -> JPEG of the road from above.
+        images: place -> camera -> JPEG of its small image; of MOST_SHOWN frames at most.
+        stated: place -> world_from_ego (4, 4); of a drive with poses.
+        view: the cells of the road in the images of the rig; None before a frame is loaded.
+    """
+
+    def __init__(self, sequence: Sequence) -> None:
+        super().__init__(sequence)
+        self.road: dict[int, bytes] = {}
+        self.images: dict[int, dict[str, bytes]] = {}
+        self.stated: dict[int, Array] = {}
+        self.view: GroundView | None = None
+        self._every = -(-len(sequence.stamps) // MOST_SHOWN)
+
+    def load(self, place: int) -> Frame:
+        frame = super().load(place)
+        if self.view is None or self.view.rig is not frame.rig:
+            self.view = GroundView(frame.rig)
+        self.road[place] = cv2.imencode(".jpg", self.view.of(frame), JPEG)[1].tobytes()
+        if place % self._every == 0:
+            self.images[place] = {name: _small(image.pixels_bgr) for name, image in frame.images.items()}
+        if self.has_ego_motion:
+            self.stated[place] = frame.world_from_ego.matrix
+        return frame
+
+    @property
+    def stated_poses(self) -> list[Array] | None:
+        """(F, 4, 4) of all frames; None for a drive without poses."""
+        return [self.stated[place] for place in range(len(self.stamps))] if self.stated else None
+
+
+@dataclass(frozen=True)
+class StitchedRoad:
+    """The road along the way.
+
+    Attributes:
+        image: (H, W, 3) RGB, white where it was not seen; the first row has the largest y.
+        x_range_m: of the image, in the world frame.
+        y_range_m: the same.
+    """
+
+    image: Pixels
+    x_range_m: tuple[float, float]
+    y_range_m: tuple[float, float]
+
+    def pixels(self, poses: Array) -> Array:
+        """(F, 2) column and row of each of some poses (F, 4, 4), world_from_ego."""
+        (x0, x1), (_, y1) = self.x_range_m, self.y_range_m
+        cell = (x1 - x0) / self.image.shape[1]
+        return np.stack([poses[:, 0, 3] - x0, y1 - poses[:, 1, 3]], axis=-1) / cell
+
+
+def stitched(drive: WatchedDrive, poses: Array) -> StitchedRoad:
+    """The road of all frames by their poses (F, 4, 4): each place as the frame saw it that was closest to it."""
+    assert drive.view is not None
+    low, high = poses[:, :2, 3].min(0) - REACH_M, poses[:, :2, 3].max(0) + REACH_M
+    cell = max(CELL_M, float((high - low).max()) / MOST_PIXELS)
+    width, height = (int(size) for size in np.ceil((high - low) / cell))
+    image, best = np.full((height, width, 3), 255, np.uint8), np.zeros((height, width), np.float32)
+    pixel_from_world = np.array([[1 / cell, 0, -low[0] / cell], [0, -1 / cell, high[1] / cell], [0, 0, 1]])
+    for place in sorted(drive.road):
+        road = np.asarray(cv2.imdecode(np.frombuffer(drive.road[place], np.uint8), cv2.IMREAD_COLOR_RGB))
+        weight = drive.view.weight * (road.max(-1) > 4)  # where an image is missing it is black
+        pixel_from_patch = pixel_from_world @ _world_from_patch(poses[place])
+        corners = pixel_from_patch @ np.array([[0, SIDE, 0, SIDE], [0, 0, SIDE, SIDE], [1, 1, 1, 1]])
+        x0, y0 = np.maximum(np.floor(corners[:2].min(1)), 0).astype(int)
+        x1, y1 = np.minimum(np.ceil(corners[:2].max(1)), (width, height)).astype(int)
+        local = np.array([[1, 0, -x0], [0, 1, -y0]]) @ pixel_from_patch
+        size = int(x1 - x0), int(y1 - y0)
+        colors = cv2.warpAffine(road, local, size, flags=cv2.INTER_LINEAR)
+        weights = cv2.warpAffine(weight, local, size, flags=cv2.INTER_NEAREST)
+        part, closer = best[y0:y1, x0:x1], weights > best[y0:y1, x0:x1]
+        image[y0:y1, x0:x1][closer], part[closer] = colors[closer], weights[closer]
+    return StitchedRoad(
+        image, (float(low[0]), float(low[0] + cell * width)), (float(high[1] - cell * height), float(high[1]))
+    )
+
+
+def _world_from_patch(world_from_ego: Array) -> Array:
+    """(3, 3) from pixels (column, row) of the road around a frame to x, y of the world, on a level road."""
+    ego_from_patch = np.array([[0, -CELL_M, REACH_M], [-CELL_M, 0, REACH_M], [0, 0, 1]])
+    flat = np.eye(3)
+    flat[:2, :2], flat[:2, 2] = world_from_ego[:2, :2], world_from_ego[:2, 3]
+    return flat @ ego_from_patch
+
+
+def write_picture(path: Path, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> None:
+    """Write odometry.png. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
+    figure = draw(motion, road, stated)
+    with whole_file(path, parents=True) as unfinished:
+        figure.savefig(unfinished, dpi=110, format="png")
+
+
+def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> Figure:
+    """The figure: the way on the road, beside or above the curves."""
+    height, width = road.image.shape[:2]
+    wide = width > 1.6 * height
+    figure = Figure(figsize=(13, 9) if wide else (14, 7), layout="constrained")
+    figure.suptitle(f"{motion.name}: {lengths_m(motion).sum():.1f} m", x=0.01, ha="left", fontweight="bold")
+    grid = figure.add_gridspec(3 if wide else 2, 1 if wide else 2, height_ratios=[2, 1, 1] if wide else None)
+    cells = [grid[0], grid[1], grid[2]] if wide else [grid[:, 0], grid[0, 1], grid[1, 1]]
+    way, speed, yaw_rate = (figure.add_subplot(cell) for cell in cells)
+    _draw_way(way, motion, road, stated)
+    others = None if stated is None else _motion_of(motion, stated)
+    _draw_curve(speed, motion, speeds(motion), None if others is None else speeds(others)[0], "speed, m/s")
+    of_stated = None if others is None else yaw_rates_deg(others)[0]
+    _draw_curve(yaw_rate, motion, yaw_rates_deg(motion), of_stated, "yaw rate, °/s")
+    yaw_rate.set_xlabel("seconds")
+    kmh = speed.secondary_yaxis("right", functions=(_times_kmh, _by_kmh))
+    kmh.set_ylabel("km/h")
+    return figure
+
+
+def _times_kmh(speed: Any) -> Any:
+    return KMH * speed
+
+
+def _by_kmh(speed: Any) -> Any:
+    return speed / KMH
+
+
+def _motion_of(motion: MeasuredMotion, stated: Items[Array]) -> MeasuredMotion:
+    """Stated poses as a motion, for the curves."""
+    steps = [
+        replace(step, ego_a_from_ego_b=inverse(a) @ b)
+        for step, (a, b) in zip(motion.steps, pairwise(stated), strict=True)
+    ]
+    return replace(motion, steps=tuple(steps))
+
+
+def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> None:
+    axes.imshow(road.image, extent=(*road.x_range_m, *road.y_range_m), interpolation="bilinear")
+    places = motion.poses[:, :2, 3]
+    if stated is not None:
+        moved = np.stack([inverse(stated[0]) @ pose for pose in stated])[:, :2, 3]
+        axes.plot(*moved.T, color=STATED, linewidth=3.5, alpha=0.6, label="stated")
+    axes.plot(*places.T, color=WAY, linewidth=1.5, marker="o", markersize=2.5, label="measured")
+    guessed = [index for index, step in enumerate(motion.steps) if step.reason]
+    if guessed:
+        for index in guessed:
+            axes.plot(*places[index : index + 2].T, color=GUESSED, linewidth=3)
+        axes.plot([], [], color=GUESSED, linewidth=3, label="not measured")
+    axes.plot(*places[0], marker="s", color="black", markersize=6)
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    axes.legend(loc="best", fontsize=9)
+    axes.set_aspect("equal")
+
+
+def _draw_curve(
+    axes: Axes, motion: MeasuredMotion, measured: tuple[Array, Array], stated: Array | None, label: str
+) -> None:
+    """measured: values (F - 1,) and standard deviations."""
+    values, deviations = measured
+    times = (motion.timestamps_ns - motion.timestamps_ns[0]) / 1e9
+    middles = (times[:-1] + times[1:]) / 2
+    if stated is not None:
+        axes.plot(middles, stated, color=STATED, linewidth=3.5, alpha=0.6)
+    axes.fill_between(middles, values - deviations, values + deviations, color=WAY, alpha=0.3, linewidth=0)
+    axes.plot(middles, values, color=WAY, linewidth=1.5)
+    guessed = np.array([bool(step.reason) for step in motion.steps])
+    axes.plot(middles[guessed], values[guessed], color=GUESSED, linestyle="", marker="x")
+    axes.set_ylabel(label)
+    axes.set_title(f"± σ, {np.median(deviations):.3f} (median)" if len(values) else "", fontsize=9, loc="right")
+    axes.grid(visible=True, color="#e6e6e6")
+    if len(values):  # a guess's wide deviation must not hide the curve
+        shown = values if stated is None else np.concatenate([values, stated])
+        margin = max(0.15 * float(np.ptp(shown)), 3 * float(np.median(deviations)), 0.5)
+        axes.set_ylim(float(shown.min()) - margin, float(shown.max()) + margin)

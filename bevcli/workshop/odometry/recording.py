@@ -1,0 +1,131 @@
+"""odometry.rrd: the way on the road, the road from above frame by frame, images, and the curves, for `bevcli viz`."""
+
+from collections.abc import Sequence as Items
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bevcli.errors import OutputError
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.files import plain_name
+from bevcli.recording import entities
+from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
+from bevcli.workshop.odometry.measure import MeasuredMotion
+from bevcli.workshop.odometry.picture import SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
+from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
+from bevcli.workshop.odometry.seen_points import SeenPoints
+from bevcli.writing import whole_file
+
+WAY, ROAD, CAMERAS = "way", "road", "cameras"
+CURVES = {"speed": "speed, m/s", "yaw_rate": "yaw rate, °/s"}
+COLOR, PALE, STATED_COLOR, GUESSED_COLOR = (255, 140, 26), (255, 140, 26, 110), (42, 125, 225), (255, 45, 85)
+SERIES = (("measured", "measured", COLOR, 2.0), ("low", "- σ", PALE, 1.0), ("high", "+ σ", PALE, 1.0))
+ROAD_COLOR = (70, 150, 255)
+RESIDUALS_PX, RESIDUAL_COLORS = (0.5, 1.5), ((70, 220, 120), (245, 222, 90), (255, 45, 85))  # of matched points
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+
+
+def write_recording(
+    path: Path, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, stated: Items[Array] | None
+) -> None:
+    """Write the recording. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
+    layout = _layout(drive, road)
+    with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream("bevcli-odometry") as stream:
+        try:
+            stream.save(unfinished, default_blueprint=layout)
+        except RuntimeError as error:
+            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
+        finally:
+            layout.free()
+        _log_way(stream, motion, road, stated)
+        for name in CURVES:
+            for part, text, color, width in SERIES:
+                style = rr.SeriesLines(colors=color, widths=width, names=text)
+                stream.log(f"curves/{name}/{part}", style, static=True)
+        for place, stamp in enumerate(drive.stamps):
+            stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
+            stream.set_time(entities.TIME_TIMELINE, duration=(stamp.timestamp_ns - drive.stamps[0].timestamp_ns) / 1e9)
+            _log_frame(stream, motion, drive, road, place)
+
+
+def _layout(drive: WatchedDrive, road: StitchedRoad) -> Layout:
+    height, width = road.image.shape[:2]
+    ahead = flat_view(ROAD, "road from above, ahead is up", (0, SIDE), (0, SIDE))
+    way = flat_view(WAY, "way", (0, width), (0, height))
+    curves = [rrb.TimeSeriesView(origin=f"curves/{name}", name=title) for name, title in CURVES.items()]
+    texts = rrb.TextLogView(origin=entities.EVENTS, name="steps that were not measured")
+    cameras = {
+        camera.name: flat_view(
+            f"{CAMERAS}/{camera.name}", camera.name, (0, SHOWN_WIDTH), (0, SHOWN_WIDTH * camera.height / camera.width)
+        )
+        for camera in drive.rig.cameras
+    }
+    rows = [rrb.Horizontal(*(cameras[name] for name in row)) for row in camera_rows(drive.rig)]
+    middle = rrb.Horizontal(way, ahead, rrb.Vertical(*curves, texts, row_shares=[3, 3, 2]), column_shares=[3, 2, 3])
+    return Layout(
+        rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[1, 2, 1][: len(rows) + 1]),
+        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE, fps=frame_rate_hz(drive.stamps)),
+    )
+
+
+def _log_way(
+    stream: rr.RecordingStream, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
+) -> None:
+    """The stitched road with the whole way."""
+    encoded = cv2.imencode(".jpg", road.image[..., ::-1], JPEG)[1].tobytes()
+    stream.log(f"{WAY}/road", rr.EncodedImage(contents=encoded, media_type="image/jpeg"), static=True)
+    if stated is not None:
+        moved = np.stack([inverse(stated[0]) @ pose for pose in stated])
+        line = rr.LineStrips2D([road.pixels(moved)], colors=STATED_COLOR, radii=rr.Radius.ui_points(2.5))
+        stream.log(f"{WAY}/stated", line, static=True)
+    pixels = road.pixels(motion.poses)
+    line = rr.LineStrips2D([pixels], colors=COLOR, radii=rr.Radius.ui_points(1.2))
+    stream.log(f"{WAY}/measured", line, static=True)
+    guessed = [pixels[index : index + 2] for index, step in enumerate(motion.steps) if step.reason]
+    red = rr.LineStrips2D(guessed, colors=GUESSED_COLOR, radii=rr.Radius.ui_points(2.0))
+    stream.log(f"{WAY}/not_measured", red, static=True)
+
+
+def _log_frame(
+    stream: rr.RecordingStream, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, place: int
+) -> None:
+    """The road around the vehicle, the vehicle on its way, and the curves of the step that ends here."""
+    pose = motion.poses[place]
+    ahead = pose @ np.array([[1, 0, 0, 3.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    start, end = road.pixels(np.stack([pose, ahead]))
+    radii = rr.Radius.ui_points(3.0)
+    vehicle = rr.Arrows2D(origins=[start], vectors=[end - start], colors=entities.EGO_COLOR, radii=radii)
+    stream.log(f"{WAY}/vehicle", vehicle)
+    stream.log(f"{ROAD}/image", rr.EncodedImage(contents=drive.road[place], media_type="image/jpeg"))
+    for name, encoded in drive.images.get(place, {}).items():
+        stream.log(f"{CAMERAS}/{name}/image", rr.EncodedImage(contents=encoded, media_type="image/jpeg"))
+    if place == 0:
+        return
+    for name, (values, deviations) in zip(CURVES, (speeds(motion), yaw_rates_deg(motion)), strict=True):
+        value, deviation = float(values[place - 1]), float(deviations[place - 1])
+        parts = {"measured": value, "low": value - deviation, "high": value + deviation}
+        for part, number in parts.items():
+            stream.log(f"curves/{name}/{part}", rr.Scalars(number))
+    if place in drive.images:
+        _log_points(stream, motion.steps[place - 1].seen, drive.rig)
+    reason = motion.steps[place - 1].reason
+    if reason:
+        stream.log(entities.EVENTS, rr.TextLog(f"frame {drive.stamps[place].index}: {reason}", level="WARN"))
+
+
+def _log_points(stream: rr.RecordingStream, seen: SeenPoints | None, rig: CameraRig) -> None:
+    """The points of a step in the images: those of the road blue, matched ones by their residual."""
+    for index, camera in enumerate(rig.cameras):
+        entity = f"{CAMERAS}/{camera.name}/points"
+        if seen is None:
+            stream.log(entity, rr.Clear(recursive=False))
+            continue
+        mine = seen.camera == index
+        colors = np.asarray(RESIDUAL_COLORS)[np.digitize(seen.residuals_px[mine], RESIDUALS_PX)]
+        colors[seen.is_road[mine]] = ROAD_COLOR
+        at = seen.at[mine] * (SHOWN_WIDTH, SHOWN_WIDTH * camera.height / camera.width)
+        stream.log(entity, rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(1.5), draw_order=10))

@@ -1,0 +1,329 @@
+"""The motion between two frames: matched points, starts, and the motion that fits points and road best."""
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+
+from bevcli.geometry.transforms import Array
+from bevcli.workshop.correspondence.points import matched, neighbours
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, Residuals, RoadResiduals
+from bevcli.workshop.correspondence.road import RoadPoints, road_points
+from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve, spread, values
+from bevcli.workshop.odometry.above import CELL_M, distance_votes, road_flow
+from bevcli.workshop.odometry.frames import FrameView
+from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
+from bevcli.workshop.odometry.unknowns import (
+    CHANGE_RAD,
+    COUNT,
+    SHORTEST_M,
+    SLOPE_RAD,
+    SLOPES,
+    STATE,
+    StepUnknowns,
+    deviations_at,
+)
+
+YAWS = np.radians(np.arange(-30, 30.1, 2.0))  # that are tried, besides those of the last step
+FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
+STILL_PX, STILL_SHARE = 0.6, 0.7  # of matched points of a vehicle that stands
+STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
+CLEAR_M, CLEAR_SHARE = 60.0, 0.4  # of points that tell whether the vehicle drives backwards
+WIDEST_M, WIDEST, WIDEST_RAD = (
+    0.15,
+    0.1,
+    np.radians(1.5),
+)  # deviations of what counts as measured: way, share of it, turn
+USUAL_M = 4.0  # distance at which directions are searched
+ROUGH_PX = 6.0  # of residuals while directions are searched
+FASTEST, BACK = 45.0, 6.0  # m/s, of the distances that are tried
+MOST_M = (0.8, 0.25)  # between points of the road and where they are expected, pass by pass
+ROAD_PX = 60.0  # the same in one image, for a metre
+MOST_PX = (30.0, 8.0)  # of points of two cameras
+LEAST_SHARE = 0.3  # of the points of two cameras that fit; where fewer do, both see nothing in common
+LEAST_SPREAD, MOST_SPREAD = 0.3, 2.0  # of residuals, while the motion is searched
+CANDIDATES = 3  # distances of a step that are measured
+LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
+APART_M = 0.4  # between them
+PARTS = 6  # of a pair of images, whose agreement tells the deviations
+
+
+NO_POINTS = RoadPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0))
+Some = TypeVar("Some", bound=Residuals)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A motion that a step may have.
+
+    Attributes:
+        state: (8,), see `StepUnknowns`.
+        covariance: (6, 6) of rotation and translation.
+        votes: of the road for its distance.
+        matches: number of matched points.
+        road_points: number of points of the road.
+        seen: some of both, for recordings.
+    """
+
+    state: Array
+    covariance: Array
+    votes: float
+    matches: int
+    road_points: int
+    seen: SeenPoints | None = None
+
+    def speed_and_rate(self, seconds: float) -> Array:
+        """(2,) the speed (m/s, negative backwards) and the yaw rate (radians a second) of a step of some seconds."""
+        return np.array([np.copysign(np.hypot(*self.state[3:5]), self.state[3]), self.state[2]]) / seconds
+
+
+@dataclass(frozen=True)
+class StepViews:
+    """Two frames of C cameras. Their images form C x C groups, and each group has PARTS."""
+
+    first: FrameView
+    second: FrameView
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.first.cameras)
+
+    def pair(self, group: Indices) -> tuple[Indices, Indices]:
+        """The cameras of the first and of the second images of groups."""
+        return np.divmod(group // PARTS, self.cameras)
+
+    def group(self, first: Indices | int, second: Indices | int, rays_a: Array) -> Indices:
+        """(n,) the groups of points with rays (n, 3) in images of a first and of a second camera."""
+        part = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
+        return np.asarray((first * self.cameras + second) * PARTS + part, dtype=np.int64)
+
+    def unknowns(self, start: Array, deviations: Array) -> StepUnknowns:
+        """The unknowns about a start (8,)."""
+        groups = self.pair(np.arange(self.cameras**2 * PARTS))
+        views, seconds = (self.first, self.second), (self.second.timestamp_ns - self.first.timestamp_ns) / 1e9
+        a, b = (
+            np.stack([camera.ego_from_camera for camera in view.cameras])[index]
+            for view, index in zip(views, groups, strict=True)
+        )
+        shares = [
+            side + view.late_s[index] / seconds for side, (view, index) in enumerate(zip(views, groups, strict=True))
+        ]
+        return StepUnknowns((a, b), np.stack(shares, -1), start, deviations)
+
+
+def match_points(step: StepViews) -> EpipolarResiduals:
+    """The matched points of each camera with itself and with its neighbours."""
+    nothing = np.zeros((0, 3))
+    group, a, b, focal = [np.zeros(0, dtype=np.int64)], [nothing], [nothing], [np.zeros(0)]
+    for i, j in [(index, index) for index in range(step.cameras)] + neighbours(step.first.cameras):
+        first, second = step.first.features[i], step.second.features[j]
+        if first is None or second is None:
+            continue
+        rays_a, rays_b = matched(first, second, step.first.cameras[i], step.second.cameras[j])
+        group.append(step.group(i, j, rays_a))
+        a.append(rays_a)
+        b.append(rays_b)
+        focal.append(np.full(len(rays_a), step.first.cameras[i].intrinsics[0, 0]))
+    columns = np.concatenate(group), np.concatenate(a), np.concatenate(b), np.concatenate(focal)
+    return _sorted(EpipolarResiduals(*columns))
+
+
+def _sorted(residuals: Some) -> Some:
+    """By group, as the solver needs it."""
+    order = np.argsort(residuals.group, kind="stable")
+    return type(residuals)(*(getattr(residuals, field.name)[order] for field in fields(residuals)))
+
+
+def along_arc(distance: float, yaw: float, slopes: Array) -> Array:
+    """(8,) the start of a vehicle that drives along an arc."""
+    return np.array([0, 0, yaw, distance * np.cos(yaw / 2), distance * np.sin(yaw / 2), 0, *slopes])
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What is expected of a step from the one before.
+
+    Attributes:
+        state: (8,), see `StepUnknowns`; None where nothing is known.
+        height_m: standard deviation of the stated heights of the cameras.
+        still: whether the vehicle stands, as all points show.
+    """
+
+    state: Array | None
+    height_m: float
+    still: bool = False
+
+    @property
+    def slopes(self) -> Array:
+        """(2,) of the road."""
+        return np.zeros(2) if self.state is None else self.state[SLOPES]
+
+    def deviations(self, start: Array, *, known_distance: bool = False) -> Array:
+        """(9,) of the unknowns."""
+        slope = SLOPE_RAD if self.state is None else CHANGE_RAD
+        result = deviations_at(start, self.height_m, slope, known_distance=known_distance)
+        return np.minimum(result, STANDING) if self.still else result
+
+
+def is_still(step: StepViews, points: EpipolarResiduals) -> bool:
+    """True where most points of single cameras stay where they are in the image."""
+    inside = points.where(np.equal(*step.pair(points.group)))
+    moved = np.linalg.norm(inside.rays_a - inside.rays_b, axis=-1) * inside.focal
+    return len(moved) >= FEWEST and bool((moved < STILL_PX).mean() > STILL_SHARE)
+
+
+def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array:
+    """(8,) the motion that fits the matched points of single cameras; its length is that of the guess, if any."""
+    inside = points.where(np.equal(*step.pair(points.group)))
+    known = guess.state is not None and np.hypot(*guess.state[3:5]) > SHORTEST_M
+    length = float(guess.state[3]) if known and guess.state is not None else USUAL_M
+    starts = [along_arc(length, yaw, guess.slopes) for yaw in YAWS] + ([] if guess.state is None else [guess.state])
+    costs = []
+    for start in starts:
+        unknowns = step.unknowns(start, guess.deviations(start, known_distance=True))
+        squares = (values(unknowns, inside, np.zeros(COUNT)) ** 2).sum(-1)
+        costs.append(float(np.log1p(squares / ROUGH_PX**2).sum()))
+    best = starts[int(np.argmin(costs))]
+    for scale in (ROUGH_PX, 1.0):
+        unknowns = step.unknowns(best, guess.deviations(best, known_distance=True))
+        best = best + solve(unknowns, [(inside, scale)], np.zeros(COUNT)).x[STATE]
+    return best
+
+
+def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
+    """The motions that a step may have, those with most votes first; none where the images do not tell it."""
+    points = match_points(step)
+    if is_still(step, points):
+        start = np.concatenate([np.zeros(6), guess.slopes])
+        return [measured(step, points, start, replace(guess, still=True), 1.0)]
+    if len(points.group) < FEWEST:
+        return []
+    rough = direction(step, points, guess)
+    heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
+    seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
+    cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
+    distances, votes = distance_votes(step.first.road, step.second.road, heading, float(rough[2]), cells)
+    votes[np.sign(distances) == -_sense(step, points, rough)] = 0
+    found = []
+    for index in _peaks(votes)[:CANDIDATES]:
+        start = rough.copy()
+        start[3:5] = distances[index] * np.array([np.cos(heading), np.sin(heading)])
+        found.append(measured(step, points, start, guess, float(votes[index])))
+    return found
+
+
+def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
+    """1 for a vehicle that drives forwards, -1 for backwards, since points are in front of cameras; 0: not clear."""
+    unknowns = step.unknowns(rough, np.ones(COUNT))
+    inside = points.where(np.equal(*step.pair(points.group)))
+    depths = inside.depths(unknowns.geometry(np.zeros((len(unknowns.shares), COUNT))))
+    near = depths[(np.abs(depths) < CLEAR_M).all(-1)]
+    if len(near) < FEWEST:
+        return 0
+    share = float((near > 0).all(-1).mean() - (near < 0).all(-1).mean())
+    return int(np.sign(share) * np.sign(rough[3])) if abs(share) > CLEAR_SHARE else 0
+
+
+def _peaks(votes: Array) -> list[int]:
+    """The indices of the distances with most votes, most first."""
+    left, apart = votes.copy(), round(APART_M / CELL_M)
+    found: list[int] = []
+    while left.max() > 0 and left.max() >= LEAST_VOTES * votes.max():
+        best = int(left.argmax())
+        found.append(best)
+        left[max(0, best - apart) : best + apart + 1] = 0
+    return found
+
+
+def measured(step: StepViews, points: EpipolarResiduals, start: Array, guess: Guess, votes: float) -> Candidate:
+    """The motion near a start (8,) that fits points and road best."""
+    deviations = guess.deviations(start)
+    unknowns, x = step.unknowns(start, deviations), np.zeros(len(deviations))
+    for most_m, most_px in zip(MOST_M, MOST_PX, strict=True):
+        fitting = _common(step, unknowns, points, x, most_px) if not guess.still else _still(step, points)
+        road: GroundResiduals | RoadResiduals = _road_in_images(step, unknowns, x, ROAD_PX * most_m)
+        if len(road.group) < FEWEST_OF_ROAD:
+            road = _road(step, unknowns, x, most_m)
+        terms = _terms(step, unknowns, (fitting, road), x)
+        x = solve(unknowns, [(each, np.clip(scale, LEAST_SPREAD, MOST_SPREAD)) for each, scale in terms], x).x
+    solution = solve(unknowns, _terms(step, unknowns, (fitting, road), x), x)
+    covariance = honest_covariance(unknowns, solution, np.arange(len(unknowns.columns)))
+    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance)
+    kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
+    seen = seen_points(step.second.cameras, *kinds)
+    return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
+
+
+@dataclass(frozen=True)
+class StillPoints(EpipolarResiduals):
+    """Points that stay where they are in the image: they tell the rotation, since there is no direction of driving."""
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 3) pixels."""
+        turns = geometry.camera_b_from_camera_a[self.group, :3, :3]
+        return self.focal[:, None] * (np.einsum("nij,nj->ni", turns, self.rays_a) - self.rays_b)
+
+
+def _still(step: StepViews, points: EpipolarResiduals) -> StillPoints:
+    """The points of single cameras."""
+    inside = points.where(np.equal(*step.pair(points.group)))
+    return StillPoints(inside.group, inside.rays_a, inside.rays_b, inside.focal)
+
+
+def _terms(step: StepViews, unknowns: StepUnknowns, residuals: tuple[Residuals, ...], x: Array) -> list[Term]:
+    """The residuals with the spread of those of each pair of cameras."""
+    return [(each, spread(unknowns, each, x, each.group // PARTS)) for each in residuals if len(each.group)]
+
+
+def _common(
+    step: StepViews, unknowns: StepUnknowns, points: EpipolarResiduals, x: Array, most_px: float
+) -> EpipolarResiduals:
+    """The points of single cameras, and those of two cameras that see something in common."""
+    first, second = step.pair(points.group)
+    pairs = first * step.cameras + second
+    fits = np.abs(values(unknowns, points, x)[:, 0]) < most_px
+    share = np.bincount(pairs, fits, step.cameras**2) / np.maximum(np.bincount(pairs, minlength=step.cameras**2), 1)
+    return points.where((first == second) | (fits & (share >= LEAST_SHARE)[pairs]))
+
+
+def _road(step: StepViews, unknowns: StepUnknowns, x: Array, most_m: float) -> GroundResiduals:
+    """The points of the road near the motion of x."""
+    motion = unknowns.start + x[STATE]
+    yaw = float(motion[2])
+    flow = road_flow(step.first.road, step.second.road, yaw, motion[3:5], most_m)
+    rays_a, rays_b, weights = rays_and_weights(flow, (step.first.cameras, step.second.cameras), yaw)
+    group = step.group(flow.cameras[:, 0], flow.cameras[:, 1], rays_a)
+    return _sorted(GroundResiduals(group, rays_a, rays_b, weights))
+
+
+def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: float) -> RoadResiduals:
+    """The points of the road in the images of single cameras near the motion of x: exact after a short way."""
+    geometry = unknowns.geometry(x[unknowns.columns])
+    groups, parts = [np.zeros(0, dtype=np.int64)], [NO_POINTS]
+    for index, camera in enumerate(step.first.cameras):
+        a, b = step.first.images[index], step.second.images[index]
+        if a is not None and b is not None:
+            group = (index * step.cameras + index) * PARTS
+            parts.append(road_points(camera, (a.texture, b.texture), geometry, group, most_px))
+            groups.append(step.group(index, index, parts[-1].rays_a))
+    columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
+    return _sorted(RoadResiduals(np.concatenate(groups), *columns))
+
+
+def is_measured(candidate: Candidate) -> bool:
+    """False where the images do not tell the motion: its deviations are those before anything was measured."""
+    turn, place = np.sqrt(np.diag(candidate.covariance)).reshape(2, 3)
+    distance = float(np.hypot(*candidate.state[3:5]))
+    return bool(np.hypot(*place[:2]) < max(WIDEST_M, WIDEST * distance) and turn.max() < WIDEST_RAD)
+
+
+def reason_of(step: StepViews, found: list[Candidate]) -> str:
+    """The reason why a step could not be measured."""
+    first, second = (sum(image is not None for image in view.images) for view in (step.first, step.second))
+    if not min(first, second):
+        return "no image shows anything (missing, dark or covered)"
+    if not found:
+        return "too few points of the images match, or no part of the road looks alike in both frames"
+    return "the images do not tell the distance: too few points of the road match"

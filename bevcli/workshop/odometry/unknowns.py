@@ -1,0 +1,90 @@
+"""The unknowns of a step: the motion of the vehicle, the slope of the road, and the height of the cameras over it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bevcli.geometry.transforms import Array, inverse, rigid
+from bevcli.workshop.correspondence.residuals import GroupGeometry, Indices
+from bevcli.workshop.odometry.twist import exponential, logarithm
+
+TURN, PLACE, SLOPES, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 8), 8  # the indices of the unknowns
+COUNT = 9
+STATE = slice(0, 8)  # those that a start has
+SUSPENSION_RAD, SUSPENSION_M = np.radians(0.7), 0.01  # of pitch and roll, and of the height, between two frames
+YAW_RAD, ALONG = np.radians(3.0), 0.3  # by which the start may be wrong, the second as a share of the distance
+SHORTEST_M = 0.5  # distance for that share
+SLOPE_RAD, CHANGE_RAD = np.radians(1.0), np.radians(0.2)  # of the road under the vehicle, and its change in a step
+
+
+@dataclass(frozen=True)
+class StepUnknowns:
+    """The unknowns x (9,) of a step, counted from a start.
+
+    x holds the rotation vector of ego_a_from_ego_b (radians); the way along x and y, and the change of the height over
+    the road (metres); the slopes of the road along x and y; the error of the stated heights of all cameras (metres).
+    So the vehicle drives along the road, whose slope in the ego frame is also the pitch of the vehicle over it.
+    """
+
+    sides: tuple[Array, Array]  # (G, 4, 4) ego_from_camera of both images of a group
+    shares: Array  # (G, 2) when they were taken, as shares of the step: 0 is the first frame's time, 1 the second's
+    start: Array  # (8,) of all but the last
+    deviations: Array  # (9,)
+
+    @cached_property
+    def columns(self) -> Indices:
+        """(G, 9): each group depends on all unknowns."""
+        return np.tile(np.arange(COUNT), (len(self.shares), 1))
+
+    @cached_property
+    def _times(self) -> tuple[Array, Indices]:
+        """The shares that occur, (T,), and which of them both images of each group have, (G, 2)."""
+        times, of_group = np.unique(self.shares, return_inverse=True)
+        return times, of_group.reshape(self.shares.shape)
+
+    def geometry(self, local: Array) -> GroupGeometry:
+        """The geometry of all groups."""
+        x, (times, of_group) = local[0], self._times
+        poses = exponential(times[:, None] * logarithm(self.motion(x)))  # in the first ego frame
+        between = inverse(poses)[:, None] @ poses  # (T, T, 4, 4)
+        raised = rigid((0, 0, x[HEIGHT]))
+        a, b = (raised @ side for side in self.sides)
+        return GroupGeometry(a, b, between[of_group[:, 1], of_group[:, 0]], self.start[SLOPES] + x[SLOPES])
+
+    def motion(self, x: Array) -> Array:
+        """(4, 4) ego_a_from_ego_b."""
+        return motion_of(self.start + x[STATE])
+
+    def covariance(self, x: Array, covariance: Array) -> Array:
+        """(6, 6) of rotation and translation, of the covariance (9, 9) of x."""
+        slopes, way = self.start[SLOPES] + x[SLOPES], (self.start + x[STATE])[PLACE][:2]
+        derivative = np.eye(6, COUNT)
+        derivative[5, 3:5], derivative[5, SLOPES] = slopes, way
+        return np.asarray(derivative @ covariance @ derivative.T)
+
+
+def motion_of(state: Array) -> Array:
+    """(4, 4) ego_a_from_ego_b of a state (8,): see `StepUnknowns`."""
+    x, y, over = state[PLACE]
+    climb = state[SLOPES] @ (x, y)
+    return rigid((x, y, over + climb), Rotation.from_rotvec(state[TURN]).as_matrix())
+
+
+def next_slopes(state: Array) -> Array:
+    """(2,) the slopes of the road in the second ego frame."""
+    normal = Rotation.from_rotvec(state[TURN]).inv().apply(np.array([*-state[SLOPES], 1.0]))
+    return np.asarray(-normal[:2] / normal[2])
+
+
+def deviations_at(start: Array, height_m: float, slope_rad: float, *, known_distance: bool = False) -> Array:
+    """(9,) the standard deviations of the unknowns about a start (8,).
+
+    known_distance: hold the distance of the start, and let the direction be anything.
+    """
+    wide = max(float(np.hypot(*start[3:5])), SHORTEST_M) * ALONG
+    along = 1e-3 if known_distance else wide
+    return np.array(
+        [SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, SUSPENSION_M, slope_rad, slope_rad, height_m]
+    )

@@ -1,0 +1,145 @@
+"""The check of the stated poses in `bevcli project-debug`: which steps, in which order, and what is left out."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+from stated_mistakes import FIRST, MISTAKES, SHOWN, stated
+
+import bevcli
+from bevcli.errors import InputError
+from bevcli.findings import Finding
+from bevcli.frame import FrameStamp
+from bevcli.geometry.transforms import Pose
+from bevcli.workshop.calibration import CheckMotionOptions, calibrate, commands
+from bevcli.workshop.odometry import check_motion
+from bevcli.workshop.odometry.check_motion import chosen_places, stated_motion_findings, without_consequences
+from bevcli.workshop.odometry.compare import compare
+
+STREET = Path(__file__).parents[2] / "samples/street"
+OFF = Finding("calibration-off", "warning", "CAM_FRONT", "does not fit how the vehicle moves")
+UNSEEN = Finding("motion-not-measured", "info", None, "the drive does not show its calibration")
+SCALE = Finding("motion-scale", "warning", None, "the poses have another scale than the images")
+INFO = Finding("motion-not-compared", "info", None, "the poses were not compared with the images")
+
+
+class Drive(MemorySequence):
+    """The drive of stated_mistakes.py: nine frames, and their poses in a table or not."""
+
+    def __init__(self, poses, in_table=True):
+        super().__init__(count=0)
+        times = SHOWN.timestamps_ns.tolist()
+        self.stamps = tuple(FrameStamp(40 + place, "", time) for place, time in enumerate(times))
+        self.poses, self.ego_motion = poses, poses if in_table else None
+
+    def pose(self, place):
+        row = FIRST + 25 * place
+        return Pose(self.poses.translations[row], self.poses.quaternions[row])
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    def measure(drive):
+        for place in range(len(drive.stamps)):
+            drive.load(place)
+        return SHOWN
+
+    monkeypatch.setattr(check_motion, "measure_motion", measure)
+
+
+@pytest.mark.parametrize("in_table", [True, False])
+def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
+    assert stated_motion_findings(Drive(stated(), in_table)) == ()
+    (finding,) = stated_motion_findings(Drive(MISTAKES["km/h"][0], in_table))
+    assert finding.code == "motion-scale"
+
+
+def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch):
+    monkeypatch.setattr(calibrate, "motion_findings", lambda drive: (OFF,))
+    check = commands.CHECK_MOTION.apply
+    (finding,) = check(CheckMotionOptions(), lambda: Drive(MISTAKES["km/h"][0]))
+    assert finding.code == "motion-scale"
+    assert check(CheckMotionOptions(), lambda: Drive(stated())) == (OFF,)
+    assert check(CheckMotionOptions(motion=False), lambda: Drive(MISTAKES["km/h"][0])) == ()
+
+
+def test_one_cause_is_told_where_both_are_off():
+    assert without_consequences((SCALE,), (OFF,), cameras=6) == (OFF,)
+    assert without_consequences((SCALE,), (OFF,) * 4, cameras=6) == (SCALE,)
+    assert without_consequences((SCALE,), (), cameras=6) == (SCALE,)
+    assert without_consequences((), (OFF,), cameras=6) == (OFF,)
+    assert without_consequences((INFO,), (UNSEEN,), cameras=6) == (UNSEEN,)
+    assert without_consequences((INFO,), (OFF,), cameras=6) == (INFO, OFF)
+
+
+def test_frames_are_chosen_where_the_poses_turn():
+    drive = Drive(stated())
+    times = drive.ego_motion.timestamps_ns
+    drive.stamps = tuple(FrameStamp(place, "", int(time)) for place, time in enumerate(times[::10]))  # 5 Hz
+    places = chosen_places(drive)
+    assert len(places) == 9
+    assert set(np.diff(places)) == {2}  # 0.4 s
+    yaws = np.unwrap(2 * np.arctan2(drive.ego_motion.quaternions[:, 3], drive.ego_motion.quaternions[:, 0]))[::10]
+    turns = [np.abs(np.diff(yaws[start : start + 17 : 2])).sum() for start in range(0, 132, 2)]
+    assert np.abs(np.diff(yaws[places])).sum() > np.median(turns)
+
+
+def test_a_short_drive_and_the_longest_scene_are_taken():
+    assert chosen_places(MemorySequence(4)) == [0, 1, 2, 3]
+    assert chosen_places(MemorySequence(6, scenes="aabbbb")) == [2, 3, 4, 5]
+    assert chosen_places(MemorySequence(0)) == []
+
+
+def test_what_cannot_be_measured_is_said(monkeypatch):
+    def refuse(drive):
+        raise InputError("memory: has one frame")
+
+    monkeypatch.setattr(check_motion, "measure_motion", refuse)
+    (finding,) = stated_motion_findings(MemorySequence(1))
+    assert (finding.code, finding.severity) == ("motion-not-compared", "info")
+    assert "memory: has one frame" in finding.message
+    without = MemorySequence(1)
+    without.has_ego_motion = False
+    assert stated_motion_findings(without) == ()
+
+
+@pytest.fixture(scope="module")
+def street():
+    """The sample drive, and what its images show."""
+    drive = bevcli.open_sequence(STREET, ground_truth=False)
+    return drive, check_motion.measure_motion(check_motion.SomeFrames(drive, chosen_places(drive)))
+
+
+@pytest.mark.slow
+def test_the_poses_of_the_sample_drive_are_sound(street):
+    drive, shown = street
+    assert compare(drive.ego_motion, shown) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "code", "found"),
+    [
+        (lambda motion: {"translations": 3.6 * motion.translations}, "motion-scale", r"^3\.[56]"),
+        (lambda motion: {"translations": 1.08 * motion.translations}, "motion-scale", r"^1\.0[78]"),
+        (lambda motion: {"translations": motion.translations[:, [1, 0, 2]]}, "motion-axes", "hold y, x, z"),
+        (lambda motion: {"quaternions": motion.quaternions * (1, 1, 1, -1)}, "motion-angles", "steps fit, 8 where"),
+        (lambda motion: {"timestamps_ns": motion.timestamps_ns + 200_000_000}, "motion-time", r"(19|20)\d ± \d+ ms"),
+        (lambda motion: {"translations": 0 * motion.translations}, "motion-stands", "^0.0 m in the poses"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_the_sample_drive_is_named(street, change, code, found):
+    drive, shown = street
+    (finding,) = compare(replace(drive.ego_motion, **change(drive.ego_motion)), shown)
+    assert finding.code == code
+    assert re.search(found, finding.found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kitti-straight", "nuscenes-scene-0103"])
+def test_the_poses_of_real_drives_are_sound(shared, name):
+    drive = bevcli.open_sequence(shared / "data" / name, ground_truth=False)
+    assert all(finding.severity == "info" for finding in stated_motion_findings(drive))

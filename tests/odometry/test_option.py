@@ -1,0 +1,170 @@
+"""The option `odometry`: opening a drive, runs, conversions, and messages of drives without poses.
+
+The measurement is replaced by the true motion; tests of the measurement itself are in test_measure.py.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from command_line import MINI_TOML, command
+from memory_drive import MemorySequence
+from true_motion import STREET, motion_of, street_copy
+
+import bevcli
+from bevcli.errors import InputError
+from bevcli.evaluation.inputs import pair_frames
+from bevcli.geometry.transforms import inverse
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.options import SequenceOptions
+from bevcli.workshop.batch.job import Job
+from bevcli.workshop.odometry import measure
+from bevcli.workshop.odometry.measure import MeasuredDrive
+from bevcli.workshop.odometry.run_option import MOST_RATE_HZ, at_most_rate, frames_between
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A drive without poses."""
+    return street_copy(tmp_path_factory.mktemp("street") / "drive", FRAMES)
+
+
+@pytest.fixture(scope="module")
+def true_motion():
+    return motion_of(bevcli.open_sequence(STREET, frames=slice(0, FRAMES), ground_truth=False))
+
+
+@pytest.fixture
+def measuring(monkeypatch, true_motion):
+    """Drives that were measured. A measurement gives the true motion."""
+    seen = []
+
+    def measured(drive, options=None, after_step=lambda: None):
+        seen.append(drive)
+        for _ in drive.stamps[1:]:
+            after_step()
+        places = np.searchsorted(true_motion.timestamps_ns, [stamp.timestamp_ns for stamp in drive.stamps])
+        poses = true_motion.poses[places]
+        steps = [replace(true_motion.steps[0], ego_a_from_ego_b=inverse(a) @ b) for a, b in pairwise(poses)]
+        return replace(true_motion, timestamps_ns=true_motion.timestamps_ns[places], steps=tuple(steps))
+
+    monkeypatch.setattr(measure, "measure_motion", measured)
+    return seen
+
+
+def test_a_drive_without_poses_gets_those_that_are_measured(folder, measuring):
+    calls = []
+    drive = bevcli.open_sequence(folder, odometry=True, after_step=lambda *steps: calls.append(steps))
+    stated = bevcli.open_sequence(STREET)
+    assert drive.has_ego_motion
+    assert drive.facts.motion_measured
+    first = inverse(stated.load(0).world_from_ego.matrix)
+    for place in range(FRAMES):
+        frame, other = drive.load(place), stated.load(place)
+        assert frame.world_from_ego.matrix == pytest.approx(first @ other.world_from_ego.matrix, abs=1e-6)
+        assert set(frame.world_from_ego_at) == set(drive.rig.names)
+    assert drive.load(2).kinematics.velocity[0] > 1
+    assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert [note for note in drive.notes if "measured from the images" in note]
+    assert not [note for note in drive.notes if "ego frame" in note]
+
+
+def test_true_boxes_stay_where_they_are_seen_from_the_vehicle(measuring):
+    """In the world of the measured motion, which is another one."""
+    drive, stated = (bevcli.open_sequence(STREET, frames=slice(0, 4), odometry=on) for on in (True, False))
+    for of in (MeasuredDrive.load, MeasuredDrive.ground_truth_frame):
+        frame, other = of(drive, 3), stated.load(3)
+        a, b = (each.ground_truth.transformed(inverse(each.world_from_ego.matrix)) for each in (frame, other))
+        assert a.centers == pytest.approx(b.centers, abs=1e-6)
+        assert a.velocities == pytest.approx(b.velocities, abs=1e-6, nan_ok=True)
+
+
+def test_frames_between_those_that_are_used_are_measured_too(folder, measuring):
+    drive = bevcli.open_sequence(folder, odometry=True, every=2)
+    assert len(drive.stamps) == 2
+    assert [len(each.stamps) for each in measuring] == [3]
+    assert drive.load(1).world_from_ego.matrix == pytest.approx(drive.motion.poses[2], abs=1e-9)
+
+
+def test_frames_outside_of_the_range_are_not_measured(folder, measuring):
+    bevcli.open_sequence(folder, odometry=True, frames=slice(1, 3))
+    assert [[stamp.index for stamp in each.stamps] for each in measuring] == [[1, 2]]
+
+
+def test_a_fast_drive_is_thinned(folder):
+    fast = MemorySequence(9, scenes="a" * 9, step_s=1 / 30)
+    assert [stamp.index for stamp in at_most_rate(fast).stamps] == [0, 3, 6]
+    slow = MemorySequence(4, step_s=1 / MOST_RATE_HZ)
+    assert at_most_rate(slow) is slow
+
+
+def test_several_scenes_are_refused():
+    drive = MemorySequence(4, scenes="aabb")
+    with pytest.raises(InputError, match="memory: has 2 scenes"):
+        frames_between(drive, drive)
+
+
+def test_static_and_odometry_exclude_each_other():
+    with pytest.raises(InputError, match="exclude each other"):
+        bevcli.open_sequence(STREET, ego_motion="static", odometry=True)
+
+
+def test_a_drive_without_poses_names_the_option(folder, tmp_path):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    done = command(tmp_path, "run", str(folder), "--model", "mini.toml", "--untrained")
+    assert done.returncode == 1
+    assert "ego_motion.csv: the file is missing" in done.stderr
+    assert "pass --odometry to measure them from the images, --static if the vehicle stands" in done.stderr
+
+
+def test_a_run_measures_first_and_says_so(folder, tmp_path, measuring):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    options = ("--model", "mini.toml", "--untrained", "--record", "minimal", "--out", "out")
+    done = command(tmp_path, "run", str(folder), *options, "--odometry")
+    assert done.returncode == 0, done.stderr
+    assert "3/3 steps of the ego-motion" in done.stderr
+    assert "the ego-motion is measured from the images" in done.stderr
+    predictions = (tmp_path / "out/predictions.json").read_text()
+    assert '"frame_of_reference": "world"' in predictions
+    assert '"ego_motion": "measured"' in predictions
+
+
+def test_a_conversion_writes_the_measured_poses(folder, tmp_path, measuring, true_motion):
+    done = command(tmp_path, "convert", str(folder), "out", "--odometry")
+    assert done.returncode == 0, done.stderr
+    again = bevcli.open_sequence(tmp_path / "out")
+    assert again.load(3).world_from_ego.matrix == pytest.approx(true_motion.poses[3], abs=1e-6)
+    assert len(again.load(0).ground_truth) == len(bevcli.open_sequence(STREET).load(0).ground_truth)
+
+
+def test_a_drive_of_a_batch_is_measured(folder, measuring):
+    job = Job("runs/fleet", source=SequenceOptions(odometry=True))
+    assert job.open(folder, None).has_ego_motion
+    assert len(measuring) == 1
+
+
+def test_a_validation_scores_drives_without_poses(folder, tmp_path, measuring):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    model = bevcli.load_model(tmp_path / "mini.toml", untrained=True)
+    scores = bevcli.validate(model, data=folder, odometry=True)
+    assert scores.to_dict()["frames"] == FRAMES
+    assert [len(each.stamps) for each in measuring] == [FRAMES]  # once, although it is opened for several purposes
+
+
+def test_boxes_are_scored_in_the_world_of_the_ground_truth():
+    drive = bevcli.open_sequence(STREET, frames=slice(0, 2))
+    moved, truth = [], []
+    for place in range(2):
+        frame = drive.load(place)
+        pose, boxes = frame.world_from_ego, frame.ground_truth
+        other = bevcli.Pose.from_matrix(inverse(drive.load(0).world_from_ego.matrix) @ pose.matrix)
+        seen = replace(boxes, scores=np.ones(len(boxes)))
+        truth.append(FrameBoxes(frame.stamp, pose, boxes))
+        moved.append(FrameBoxes(frame.stamp, other, seen.transformed(other.matrix @ inverse(pose.matrix))))
+    predicted = BoxesFile("world", tuple(moved), extras={"ego_motion": "measured"})
+    pairs = pair_frames(predicted, BoxesFile("world", tuple(truth)))
+    for found, true in zip(*pairs.boxes, strict=True):
+        assert found.centers == pytest.approx(true.centers, abs=1e-6)

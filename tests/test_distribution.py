@@ -1,0 +1,194 @@
+"""The distributions: two builds are equal, the index page leads to files, the installed wheel works without a clone.
+
+The wheel is installed into an environment that does not see the clone. bevcli comes from the wheel, its dependencies
+from the environment of the tests, which a .pth file names: so it takes seconds and no network.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+from dataclasses import dataclass
+from email import message_from_bytes
+from email.message import Message
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+import yaml
+from recorded_drive import NO_DRIVER
+
+import bevcli
+
+ROOT = Path(__file__).parents[1]
+TOOLS = ("git", "pyproject-build", "twine", "check-wheel-contents")
+PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+# Files of the package that are no code. NOTICE states where each comes from.
+DATA = re.compile(
+    r"bevcli/(py\.typed|configs/[\w-]+\.toml|weights/(demo\.safetensors|sources\.toml)"
+    r"|samples/(street/.*|first_steps\.ipynb))"
+)
+PROGRAM = """
+import bevcli
+
+drive = bevcli.open_sequence("samples/street")
+model = bevcli.load_model("demo")
+for frame, prediction in bevcli.run(model, drive):
+    reveal_type(prediction)
+    bevcli.open_sequence(frame)
+"""
+
+
+def test_changelog_and_citation_name_this_version():
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert newest is not None
+    assert newest[1] == bevcli.__version__
+    assert str(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"]) == bevcli.__version__
+
+
+def ran(*command: object, folder: Path | None = None, umask: int = -1) -> subprocess.CompletedProcess:
+    """The program with the tools of the tests, and without what says where bevcli is."""
+    settings = {name: text for name, text in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
+    words = [str(word) for word in command]
+    settings["PATH"] = PATH
+    return subprocess.run(words, cwd=folder, env=settings, umask=umask, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two folders with the sdist and the wheel of the last commit, built with different rights of new files."""
+    if missing := [tool for tool in TOOLS if shutil.which(tool, path=PATH) is None]:
+        pytest.skip(f"{', '.join(missing)}: not installed; run pip install 'bevcli[dist]'")
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a clone")
+    folders = [tmp_path_factory.mktemp("dist") for _ in range(2)]
+    for folder, umask in zip(folders, (0o022, 0o077), strict=True):
+        done = ran(ROOT / ".ci/build-dist", folder, umask=umask)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return folders
+
+
+@pytest.fixture(scope="module")
+def wheel(built: list[Path]) -> Path:
+    [path] = built[0].glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path) -> Message:
+    with ZipFile(wheel) as file:
+        return message_from_bytes(file.read(f"bevcli-{bevcli.__version__}.dist-info/METADATA"))
+
+
+@pytest.mark.slow
+def test_two_builds_have_equal_bytes(built: list[Path]):
+    first, second = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in built)
+    assert len(first) == 2
+    assert first == second
+
+
+@pytest.mark.slow
+def test_the_wheel_has_the_package_its_data_and_its_licence(wheel: Path):
+    with ZipFile(wheel) as file:
+        names = set(file.namelist())
+    about = f"bevcli-{bevcli.__version__}.dist-info"
+    assert {f"{about}/licenses/LICENSE", f"{about}/licenses/NOTICE", "bevcli/py.typed"} <= names
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "bevcli").rglob("*.py")}
+    data = names - modules - {name for name in names if name.startswith(about)}
+    assert modules <= names
+    assert not [name for name in data if not DATA.fullmatch(name)]
+    assert sum(name.endswith(".jpg") for name in data) == len(list((ROOT / "samples/street").rglob("*.jpg")))
+
+
+@pytest.mark.slow
+def test_the_sdist_has_the_tests_and_the_documents(built: list[Path]):
+    [path] = built[0].glob("*.tar.gz")
+    with tarfile.open(path) as file:
+        names = {name.partition("/")[2] for name in file.getnames()}
+    assert {"tests/test_distribution.py", "docs/python.md", "Makefile", "constraints.txt", "NOTICE"} <= names
+
+
+@pytest.mark.slow
+def test_the_index_page_leads_to_files_of_the_release(metadata: Message):
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
+    owner = hooks["custom"]["owner"]
+    repository = f"https://github.com/{owner}/bevcli"
+    page = metadata.get_payload()
+    targets = re.findall(r"\]\(([^)]+)\)", page)
+    assert len(targets) > 30
+    assert all(target.startswith("https://") for target in targets)
+    ours = [target.removeprefix(repository) for target in targets if target.startswith(repository)]
+    tag = f"v{bevcli.__version__}"
+    for target in ours:
+        kind, path = re.fullmatch(rf"/(blob|raw)/{tag}/([^#]+)(?:#.*)?", target).groups()
+        assert (ROOT / path).is_file(), target
+        assert (kind == "raw") == path.endswith((".jpg", ".png", ".webp")), target
+    urls = dict(line.split(", ") for line in metadata.get_all("Project-URL"))
+    assert {"Documentation", "Source", "Issues", "Changelog"} == urls.keys()
+    assert all(owner in url for url in urls.values())
+
+
+@dataclass
+class Environment:
+    """A virtual environment with the wheel, and an empty folder to work in; neither sees the clone."""
+
+    folder: Path
+
+    def python(self, *arguments: object) -> subprocess.CompletedProcess:
+        return ran(self.folder / "bin/python", *arguments, folder=self.folder / "work")
+
+    def bevcli(self, *arguments: object) -> subprocess.CompletedProcess:
+        return self.python(self.folder / "bin/bevcli", *arguments)
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    environment = Environment(tmp_path_factory.mktemp("environment"))
+    (environment.folder / "work").mkdir()
+    ran(sys.executable, "-m", "venv", environment.folder)
+    there = environment.python("-c", "import sysconfig; print(sysconfig.get_path('purelib'))").stdout.strip()
+    Path(there, "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    done = environment.python("-m", "pip", "install", "--no-index", "--no-deps", wheel)
+    assert done.returncode == 0, done.stderr
+    return environment
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_without_the_clone(installed: Environment):
+    found = installed.python("-c", "import bevcli; print(bevcli.__file__, bevcli.__version__)").stdout.split()
+    assert Path(found[0]).is_relative_to(installed.folder)
+    assert found[1] == bevcli.__version__
+    for command in (
+        ("samples",),
+        ("run", "samples/street", "--frames", "0:2", "--out", "runs/first"),
+        ("demo", "--count", "2", "--no-view"),
+        ("eval", "runs/first/predictions.json", "samples/street", "--max-range", "32"),
+    ):
+        done = installed.bevcli(*command)
+        assert done.returncode == 0, done.stderr
+    assert (installed.folder / "work/runs/demo").is_dir()
+
+
+@pytest.mark.slow
+def test_the_viewer_of_the_wheel_draws_a_recording(installed: Environment):
+    done = installed.bevcli("viz", "runs/first", "--screenshot", "image.png")
+    if NO_DRIVER in " ".join(done.stderr.split()):
+        pytest.skip(NO_DRIVER)
+    assert done.returncode == 0, done.stderr
+    assert (installed.folder / "work/image.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_programs_that_use_the_wheel_are_type_checked(installed: Environment):
+    pytest.importorskip("mypy")
+    (installed.folder / "work/program.py").write_text(PROGRAM)
+    options = ("--strict", "--python-executable", installed.folder / "bin/python")
+    done = ran(sys.executable, "-m", "mypy", *options, "program.py", folder=installed.folder / "work")
+    assert 'Revealed type is "bevcli.frame.Prediction"' in done.stdout
+    errors = [line for line in done.stdout.splitlines() if ": error:" in line]
+    assert len(errors) == 1, done.stdout
+    assert errors[0].startswith('program.py:8: error: Argument 1 to "open_sequence"')
