@@ -8,6 +8,7 @@ import pytest
 import torch
 from command_line import MINI_TOML, command
 
+from bevcli._version import __version__
 from bevcli.workshop.benchmark import made_up, measure
 from bevcli.workshop.checks import checks, speed
 
@@ -47,7 +48,14 @@ def test_each_line_tells_its_own_failure(tmp_path, monkeypatch):
     assert list(facts) == list(checks.CHECKS)
     assert facts["processor"].startswith("cannot be told (ModuleNotFoundError: ")
     assert facts["viewer"].startswith("cannot be told (OSError: [Errno 5]")
-    assert facts["bevcli"].startswith(version("bevcli"))
+    assert facts["bevcli"].startswith(f"{__version__} of a checkout")
+
+
+def test_metadata_of_another_version_are_told(monkeypatch):
+    monkeypatch.setattr(checks, "installed", lambda package: "0.0.1")
+    assert f"{__version__} of a checkout (its metadata are of 0.0.1: install it again), Python" in checks.versions()
+    monkeypatch.setattr(checks, "installed", lambda package: __version__)
+    assert f"{__version__} of a checkout, Python" in checks.versions()
 
 
 def test_what_is_not_installed_and_how_to(monkeypatch):

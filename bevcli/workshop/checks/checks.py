@@ -70,6 +70,9 @@ def _lines(title: str, fact: Facts) -> Iterator[str]:
 def versions() -> Facts:
     """Those of bevcli, Python and the system."""
     kind = " of a checkout" if (Path(__file__).parents[3] / "pyproject.toml").is_file() else ""
+    metadata = installed("bevcli")
+    if metadata != __version__:  # an editable installation keeps the requirements of its day
+        kind += f" (its metadata are of {metadata or 'no version'}: install it again)"
     return f"{__version__}{kind}, Python {platform.python_version()}, {platform.platform()}"
 
 
