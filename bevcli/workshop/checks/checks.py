@@ -109,7 +109,7 @@ def processor() -> Facts:
     affinity = getattr(os, "sched_getaffinity", None)
     cores = f"{len(affinity(0)) if affinity else os.cpu_count()} of {os.cpu_count()} cores"
     meminfo = Path("/proc/meminfo")
-    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
+    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text(encoding="utf-8")) if meminfo.is_file() else None
     memory = f", {int(total[1]) / 2**20:.0f} GiB" if total else ""
     rounds = "instructions for bfloat16" if has_onednn(torch.bfloat16) else "no instructions for bfloat16"
     amx = "AMX" if has_matrix_unit() else "no AMX"
