@@ -89,10 +89,10 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
     steps = steps_between(poses)
     found = as_it_is = _candidate(shown, steps)
     if not _stands(shown, shown.steps):  # else any scale near 0 fits
-        best = as_it_is
-        for candidate in _candidates(shown, rows, steps):
-            best = candidate if candidate.cost < best.cost - SAME else best
-        found = best if as_it_is.cost - best.cost > MUCH and best.share >= MOST else as_it_is
+        fitting = [each for each in (as_it_is, *_candidates(shown, rows, steps)) if each.share >= MOST]
+        least = min((each.cost for each in fitting), default=np.inf)
+        best = next((each for each in fitting if each.cost <= least + SAME), as_it_is)
+        found = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
     if found.share >= MOST:
         return (*found.findings, *_jumps(shown, found.steps, numbers))
