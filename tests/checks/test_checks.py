@@ -8,6 +8,7 @@ import pytest
 import torch
 from command_line import MINI_TOML, command
 
+from bevcli._version import __version__
 from bevcli.workshop.benchmark import made_up, measure
 from bevcli.workshop.checks import checks, speed
 
@@ -47,7 +48,14 @@ def test_each_line_tells_its_own_failure(tmp_path, monkeypatch):
     assert list(facts) == list(checks.CHECKS)
     assert facts["processor"].startswith("cannot be told (ModuleNotFoundError: ")
     assert facts["viewer"].startswith("cannot be told (OSError: [Errno 5]")
-    assert facts["bevcli"].startswith(version("bevcli"))
+    assert facts["bevcli"].startswith(f"{__version__} of a checkout")
+
+
+def test_metadata_of_another_version_are_told(monkeypatch):
+    monkeypatch.setattr(checks, "installed", lambda package: "0.0.1")
+    assert f"{__version__} of a checkout (its metadata are of 0.0.1: install it again), Python" in checks.versions()
+    monkeypatch.setattr(checks, "installed", lambda package: __version__)
+    assert f"{__version__} of a checkout, Python" in checks.versions()
 
 
 def test_what_is_not_installed_and_how_to(monkeypatch):
@@ -81,6 +89,8 @@ def test_speed_measures_each_model_until_the_time_is_over(tmp_path, monkeypatch)
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):
         monkeypatch.setattr(made_up, name, getattr(made_up, name) // 4)
+    # Other tests keep the images of the usual size.
+    monkeypatch.setattr(made_up, "_jpeg", getattr(made_up._jpeg, "__wrapped__", made_up._jpeg))
     monkeypatch.setattr(measure, "CPU_EDGE", 256)
     monkeypatch.setattr(measure, "COPIED_FLOATS", 1 << 20)
     monkeypatch.setattr(speed, "MODELS", (str(tmp_path / "mini.toml"),))

@@ -25,7 +25,7 @@ from bevcli.model.resnet import ResNet, ResNetConfig
 
 LEVEL_SHAPES = ((5, 7), (3, 4), (2, 2), (1, 1))
 FAR = 1e6  # where positions have no gradients
-SCALE = 32  # channels are divided by it
+OUTPUTS = 8  # of a convolution, which the kernels do not see
 
 
 class AttentionShape(NamedTuple):
@@ -57,12 +57,12 @@ def attention_shapes(config: ModelConfig) -> set[AttentionShape]:
     return found
 
 
-def convolution_shapes(config: ModelConfig) -> set[tuple[int, int, int]]:
-    """(input channels, output channels, stride) of a model's deformable convolutions."""
+def convolution_shapes(config: ModelConfig) -> set[tuple[int, int]]:
+    """(input channels, stride) of a model's deformable convolutions."""
     with torch.device("meta"):
         modules = list(ResNet(config.backbone).modules())
     found = [module for module in modules if isinstance(module, ModulatedDeformableConvolution)]
-    return {(each.weight.shape[1], each.weight.shape[0], each.stride) for each in found}
+    return {(each.weight.shape[1], each.stride) for each in found}
 
 
 def attention_case(heads: int, depth: int, levels: int, points: int, counts: Sequence[int]) -> list[Tensor]:
@@ -144,7 +144,7 @@ def main() -> None:
         versions = (predicted_deformable_convolution, convolution.deformable_convolution)
         return [lambda *inputs, each=each: each(*inputs, stride) for each in versions]
 
-    shapes = sorted({(c // SCALE, o // SCALE, s) for each in configs for c, o, s in convolution_shapes(each)})
+    shapes = sorted({(c, OUTPUTS, s) for each in configs for c, s in convolution_shapes(each)})
     cases = [*shapes, (6, 5, 1), (20, 17, 2), (3, 4, 1, (1, 1)), (3, 4, 2, (4, 4), 0)]
     for case in cases:
         compare(f"convolution {case}", convolution_case(*case), *convolutions(case[2]))

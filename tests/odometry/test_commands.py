@@ -9,7 +9,7 @@ from true_motion import STREET, motion_of, street_copy
 import bevcli
 from bevcli.workshop.odometry import measure
 
-FRAMES = 3
+FRAMES = 5
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def test_a_drive_without_poses_gets_four_files_and_a_table(tmp_path, measuring):
     folder = street_copy(tmp_path / "drive", FRAMES)
     done = command(tmp_path, "odometry", str(folder))
     assert done.returncode == 0, done.stderr
-    assert "2/2 steps" in done.stderr
-    assert "m in 1.0 s, 2 steps" in done.stdout
+    assert "4/4 steps" in done.stderr
+    assert "m in 2.0 s, 4 steps" in done.stdout
     assert "not measured  1 step (too dark)" in done.stdout
     assert "stated poses" not in done.stdout
     out = tmp_path / "runs/drive-odometry"
@@ -42,11 +42,16 @@ def test_a_drive_without_poses_gets_four_files_and_a_table(tmp_path, measuring):
     assert bevcli.open_sequence(folder, ego_motion_file=out / "ego_motion.csv").has_ego_motion
 
 
-def test_stated_poses_are_compared_and_json_is_printed(tmp_path, measuring):
-    done = command(tmp_path, "odometry", str(STREET), "--frames", f"0:{FRAMES}", "--out", "out", "--json")
+def test_the_mistake_of_stated_poses_is_named(tmp_path, measuring):
+    folder = street_copy(tmp_path / "drive", FRAMES)
+    rows = [line.split(",") for line in (STREET / "ego_motion.csv").read_text().splitlines()]
+    wrong = [[row[0], *(str(1000 * float(cell)) for cell in row[1:4]), *row[4:8]] for row in rows[1:]]
+    (folder / "ego_motion.csv").write_text("\n".join(",".join(row) for row in [rows[0][:8], *wrong]))
+    done = command(tmp_path, "odometry", str(folder), "--out", "out", "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["stated"]["end_m"] == pytest.approx(0, abs=1e-6)
+    assert report["stated"]["end_m"] > 1000
+    assert ["millimetres" in finding["message"] for finding in report["stated"]["findings"]] == [True]
     assert report["not_measured"] == {"too dark": 1}
     assert report == json.loads((tmp_path / "out/report.json").read_text())
 

@@ -9,6 +9,7 @@ from true_motion import STREET, motion_of, street_copy
 
 import bevcli
 from bevcli.errors import InputError
+from bevcli.findings import Finding
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep
@@ -42,8 +43,9 @@ def street():
 def test_the_deviation_of_the_end_is_that_of_many_drives():
     motion, random = curve(), np.random.default_rng(0)
     poses = np.tile(np.eye(4), (4000, 1, 1))
+    shared = random.normal(scale=DEVIATIONS, size=(len(poses), 6))  # by the calibration
     for step in motion.steps:
-        errors = random.normal(scale=DEVIATIONS, size=(len(poses), 6))
+        errors = (shared + random.normal(scale=DEVIATIONS, size=(len(poses), 6))) / np.sqrt(2)
         steps = np.tile(step.ego_a_from_ego_b, (len(poses), 1, 1))
         steps[:, :3, :3] = Rotation.from_rotvec(errors[:, :3]).as_matrix() @ steps[:, :3, :3]
         steps[:, :3, 3] += errors[:, 3:]
@@ -103,6 +105,8 @@ def test_a_scale_is_seen_against_stated_poses(street):
     assert difference.end_m == pytest.approx(0.02 * straight, rel=0.01)
     assert difference.end_deg == pytest.approx(0, abs=1e-5)
     assert "(2.0 %)" in difference.text()
+    wrong = Finding("speed", "error", None, "the wheel is small", advice="measure it")
+    assert "error: the wheel is small: measure it" in report_text(motion_of(street), difference, [wrong])
 
 
 def test_steps_that_are_guesses_are_counted_with_their_reasons(street):

@@ -71,3 +71,11 @@ def test_an_update_waits_for_matchings_and_numbers_only(settings, tmp_path, monk
     assert [loss for loss, _ in found] == pytest.approx([loss for loss, _ in expected], rel=0.02)
     found_waits = sorted(wait for _, waits in found for wait in waits)
     assert found_waits == sorted(len(found) * ["cpu", "cpu", "event"])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+def test_a_real_gpu_has_the_losses_of_the_cpu(tmp_path) -> None:
+    settings = replace(ALL_PARTS, augmentation=PLAIN.augmentation)  # noise is drawn on the device
+    expected, found = (losses(settings, tmp_path, torch.device(name), []) for name in ("cpu", "cuda:0"))
+    assert [loss for loss, _ in found] == pytest.approx([loss for loss, _ in expected], rel=0.03)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.transforms import Array, inverse
@@ -12,7 +13,7 @@ from bevcli.workshop.correspondence.solver import Solution
 
 OF_CAMERA = 7  # unknowns: rotation, position, delay
 HEIGHT = 5  # index of a camera's height among them
-OF_PAIR = 3  # the error of the vehicle's rotation
+OF_PAIR = 3  # the error of the vehicle's rotation; or of lenses
 OF_RIG = 3  # scale of the ego-motion, slope of the road along x and y
 DELAYS_S = np.linspace(-0.3, 0.3, 25)  # of a camera's capture times, where the motion of a pair is tabulated
 
@@ -22,7 +23,8 @@ class Unknowns:
     """The layout of the vector of unknowns, x, and the stated values from which it counts.
 
     x holds for each camera its rotation (3, radians, in the camera frame), position (3, metres, in the ego frame) and
-    delay (seconds); for each pair the rotation of the vehicle (3, radians); at last the scale of the ego-motion (a
+    delay (seconds); for each pair the rotation of the vehicle (3, radians); for each two neighbours the rotation that
+    errors of their lenses look like at one time (3, radians, in the ego frame); at last the scale of the ego-motion (a
     share), and the slopes of the road along x and y of the ego frame. Poses are quaternions (x, y, z, w) and
     translations.
     """
@@ -30,7 +32,9 @@ class Unknowns:
     stated: Array  # (C, 4, 4) ego_from_camera
     poses: Array  # (G, 2, 25, 7) world_from_ego of both images of a group, by delay
     groups: Indices  # (G, 3) pair, camera of the first image and camera of the second one
+    turns: Indices  # (G,) the rotation that the group depends on: that of its pair, or else of its two cameras
     pairs: int
+    neighbours: int  # pairs of neighbours
     deviations: Array  # (P,) the standard deviation of each unknown before anything is measured
 
     @property
@@ -44,13 +48,19 @@ class Unknowns:
         return np.flatnonzero(self.groups[:, 1] == self.groups[:, 2])
 
     @cached_property
+    def moves(self) -> NDArray[np.bool_]:
+        """(G,) whether the images of a group are of both frames of its pair; else both are of the first one."""
+        return np.asarray(self.turns < self.pairs)
+
+    @cached_property
     def columns(self) -> Indices:
         """(G, 20) the indices in x of the unknowns that a group depends on: two cameras, the pair, and the rig."""
-        pair, first, second = self.groups.T[..., None]
-        start, rig = OF_CAMERA * self.cameras, OF_CAMERA * self.cameras + OF_PAIR * self.pairs
+        _, first, second = self.groups.T[..., None]
+        start = OF_CAMERA * self.cameras
+        rig = start + OF_PAIR * (self.pairs + self.neighbours)
         of_rig = np.broadcast_to(rig + np.arange(OF_RIG), (len(self.groups), OF_RIG))
         cameras = [OF_CAMERA * index + np.arange(OF_CAMERA) for index in (first, second)]
-        return np.concatenate([*cameras, start + OF_PAIR * pair + np.arange(OF_PAIR), of_rig], axis=-1)
+        return np.concatenate([*cameras, start + OF_PAIR * self.turns[:, None] + np.arange(OF_PAIR), of_rig], axis=-1)
 
     def of_camera(self, x: Array) -> Array:
         """(C, 7) rotation, position and delay of each camera."""
@@ -58,13 +68,15 @@ class Unknowns:
 
     def geometry(self, local: Array) -> GroupGeometry:
         """The geometry of all groups. local: (G, 20), the values of `columns`."""
-        of_a, of_b, pair, rig = np.split(local, np.cumsum([OF_CAMERA, OF_CAMERA, OF_PAIR]), axis=-1)
+        of_a, of_b, turn, rig = np.split(local, np.cumsum([OF_CAMERA, OF_CAMERA, OF_PAIR]), axis=-1)
         (_, first, second), stated = self.groups.T, self.stated
         before, after = (_pose_at(self.poses[:, side], camera[:, 6]) for side, camera in enumerate((of_a, of_b)))
         motion = inverse(after) @ before
-        motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(pair).as_matrix()
+        motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(turn * self.moves[:, None]).as_matrix()
         motion[:, :3, 3] *= 1 + rig[:, :1]
-        return GroupGeometry(moved(stated[first], of_a), moved(stated[second], of_b), motion, rig[0, 1:])
+        pose_a, pose_b = moved(stated[first], of_a), moved(stated[second], of_b)
+        pose_a[:, :3, :3] = Rotation.from_rotvec(turn * ~self.moves[:, None]).as_matrix() @ pose_a[:, :3, :3]
+        return GroupGeometry(pose_a, pose_b, motion, rig[0, 1:])
 
 
 def moved(ego_from_camera: Array, change: Array) -> Array:

@@ -23,25 +23,30 @@ from bevcli.options import gather
 from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.workshop.calibration import CalibrateOptions, adjustment
-from bevcli.workshop.calibration.road import level_corrections, road_residuals, search_heights, sees_road
+from bevcli.workshop.calibration.road import followed, level_corrections, road_residuals, search_heights, sees_road
 from bevcli.workshop.calibration.views import (
     FEWEST_PAIRS,
     READING_STEPS,
     PointMatches,
     Views,
+    depths_of,
     match_points,
     read_views,
     unknowns_of,
 )
 from bevcli.workshop.correspondence import solver
 from bevcli.workshop.correspondence.images import WIDTH
-from bevcli.workshop.correspondence.residuals import RoadResiduals
+from bevcli.workshop.correspondence.residuals import DepthResiduals, RoadResiduals
 from bevcli.writing import write_whole
 
 Triple = tuple[float, float, float]
 HEADER = (
     "camera", "yaw off by", "pitch", "roll", "x off by", "y", "z", "matches", "residual px", "verdict",
 )  # fmt: skip
+MEASURED_MOTION = (
+    "the motion is measured from the images, in {rounds} rounds: height and scale cannot be told apart (a rig that is "
+    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean"
+)
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
 TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
 MOST_DELAY_MS = 300.0  # a larger one is a rotation
@@ -199,6 +204,8 @@ POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one,
 CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
 TURN_ROUNDS = 4  # in which the error of the vehicle's rotation is estimated
 KERB_M = 0.09  # less than from the road to a pavement
+LEAST_SHOWN = 0.7  # of a wrong roll, that the road has to show
+LEAST_SIGNAL = 16.0  # of contrast over noise, for cameras whose road shows less
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
 
@@ -223,37 +230,70 @@ def measure(
     within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
         x = solver.solve(unknowns, [(within, scale)], x).x
-    within = consistent(unknowns, within, x)
+    at_once, depths = matches.where(~matches.moves), depths_of(unknowns, matches)
+    for scale in SCALES_PX if len(at_once.group) else ():
+        x = solver.solve(unknowns, [(within, SCALES_PX[-1]), (at_once, scale), (depths, scale)], x).x
+    points = consistent(unknowns, matches.where(matches.same | ~matches.moves), x)
     progress()
     heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
     x[heights] += search_heights(views, unknowns, x)
     progress()
-    ties = matches.where(~matches.same)
+    ties, signals = matches.where(~matches.same & matches.moves), np.zeros(unknowns.cameras)
+    roadless, after_part = x, progress
+    while True:
+        x, road = _with_road(views, unknowns, roadless, (points, depths, ties), signals, after_part)
+        shown = followed(views, unknowns, x, FLOWS_PX[0], signals)
+        unsure = (shown < LEAST_SHOWN) & (signals == 0)
+        if not unsure.any():
+            break
+        signals, after_part = np.where(unsure, LEAST_SIGNAL, signals), lambda: None
+    sees = sees_road(unknowns, road, ties, x) & (shown >= LEAST_SHOWN)
+    road = road.where(sees[unknowns.groups[road.group, 1]])
+    for _ in range(TURN_ROUNDS):
+        solution = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, ROAD_SCALES_PX[-1]), x)
+        x, unknowns = solution.x, adjustment.with_estimated_turns(unknowns, solution)
+    return Measurement(views, matches, unknowns, solution, points, road)
+
+
+def _with_road(
+    views: Views,
+    unknowns: adjustment.Unknowns,
+    x: Array,
+    matches: tuple[PointMatches, DepthResiduals, PointMatches],
+    signals: Array,
+    progress: Callable[[], None],
+) -> tuple[Array, RoadResiduals]:
+    """x (P,) and the points of the road, in rounds from x.
+
+    matches: points of one camera or of one frame, their depths, and points of neighbours in two frames.
+    signals: see `road_residuals`.
+    """
+    points, depths, ties = matches
+    heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
     for most_px in FLOWS_PX:
-        road = road_residuals(views, unknowns, x, most_px)
+        road = road_residuals(views, unknowns, x, most_px, signals)
         progress()
         for scale in ROAD_SCALES_PX:
-            x = solver.solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
+            x = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, scale), x).x
         if most_px == FLOWS_PX[0]:
             levels = level_corrections(unknowns, road, ties, x)
             x = x + levels
             # Shared points tell the level, and the road then tells the height to the step of the search.
             x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
         progress()
-    road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
-    for _ in range(TURN_ROUNDS):
-        solution = solver.solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
-        x, unknowns = solution.x, adjustment.with_estimated_turns(unknowns, solution)
-    return Measurement(views, matches, unknowns, solution, within, road)
+    return x, road
 
 
 def _terms(
-    unknowns: adjustment.Unknowns, points: PointMatches, road: RoadResiduals, x: Array, road_scale: float
+    unknowns: adjustment.Unknowns,
+    measured: tuple[PointMatches, DepthResiduals, RoadResiduals],
+    x: Array,
+    road_scale: float,
 ) -> list[solver.Term]:
-    """Both kinds of residuals, with the spread that they have at x (P,)."""
+    """All kinds of residuals, with the spread that they have at x (P,)."""
     terms: list[solver.Term] = []
-    for residuals, least in ((points, POINT_SCALE_PX), (road, road_scale)):
-        cameras = unknowns.groups[residuals.group, 1]
+    for residuals, least in zip(measured, (POINT_SCALE_PX, POINT_SCALE_PX, road_scale), strict=True):
+        cameras = unknowns.groups[residuals.group, 1:] @ np.array([1, unknowns.cameras])
         terms.append((residuals, np.maximum(least, solver.spread(unknowns, residuals, x, cameras))))
     return terms
 
@@ -292,6 +332,7 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
+        rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
     """
 
     name: str
@@ -301,6 +342,7 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
+    rounds: int = 0
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(estimate for estimate in self.cameras if estimate.camera == camera)
@@ -309,16 +351,19 @@ class CalibrationResult:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
         table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
-        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras)])
+        measured = [MEASURED_MOTION.format(rounds=self.rounds)] if self.rounds else []
+        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras), *measured])
 
     def to_json(self) -> str:
         """The content of report.json."""
-        content = {
+        content: dict[str, Any] = {
             "drive": self.name,
             "pairs": self.pairs,
             "cameras": {estimate.camera: estimate.to_dict() for estimate in self.cameras},
             "rig": asdict(self.whole),
         }
+        if self.rounds:
+            content["rounds"] = self.rounds
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -332,15 +377,22 @@ class CalibrationResult:
         return [rig, report]
 
 
-class CorrectedDrive(DerivedSequence):
-    """The calibrated drive, with the corrected rig in every frame."""
+class DriveWithRig(DerivedSequence):
+    """A drive with another rig in every frame."""
 
-    def __init__(self, sequence: Sequence, result: CalibrationResult) -> None:
+    def __init__(self, sequence: Sequence, rig: CameraRig) -> None:
         super().__init__(sequence)
-        self.rig = result.rig
+        self.rig = rig
 
     def load(self, index: int) -> Frame:
         return replace(self.sequence.load(index), rig=self.rig)
+
+
+class CorrectedDrive(DriveWithRig):
+    """The calibrated drive, with the corrected rig in every frame."""
+
+    def __init__(self, sequence: Sequence, result: CalibrationResult) -> None:
+        super().__init__(sequence, result.rig)
 
 
 def calibrate(

@@ -19,7 +19,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.workshop.calibration.adjustment import HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.views import Views
 from bevcli.workshop.correspondence.images import THREADS
-from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, RoadResiduals
+from bevcli.workshop.correspondence.residuals import SHORTEST, EpipolarResiduals, GroupGeometry, Indices, RoadResiduals
 from bevcli.workshop.correspondence.road import (
     RoadPoints,
     beside_way,
@@ -35,7 +35,9 @@ from bevcli.workshop.correspondence.solver import geometry_at, values
 FAR_M, STEP_M = 0.6, 0.03  # of the corrections that are tried
 LEAST_CORRELATION = 0.6
 LEAST_SHARPNESS, LEAST_SCORE = 0.2, 0.6  # of a peak of the scores, as shares of the sharpest and the highest one's
-LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
+BESIDE_M = 4.0  # farther beside the vehicle's way a tile counts less
+LANE_M = 3.0  # from the vehicle's way
+TURNED, EVERY, ROLL = np.radians(1.0), 3, 2  # of cameras, to see if the road shows it; pairs; index of roll of a camera
 
 
 def search_heights(
@@ -89,26 +91,60 @@ def _scores(views: Views, unknowns: Unknowns, geometry: GroupGeometry, group: in
         alike.append(correlation(first, second))
     correlations = np.stack(alike)  # (H, tiles)
     near = np.exp(
-        -((tiles(beside_way(points.reshape(-1, 3), motion).reshape(points.shape[:2])).mean(-1) / LANE_M) ** 2)
+        -((tiles(beside_way(points.reshape(-1, 3), motion).reshape(points.shape[:2])).mean(-1) / BESIDE_M) ** 2)
     )
     weighted = votes(correlations) * near
     return np.asarray(weighted[:, correlations.max(0) > LEAST_CORRELATION].sum(-1))
 
 
-def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
-    """Road points of all groups, at most `most_px` pixels from where the unknowns x (P,) expect them."""
-    groups, geometry = unknowns.within_camera, geometry_at(unknowns, x)
+def road_residuals(
+    views: Views, unknowns: Unknowns, x: Array, most_px: float, signals: Array, groups: Indices | None = None
+) -> RoadResiduals:
+    """Road points of all or some groups, at most `most_px` pixels from where the unknowns x (P,) expect them.
+
+    signals: (C,) `least_signal` of `road_points` for each camera. Where it is above 0, only points near the vehicle's
+    way count: farther beside are kerbs, grass and parked cars, which look like a road that is tilted.
+    """
+    chosen, geometry = unknowns.within_camera if groups is None else groups, geometry_at(unknowns, x)
 
     def of_group(group: int) -> RoadPoints:
         pair, index, _ = (int(number) for number in unknowns.groups[group])
         first, second = (view.texture for view in views.sides((pair, index, index)))
-        return road_points(views.rig.cameras[index], (first, second), geometry, group, most_px)
+        return road_points(views.rig.cameras[index], (first, second), geometry, group, most_px, signals[index])
 
     with ThreadPoolExecutor(THREADS) as threads:
-        parts = list(threads.map(of_group, groups))
+        parts = list(threads.map(of_group, chosen))
     counts = [len(part.rays_a) for part in parts]
     columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
-    return RoadResiduals(np.repeat(groups, counts), *columns)
+    road = RoadResiduals(np.repeat(chosen, counts), *columns)
+    return road.where((road.beside_m < LANE_M) | (signals == 0)[unknowns.groups[road.group, 1]])
+
+
+def followed(views: Views, unknowns: Unknowns, x: Array, most_px: float, signals: Array) -> Array:
+    """(C,) how much of a wrong roll of a camera the road shows: 1 for all of it, or for a camera without road.
+
+    Flow along an edge stays where its search begins. Then the road agrees with any calibration, and small residuals say
+    nothing. So the road is measured with cameras that are turned to the left and to the right by TURNED.
+    """
+    groups = unknowns.within_camera[unknowns.groups[unknowns.within_camera, 0] % EVERY == 0]
+    shares = []
+    for turn in (-TURNED, TURNED):
+        turned = x.copy()
+        turned[np.arange(unknowns.cameras) * OF_CAMERA + ROLL] += turn
+        road = road_residuals(views, unknowns, turned, most_px, signals, groups)
+        seen = values(unknowns, road, turned)
+        expected = seen - values(unknowns, road, x)
+        squares, camera = (expected**2).sum(-1), unknowns.groups[road.group, 1]
+        share = (seen * expected).sum(-1) / np.maximum(squares, SHORTEST)
+        shares.append([_median(share[camera == c], squares[camera == c]) for c in range(unknowns.cameras)])
+    return np.mean(shares, axis=0)
+
+
+def _median(values: Array, weights: Array) -> float:
+    """The weighted median; 1 of nothing."""
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reached, reached[-1] / 2)]) if weights.any() else 1.0
 
 
 STARTS_M = np.arange(-0.45, 0.46, 0.15)  # of a camera's height, about the present one

@@ -17,7 +17,7 @@ from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.adjustment import DELAYS_S, OF_PAIR, Unknowns
 from bevcli.workshop.correspondence.images import THREADS, GreyImage, grey_image, reduced
 from bevcli.workshop.correspondence.points import features, matched, neighbours
-from bevcli.workshop.correspondence.residuals import EpipolarResiduals
+from bevcli.workshop.correspondence.residuals import DepthResiduals, EpipolarResiduals
 
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair
 MOST_FRAMES = 120  # that are read where the poses of the drive are known only with its images
@@ -51,10 +51,27 @@ class Views:
             if (a, first) in self.of and (b, second) in self.of
         ]
 
-    def sides(self, group: tuple[int, int, int]) -> tuple[View, View]:
+    def at_once(self) -> list[tuple[int, int, int]]:
+        """(pair, first camera, second camera): neighbours in the first frame of each pair."""
+        return [
+            (pair, first, second)
+            for pair, (a, _) in enumerate(self.pairs)
+            for first, second in self.beside()
+            if (a, first) in self.of and (a, second) in self.of
+        ]
+
+    def beside(self) -> list[tuple[int, int]]:
+        """Each two neighbours once."""
+        return [(first, second) for first, second in neighbours(self.rig.cameras) if first < second]
+
+    def all_groups(self) -> list[tuple[tuple[int, int, int], bool]]:
+        """Those of `groups` and then those of `at_once`, and whether the vehicle moves between their images."""
+        return [(group, True) for group in self.groups()] + [(group, False) for group in self.at_once()]
+
+    def sides(self, group: tuple[int, int, int], moves: bool = True) -> tuple[View, View]:
         """The two views of a group."""
         (a, b), (_, first, second) = self.pairs[group[0]], group
-        return self.of[a, first], self.of[b, second]
+        return self.of[a, first], self.of[b if moves else a, second]
 
 
 def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = lambda: None) -> Views:
@@ -154,18 +171,21 @@ def _poses(frame: Frame, name: str, motion: EgoMotion | None) -> Array:
 
 
 DELAY_S, TILT = 0.1, np.radians(0.2)  # standard deviations of capture times and of the ego frame's tilt over the road
+LENSES = np.radians([0.02, 0.02, 1.0])  # of what looks like a rotation between neighbours: lines of points tell no yaw
 
 
 def unknowns_of(views: Views, options: CalibrateOptions) -> Unknowns:
     """The unknowns of what a drive shows."""
-    groups = views.groups()
-    poses = np.stack([[_quaternions(view.poses) for view in views.sides(group)] for group in groups])
+    groups = [group for group, _ in views.all_groups()]
+    poses = np.stack([[_quaternions(view.poses) for view in views.sides(*each)] for each in views.all_groups()])
     poses[..., 4:] -= poses[:, :1, :1, 4:]
     stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
+    pairs, beside = len(views.pairs), views.beside()
+    turns = [group[0] if moves else pairs + beside.index(group[1:]) for group, moves in views.all_groups()]
     of_camera = [np.radians(options.rotation_deg)] * 3 + [options.position_m] * 3 + [DELAY_S]
-    of_pairs = np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg))
-    deviations = np.concatenate([np.tile(of_camera, len(stated)), of_pairs, [options.scale, TILT, TILT]])
-    return Unknowns(stated, poses, np.array(groups), len(views.pairs), deviations)
+    of_turns = [np.full(OF_PAIR * pairs, np.radians(options.turn_deg)), np.tile(LENSES, len(beside))]
+    deviations = np.concatenate([np.tile(of_camera, len(stated)), *of_turns, [options.scale, TILT, TILT]])
+    return Unknowns(stated, poses, np.array(groups), np.array(turns), pairs, len(beside), deviations)
 
 
 def _quaternions(poses: Array) -> Array:
@@ -180,22 +200,45 @@ class PointMatches(EpipolarResiduals):
     """M matches of all pairs."""
 
     same: NDArray[np.bool_]  # (M,) whether both images are of the same camera
+    moves: NDArray[np.bool_]  # (M,) whether they are of both frames; else of one
 
 
 def match_points(views: Views) -> PointMatches:
     """The matches of all groups of views."""
-    groups = views.groups()
+    groups, moves = zip(*views.all_groups(), strict=True)
     with ThreadPoolExecutor(THREADS) as threads:
         found = dict(zip(views.of, threads.map(features, views.of.values()), strict=True))
 
-        def of_group(group: tuple[int, int, int]) -> tuple[Array, Array]:
+        def of_group(group: tuple[int, int, int], moves: bool) -> tuple[Array, Array]:
             (a, b), (_, first, second) = views.pairs[group[0]], group
-            return matched(found[a, first], found[b, second], views.rig.cameras[first], views.rig.cameras[second])
+            cameras = views.rig.cameras[first], views.rig.cameras[second]
+            return matched(found[a, first], found[b if moves else a, second], *cameras, at_once=not moves)
 
-        rays = list(threads.map(of_group, groups))
+        rays = list(threads.map(of_group, groups, moves))
     counts = [len(a) for a, _ in rays]
     rays_a, rays_b = (np.concatenate(side) for side in zip(*rays, strict=True))
     _, first, second = (np.repeat(column, counts) for column in np.array(groups).T)
     group = np.repeat(np.arange(len(counts)), counts)
     focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[first]
-    return PointMatches(group, rays_a, rays_b, focal, first == second)
+    return PointMatches(group, rays_a, rays_b, focal, first == second, np.repeat(moves, counts))
+
+
+def depths_of(unknowns: Unknowns, matches: PointMatches) -> DepthResiduals:
+    """The points that a camera sees in both frames of a pair, and its neighbour in the first one."""
+    within, at_once = matches.where(matches.same), matches.where(~matches.moves)
+    later: dict[tuple[object, ...], Array] = {}
+    for (pair, camera, _), ray, ray_later in zip(
+        unknowns.groups[within.group], within.rays_a, within.rays_b, strict=True
+    ):
+        later[pair, camera, *ray] = ray_later
+    cross = {tuple(group): index for index, group in enumerate(unknowns.groups[unknowns.moves].tolist())}
+    keys = [
+        (pair, camera, *ray)
+        for (pair, camera, _), ray in zip(unknowns.groups[at_once.group], at_once.rays_a, strict=True)
+    ]
+    groups = [cross.get(tuple(group)) for group in unknowns.groups[at_once.group].tolist()]
+    kept = np.array([k for k, key in enumerate(keys) if key in later and groups[k] is not None], dtype=np.int64)
+    kept = kept[np.argsort([groups[k] for k in kept], kind="stable")]
+    group = np.array([groups[k] for k in kept], dtype=np.int64)
+    rays_later = np.array([later[keys[k]] for k in kept]).reshape(-1, 3)
+    return DepthResiduals(group, at_once.rays_a[kept], at_once.rays_b[kept], rays_later, at_once.focal[kept])

@@ -70,6 +70,9 @@ def _lines(title: str, fact: Facts) -> Iterator[str]:
 def versions() -> Facts:
     """Those of bevcli, Python and the system."""
     kind = " of a checkout" if (Path(__file__).parents[3] / "pyproject.toml").is_file() else ""
+    metadata = installed("bevcli")
+    if metadata != __version__:  # an editable installation keeps the requirements of its day
+        kind += f" (its metadata are of {metadata or 'no version'}: install it again)"
     return f"{__version__}{kind}, Python {platform.python_version()}, {platform.platform()}"
 
 
@@ -106,7 +109,7 @@ def processor() -> Facts:
     affinity = getattr(os, "sched_getaffinity", None)
     cores = f"{len(affinity(0)) if affinity else os.cpu_count()} of {os.cpu_count()} cores"
     meminfo = Path("/proc/meminfo")
-    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
+    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text(encoding="utf-8")) if meminfo.is_file() else None
     memory = f", {int(total[1]) / 2**20:.0f} GiB" if total else ""
     rounds = "instructions for bfloat16" if has_onednn(torch.bfloat16) else "no instructions for bfloat16"
     amx = "AMX" if has_matrix_unit() else "no AMX"

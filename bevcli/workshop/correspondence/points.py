@@ -18,6 +18,7 @@ FEATURES = 2000  # an image
 RATIO = 0.75  # of the distances to the best and the second best match
 INLIER_PX = 1.5
 FEWEST_IN_PAIR = 15  # matches of a pair of images; fewer are not used
+FEWEST_AT_ONCE = 100  # of two cameras at one time; those of a narrow strip fit many motions
 CELLS = (10, 6)  # of an image, across and down;
 MOST_IN_CELL = 6  # matches in one of them, so that no object counts for all
 FLATTEST = 0.25  # cosine of the largest angle off the optical axis of a matched ray
@@ -48,8 +49,11 @@ def neighbours(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return sorted(pairs | {(b, a) for a, b in pairs})
 
 
-def matched(a: Features, b: Features, first: Camera, second: Camera) -> tuple[Array, Array]:
-    """Rays (m, 3) and (m, 3) of the matches; those within one camera fit one rigid motion."""
+def matched(a: Features, b: Features, first: Camera, second: Camera, *, at_once: bool = False) -> tuple[Array, Array]:
+    """Rays (m, 3) and (m, 3) of the matches.
+
+    Those within one camera fit one rigid motion; and those of two cameras, if their images are of one time (`at_once`).
+    """
     nothing = np.zeros((0, 3)), np.zeros((0, 3))
     if min(len(a.pixels), len(b.pixels)) < FEWEST_IN_PAIR:
         return nothing
@@ -61,12 +65,14 @@ def matched(a: Features, b: Features, first: Camera, second: Camera) -> tuple[Ar
     rays_a, rays_b = first.rays(pixels_a), second.rays(b.pixels[nearest[kept]])
     with np.errstate(invalid="ignore"):
         good = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
-    if first.name == second.name:
+    if at_once or first.name == second.name:
         good[good] = _rigid(rays_a[good], rays_b[good], first)
     chosen = np.flatnonzero(good)
     # SIFT gives a point with several orientations several times.
     chosen = chosen[np.sort(np.unique(pixels_a[chosen].astype(int), axis=0, return_index=True)[1])]
     chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
+    if at_once and len(chosen) < FEWEST_AT_ONCE:
+        return nothing
     return rays_a[chosen], rays_b[chosen]
 
 

@@ -76,6 +76,31 @@ class EpipolarResiduals(Residuals):
 
 
 @dataclass(frozen=True)
+class DepthResiduals(Residuals):
+    """The distance of points from where they would be at the depth that two cameras see at one time.
+
+    The rays are of the first camera at the first time and of the second camera at the same time.
+    """
+
+    rays_later: Array  # (N, 3) unit directions of the points in the first camera at the second time
+    focal: Array  # (N,) pixels
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 3) pixels."""
+        relative = (inverse(geometry.ego_from_camera_b) @ geometry.ego_from_camera_a)[self.group]
+        turned = np.cross(self.rays_b, np.einsum("nij,nj->ni", relative[:, :3, :3], self.rays_a))
+        shifted = np.cross(self.rays_b, relative[:, :3, 3])
+        nearness = -(turned * shifted).sum(-1) / np.maximum(
+            (shifted**2).sum(-1), SHORTEST
+        )  # 1 / depth; 0 for far points
+        pose, motion = geometry.ego_from_camera_a, geometry.ego_b_from_ego_a
+        later = (inverse(pose) @ motion @ pose)[self.group]
+        ahead = np.einsum("nij,nj->ni", later[:, :3, :3], self.rays_a) + nearness[:, None] * later[:, :3, 3]
+        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+        return self.focal[:, None] * (ahead - self.rays_later)
+
+
+@dataclass(frozen=True)
 class RoadResiduals(Residuals):
     """The distance of road points from where they would be on a flat road.
 

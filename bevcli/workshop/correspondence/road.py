@@ -23,6 +23,7 @@ WINDOW = 21  # pixels
 MOST_BACK_PX = 0.5  # between a point and the flow there and back
 FEWEST = 12  # points of a pair of images; fewer are not used
 FULL_CONTRAST = 30.0  # mean squared gradient per pixel of a window, grey levels², from which a point counts fully
+LEAST_NOISE = 0.5  # the same of the difference of two windows
 AXES = np.eye(2)
 DISTANCES, ANGLES_DEG = np.linspace(2.0, 8.0, 60), np.linspace(-35, 35, 100)  # of road points; in heights of the camera
 TILES, POINTS = (6, 10), (10, 10)  # of the road: each has a level of its own, such as that of the pavement
@@ -79,8 +80,12 @@ def road_points(
     geometry: GroupGeometry,
     group: int,
     most_px: float,
+    least_signal: float = 0.0,
 ) -> RoadPoints:
-    """The points of the road in both images of a group (of one camera), at most `most_px` from where they should be."""
+    """The points of the road in both images of a group (of one camera), at most `most_px` from where they should be.
+
+    least_signal: contrast over noise that a point needs along an axis to count there (see `shared`); 0: all count.
+    """
     nothing = RoadPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0))
     first, second = textures
     warped_from = warp(camera, geometry, group)
@@ -100,7 +105,10 @@ def road_points(
     target = sampled_at(field, at + flow)
     rays_a, rays_b = camera.rays(at), camera.rays(target)
     beside = beside_way(points_of_road(geometry.ego_from_camera_a[group], rays_a), geometry.ego_b_from_ego_a[group])
-    return RoadPoints(rays_a, rays_b, ray_weights(camera, first, field, at, target), beside)
+    weights = ray_weights(camera, first, field, at, target)
+    if least_signal:
+        weights = shared(first, warped, at, flow, least_signal) @ weights
+    return RoadPoints(rays_a, rays_b, weights, beside)
 
 
 def warp(camera: Camera, geometry: GroupGeometry, group: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
@@ -196,3 +204,33 @@ def contrast(image: NDArray[np.uint8], at: NDArray[Any]) -> Array:
     size, axes = np.linalg.eigh(np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2))
     share = np.sqrt(np.clip(size / FULL_CONTRAST, 0, 1))
     return np.einsum("nij,nj,nkj->nik", axes, share, axes)
+
+
+def shared(
+    first: NDArray[np.uint8], warped: NDArray[np.uint8], at: NDArray[Any], flow: Array, least_signal: float
+) -> Array:
+    """(n, 2, 2) symmetric, how much of the contrast around pixels (n, 2) both images share: 0 to 1 along each axis.
+
+    Noise has contrast too, but another one in each image. Along an axis that shows little else, such as along the edge
+    of a shadow, the flow is where its search began. Twice `least_signal` counts fully.
+    """
+    around, again = _windows(first, at), _windows(warped, at + flow)
+    size, axes = np.linalg.eigh(_gradients(around))
+    noise = np.einsum("nji,njk,nki->ni", axes, _gradients(around - again), axes)
+    share = np.sqrt(np.clip(size / (noise + LEAST_NOISE) / least_signal - 1, 0, 1))
+    return np.einsum("nij,nj,nkj->nik", axes, share, axes)
+
+
+def _windows(image: NDArray[np.uint8], at: NDArray[Any]) -> Array:
+    """(n, WINDOW + 2, WINDOW + 2) grey values around pixels (n, 2)."""
+    reach = np.arange(WINDOW + 2) - (WINDOW + 1) // 2
+    around = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2) + at[:, None]
+    return sampled(image, around).reshape(len(at), WINDOW + 2, WINDOW + 2).astype(np.float64)
+
+
+def _gradients(windows: Array) -> Array:
+    """(n, 2, 2) mean products of the gradients along x and y of windows (n, h, w), grey levels² per pixel²."""
+    along_x = (windows[:, 1:-1, 2:] - windows[:, 1:-1, :-2]) / 2
+    along_y = (windows[:, 2:, 1:-1] - windows[:, :-2, 1:-1]) / 2
+    slopes = np.stack([along_x, along_y], axis=-1).reshape(len(windows), -1, 2)
+    return np.asarray(slopes.swapaxes(1, 2) @ slopes / slopes.shape[1])

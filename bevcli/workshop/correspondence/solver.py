@@ -148,6 +148,8 @@ def _at(parameters: Parameters, terms: Items[Term], x: Array, *, curvature: bool
         factor = _curvature(squares) if curvature else 1.0
         bounds = np.searchsorted(residuals.group, np.arange(len(columns) + 1))
         for group, (start, end) in enumerate(pairwise(bounds)):
+            if start == end:
+                continue
             part = slopes[start:end].reshape(-1, slopes.shape[-1])
             weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]
             blocks[group] += factor * part.T @ weighted

@@ -5,7 +5,7 @@ Near the motion that they tell, optical flow gives points of the road.
 """
 
 from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from bevcli.workshop.correspondence.road import contrast, flow_at, sampled
 
 CELL_M = 0.08
 BEGIN_M, SHAPE = (-24.0, -9.0), (225, 640)  # the smallest x and y; cells along y and x
+SLOPE_STEP, KEPT = np.radians(0.25), 3  # of grids
 MOST_BLUR_M = 0.45  # of the road in one pixel, along the ray
 MARGIN = 9  # cells, between cameras
 TILE, ASIDE = 25, 2  # cells: side of a tile, and by how much it may lie beside the way
@@ -35,15 +36,17 @@ class RoadPicture:
     texture: NDArray[np.uint8]  # (225, 640), 128 where nothing is seen
     seen: NDArray[np.bool_]  # (225, 640)
     of: NDArray[np.int8]  # (225, 640) the camera of each cell, -1 for none
+    slopes: Array  # (2,) of the road along x and y
 
 
 class RoadGrid:
-    """The cells of a road picture in the images of a rig."""
+    """The cells of a road picture, of a road with slopes (2,) in the ego frame, in the images of a rig."""
 
-    def __init__(self, cameras: Items[Camera]) -> None:
+    def __init__(self, cameras: Items[Camera], slopes: Array) -> None:
+        self._slopes = slopes
         rows, columns = np.indices(SHAPE)
         x, y = BEGIN_M[0] + CELL_M * columns, BEGIN_M[1] + CELL_M * rows
-        points = np.stack([x, y, np.zeros_like(x)], axis=-1)
+        points = np.stack([x, y, slopes[0] * x + slopes[1] * y], axis=-1)
         self._maps, distances = [], []
         for camera in cameras:
             pixels, depth = camera.project_ego(points)
@@ -56,18 +59,33 @@ class RoadGrid:
         none = np.isinf(np.min(distances, axis=0))
         self._of = np.where(none, -1, nearest).astype(np.int8)
 
-    def picture(self, images: Items[GreyImage | None], masks: Items[NDArray[np.bool_] | None]) -> RoadPicture:
-        """The road in the images of a frame. masks: of each image, the part that shows more than the vehicle itself."""
+    def picture(self, images: Items[GreyImage | None]) -> RoadPicture:
+        """The road in the images of a frame."""
         grey, seen = np.zeros(SHAPE, dtype=np.float32), np.zeros(SHAPE, dtype=bool)
-        for index, (image, mask, pixels) in enumerate(zip(images, masks, self._maps, strict=True)):
+        for index, (image, pixels) in enumerate(zip(images, self._maps, strict=True)):
             mine = self._of == index
             if image is None or not mine.any():
                 continue
             grey[mine] = sampled(image.pixels, pixels)[mine]
-            if mask is not None:
-                mine &= sampled(mask.astype(np.uint8), pixels) > 0
             seen |= cv2.erode(mine.astype(np.uint8), np.ones((MARGIN, MARGIN))) > 0
-        return RoadPicture(texture(grey, seen), seen, self._of)
+        return RoadPicture(texture(grey, seen), seen, self._of, self._slopes)
+
+
+class RoadGrids:
+    """The grids of a rig by slopes of the road, in steps of SLOPE_STEP; the last ones are kept."""
+
+    def __init__(self, cameras: Items[Camera]) -> None:
+        self._cameras = cameras
+        self._grids: dict[tuple[float, float], RoadGrid] = {}
+
+    def at(self, slopes: Array) -> RoadGrid:
+        """The grid nearest to slopes (2,)."""
+        x, y = (float(round(slope / SLOPE_STEP) * SLOPE_STEP) for slope in slopes)
+        grid = self._grids.pop((x, y), None) or RoadGrid(self._cameras, np.array([x, y]))
+        self._grids[x, y] = grid
+        while len(self._grids) > KEPT:
+            del self._grids[next(iter(self._grids))]
+        return grid
 
 
 def distance_votes(
@@ -124,15 +142,15 @@ def moved_picture(picture: RoadPicture, yaw: float, shift: Array) -> RoadPicture
     size, inverse = SHAPE[::-1], cv2.WARP_INVERSE_MAP
     grey = cv2.warpAffine(picture.texture, matrix, size, flags=inverse | cv2.INTER_LINEAR, borderValue=128)
     seen = cv2.warpAffine(picture.seen.astype(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST)
-    return RoadPicture(np.asarray(grey, dtype=np.uint8), seen > 0, picture.of)
+    return replace(picture, texture=np.asarray(grey, dtype=np.uint8), seen=seen > 0)
 
 
 @dataclass(frozen=True)
 class RoadFlow:
     """Points of the road in two pictures."""
 
-    first: Array  # (n, 2) x and y in the first ego frame, metres
-    second: Array  # (n, 2) in the second one
+    first: Array  # (n, 3) in the first ego frame, metres
+    second: Array  # (n, 3) in the second one
     contrast: Array  # (n, 2, 2) symmetric: 0 to 1 along each axis of the contrast, in the first ego frame
     cameras: Indices  # (n, 2) that see them
 
@@ -145,7 +163,7 @@ def road_flow(first: RoadPicture, second: RoadPicture, yaw: float, shift: Array,
     both = cv2.erode((first.seen & warped.seen).astype(np.uint8), np.ones((WINDOW, WINDOW)))
     at = np.argwhere(both[::SPACING, ::SPACING] > 0)[:, ::-1].astype(np.float32) * SPACING
     if not len(at):
-        return RoadFlow(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2), dtype=np.int64))
+        return RoadFlow(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros((0, 2), dtype=np.int64))
     flow, kept = flow_at(first.texture, warped.texture, at)
     kept &= np.linalg.norm(flow, axis=-1) * CELL_M < most_m
     at, flow = at[kept], flow[kept]
@@ -156,4 +174,5 @@ def road_flow(first: RoadPicture, second: RoadPicture, yaw: float, shift: Array,
                second.of[rows.clip(0, SHAPE[0] - 1), columns.clip(0, SHAPE[1] - 1)]]  # fmt: skip
     seen = np.minimum(*cameras) >= 0
     told = contrast(first.texture, at)
+    points, there = (np.column_stack([each, each @ of.slopes]) for each, of in ((points, first), (there, second)))
     return RoadFlow(points[seen], there[seen], told[seen], np.stack(cameras, -1)[seen].astype(np.int64))

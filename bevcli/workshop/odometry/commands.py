@@ -31,6 +31,7 @@ def odometry(
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
     from bevcli.workshop.odometry import measure
+    from bevcli.workshop.odometry.compare import compare
     from bevcli.workshop.odometry.picture import WatchedDrive, stitched, write_picture
     from bevcli.workshop.odometry.recording import write_recording
     from bevcli.workshop.odometry.report import against_stated, check_measured, report_text, to_json, write_report
@@ -48,10 +49,12 @@ def odometry(
     check_measured(motion)
     stated = drive.stated_poses
     difference = None if stated is None else against_stated(motion, stated)
-    written = write_report(motion, out, difference)
+    indices = [stamp.index for stamp in drive.stamps]
+    findings = () if drive.ego_motion is None else compare(drive.ego_motion, motion, indices)
+    written = write_report(motion, out, difference, findings)
     road = stitched(drive, motion.poses)
     write_picture(out / "odometry.png", motion, road, stated)
     write_recording(out / "odometry.rrd", motion, drive, road, stated)
     written += [out / "odometry.png", out / "odometry.rrd"]
-    say(to_json(motion, difference) if as_json else report_text(motion, difference))
+    say((to_json if as_json else report_text)(motion, difference, findings))
     say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -9,9 +9,9 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.correspondence.images import GreyImage, grey_image, reduced
 from bevcli.workshop.correspondence.points import Features, features
-from bevcli.workshop.odometry.above import RoadGrid, RoadPicture
+from bevcli.workshop.odometry.above import RoadGrids, RoadPicture
 
-PIXELS, WIDEST = 2.2e6, 1250  # of all reduced images of a frame together, and the width of one
+PIXELS, WIDEST = 1.8e6, 1250  # of all reduced images of a frame together, and the width of one
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,11 @@ class FrameView:
     late_s: Array  # (C,) when each image was taken, after the frame's time
     images: tuple[GreyImage | None, ...]  # None: no image, or one that shows nothing
     features: tuple[Features | None, ...]
-    road: RoadPicture
+    grids: RoadGrids
+
+    def road(self, slopes: Array) -> RoadPicture:
+        """The road seen from above, of slopes (2,) in the ego frame."""
+        return self.grids.at(slopes).picture(self.images)
 
 
 class Viewer:
@@ -36,7 +40,7 @@ class Viewer:
         """The views of a frame."""
         if frame.rig is not self._rig:
             self._rig, self._cameras = frame.rig, _reduced(frame.rig)
-            self._grid = RoadGrid(self._cameras)
+            self._grids = RoadGrids(self._cameras)
         time, cameras = frame.stamp.timestamp_ns, self._cameras
         taken = [frame.images[each.name].timestamp_ns if each.name in frame.images else time for each in cameras]
         images = tuple(
@@ -44,8 +48,7 @@ class Viewer:
             for camera in cameras
         )
         found = tuple(None if image is None else features(image) for image in images)
-        road = self._grid.picture(images, [None] * len(images))
-        return FrameView(time, cameras, (np.array(taken) - time) / 1e9, images, found, road)
+        return FrameView(time, cameras, (np.array(taken) - time) / 1e9, images, found, self._grids)
 
 
 def _reduced(rig: CameraRig) -> tuple[Camera, ...]:

@@ -55,12 +55,12 @@ def rays_and_weights(
 
 
 def _seen(points: Array, pose: Array, focal: Array) -> tuple[Array, Array, Array]:
-    """How cameras with poses (n, 4, 4) and focal lengths (n,) see points (n, 2) of the road.
+    """How cameras with poses (n, 4, 4) and focal lengths (n,) see points (n, 3) of the road.
 
     Returns rays (n, 3) in the camera frame, the covariance (n, 2, 2) of a point by the error of a pixel, metres², and
     the derivative (n, 2, 3) of the point by the ray.
     """
-    away = np.column_stack([points, np.zeros(len(points))]) - pose[:, :3, 3]
+    away = points - pose[:, :3, 3]
     length = np.linalg.norm(away, axis=-1, keepdims=True)
     direction = away / length
     slope = np.zeros((len(points), 2, 3))

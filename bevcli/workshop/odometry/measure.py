@@ -15,7 +15,7 @@ from bevcli.workshop.odometry import OdometryOptions
 from bevcli.workshop.odometry.chain import Chain
 from bevcli.workshop.odometry.frames import FrameView, Viewer
 from bevcli.workshop.odometry.seen_points import SeenPoints
-from bevcli.workshop.odometry.steps import Candidate, Guess, StepViews, candidates, is_measured, reason_of
+from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, StepViews, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.twist import exponential, logarithm
 from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
 
@@ -103,7 +103,7 @@ class MotionMeter:
         self._viewer, self._chain = Viewer(), Chain()
         self._last: FrameView | None = None
         self._before: tuple[Array, float] | None = None  # the state of the step before and its seconds
-        self._guessed = 0  # steps in a row
+        self._seconds, self._guessed = 0.0, 0  # of the step that is not decided; guesses in a row
 
     def add(self, frame: Frame) -> list[MeasuredStep]:
         """The steps that are certain now: of the frame before at the latest."""
@@ -114,25 +114,43 @@ class MotionMeter:
         seconds = (view.timestamp_ns - last.timestamp_ns) / 1e9
         step = StepViews(last, view)
         found = candidates(step, Guess(self._expected(seconds), self._options.height_m))
-        usable = [each for each in found if is_measured(each)]
-        if not usable:
-            return [*self.finish(), self._guess(seconds, reason_of(step, found))]
-        decided = self._chain.add(usable, seconds)
+        if not found:
+            before, self._guessed = self.finish(), self._guessed + 1
+            return [*before, self._guess(seconds, reason_of(step))]
+        decided = self._chain.add(found, seconds)
         likeliest = self._chain.likeliest
         assert likeliest is not None
-        self._before, self._guessed = (likeliest.state, seconds), 0
-        return [] if decided is None else [_step(decided)]
+        steps, self._seconds = [] if decided is None else [self._decided(decided)], seconds
+        if is_measured(likeliest):
+            self._before = likeliest.state, seconds
+        return steps
 
     @property
     def newest(self) -> MeasuredStep | None:
         """The step that is not decided, with the motion that is the likeliest so far; None where all are."""
         likeliest = self._chain.likeliest
-        return None if likeliest is None else _step(likeliest)
+        return None if likeliest is None else self._step(likeliest)
 
     def finish(self) -> list[MeasuredStep]:
         """The step that is not decided, if there is one. Called after the last frame."""
         decided = self._chain.end()
-        return [] if decided is None else [_step(decided)]
+        return [] if decided is None else [self._decided(decided)]
+
+    def _decided(self, candidate: Candidate) -> MeasuredStep:
+        self._guessed = 0 if is_measured(candidate) else self._guessed + 1
+        return self._step(candidate)
+
+    def _step(self, candidate: Candidate) -> MeasuredStep:
+        """A motion as measured, or a guess where the images do not tell it."""
+        if not is_measured(candidate):
+            return self._guess(self._seconds, NOT_TOLD)
+        return MeasuredStep(
+            motion_of(candidate.state),
+            candidate.covariance,
+            matches=candidate.matches,
+            road_points=candidate.road_points,
+            seen=candidate.seen,
+        )
 
     def _expected(self, seconds: float) -> Array | None:
         """(8,) the state of a step at constant velocity."""
@@ -145,21 +163,10 @@ class MotionMeter:
 
     def _guess(self, seconds: float, reason: str) -> MeasuredStep:
         state = self._expected(seconds)
-        self._guessed += 1
-        wide = seconds * np.sqrt(self._guessed) if state is not None else seconds * UNKNOWN
+        wide = seconds * np.sqrt(max(1, self._guessed)) if state is not None else seconds * UNKNOWN
         deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
         motion = np.eye(4) if state is None else motion_of(state)
         return MeasuredStep(motion, np.diag(deviations**2), reason)
-
-
-def _step(candidate: Candidate) -> MeasuredStep:
-    return MeasuredStep(
-        motion_of(candidate.state),
-        candidate.covariance,
-        matches=candidate.matches,
-        road_points=candidate.road_points,
-        seen=candidate.seen,
-    )
 
 
 def measure_motion(

@@ -128,4 +128,4 @@ def _log_points(stream: rr.RecordingStream, seen: SeenPoints | None, rig: Camera
         colors = np.asarray(RESIDUAL_COLORS)[np.digitize(seen.residuals_px[mine], RESIDUALS_PX)]
         colors[seen.is_road[mine]] = ROAD_COLOR
         at = seen.at[mine] * (SHOWN_WIDTH, SHOWN_WIDTH * camera.height / camera.width)
-        stream.log(entity, rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(1.5), draw_order=10))
+        stream.log(entity, rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(2.0), draw_order=10))

@@ -6,7 +6,7 @@ Functions of a `MeasuredMotion`, and the files that `bevcli odometry` writes of 
 import json
 from collections import Counter
 from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
+from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.printing import aligned, counted
 from bevcli.workshop.formats.output import write_ego_motion
@@ -23,6 +24,7 @@ from bevcli.writing import write_whole
 
 KMH = 3.6
 CM, PERCENT = 100, 100
+COMMON = 0.5  # share of the variance of a step that the others have too
 
 
 def seconds_of(motion: MeasuredMotion) -> Array:
@@ -66,17 +68,19 @@ def _turn_deg(motion: Array) -> Array:
 def end_deviations(motion: MeasuredMotion) -> tuple[float, float]:
     """Standard deviations of the last pose: distance, metres, and rotation, degrees.
 
-    The errors of the steps count as independent. An error of a step's rotation turns all that follows.
+    An error of a step's rotation turns all that follows. COMMON of each variance counts as an error of the calibration,
+    such as of a height, which is the same in all steps; the rest is independent.
     """
     poses, end = motion.poses, motion.poses[-1][:3, 3]
-    places, turns = np.zeros((3, 3)), np.zeros((3, 3))
+    own, common = np.zeros(6), np.zeros((6, 6))  # of the place and the rotation vector, world frame
     for pose, following, step in zip(poses, poses[1:], motion.steps, strict=False):
         x, y, z = end - following[:3, 3]
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        gain = np.concatenate([-cross @ pose[:3, :3], pose[:3, :3]], axis=1)  # (3, 6)
-        places += gain @ step.covariance @ gain.T
-        turns += pose[:3, :3] @ step.covariance[:3, :3] @ pose[:3, :3].T
-    return float(np.sqrt(np.trace(places))), float(np.degrees(np.sqrt(np.trace(turns))))
+        cross, turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), pose[:3, :3]
+        gain = np.block([[-cross @ turn, turn], [turn, np.zeros((3, 3))]])
+        own += np.diag(gain @ step.covariance @ gain.T)
+        common += gain @ np.linalg.cholesky(step.covariance + 1e-18 * np.eye(6))
+    variances = (1 - COMMON) * own + COMMON * (common**2).sum(-1)
+    return float(np.sqrt(variances[:3].sum())), float(np.degrees(np.sqrt(variances[3:].sum())))
 
 
 @dataclass(frozen=True)
@@ -165,8 +169,8 @@ def _reasons(motion: MeasuredMotion) -> str:
     return "; ".join(f"{counted(count, 'steps')} ({reason})" for reason, count in reasons.most_common())
 
 
-def report_text(motion: MeasuredMotion, stated: StatedDifference | None = None) -> str:
-    """A short table for a terminal."""
+def report_text(motion: MeasuredMotion, stated: StatedDifference | None = None, findings: Items[Finding] = ()) -> str:
+    """A short table for a terminal. findings: about the stated poses."""
     seconds, length = float(seconds_of(motion).sum()), float(lengths_m(motion).sum())
     speed, (end_m, end_deg) = length / seconds if seconds else 0.0, end_deviations(motion)
     rows = [
@@ -176,12 +180,12 @@ def report_text(motion: MeasuredMotion, stated: StatedDifference | None = None) 
         ("not measured", _reasons(motion) or "no step"),
     ]
     if stated is not None:
-        rows.append(("stated poses", stated.text()))
+        rows += [("stated poses", stated.text()), *(("", f"{each.severity}: {each.line}") for each in findings)]
     return "\n".join([motion.name, aligned(rows, left=(0, 1))])
 
 
-def to_json(motion: MeasuredMotion, stated: StatedDifference | None = None) -> str:
-    """The content of report.json."""
+def to_json(motion: MeasuredMotion, stated: StatedDifference | None = None, findings: Items[Finding] = ()) -> str:
+    """The content of report.json. findings: about the stated poses."""
     seconds, length, (end_m, end_deg) = seconds_of(motion), lengths_m(motion), end_deviations(motion)
     content = {
         "drive": motion.name,
@@ -191,7 +195,7 @@ def to_json(motion: MeasuredMotion, stated: StatedDifference | None = None) -> s
         "end_deviation_m": end_m,
         "end_deviation_deg": end_deg,
         "not_measured": dict(not_measured(motion)),
-        "stated": None if stated is None else stated.to_dict(),
+        "stated": None if stated is None else {**stated.to_dict(), "findings": [asdict(each) for each in findings]},
         "steps": [_entry(motion, index) for index in range(len(motion.steps))],
     }
     return json.dumps(content, indent=1, ensure_ascii=False)
@@ -213,12 +217,14 @@ def _entry(motion: MeasuredMotion, index: int) -> dict[str, Any]:
     }
 
 
-def write_report(motion: MeasuredMotion, folder: Path, stated: StatedDifference | None = None) -> list[Path]:
+def write_report(
+    motion: MeasuredMotion, folder: Path, stated: StatedDifference | None = None, findings: Items[Finding] = ()
+) -> list[Path]:
     """Write ego_motion.csv and report.json into a folder, made where it is missing. Returns their paths.
 
     Existing files are overwritten. Raises OutputError.
     """
     report, poses = folder / "report.json", folder / "ego_motion.csv"
-    write_whole(report, f"{to_json(motion, stated)}\n".encode(), parents=True)
+    write_whole(report, f"{to_json(motion, stated, findings)}\n".encode(), parents=True)
     write_ego_motion(poses, motion.ego_motion)
     return [poses, report]

@@ -10,22 +10,24 @@ from bevcli.workshop.correspondence.points import matched, neighbours
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, Residuals, RoadResiduals
 from bevcli.workshop.correspondence.road import RoadPoints, road_points
 from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve, spread, values
-from bevcli.workshop.odometry.above import CELL_M, distance_votes, road_flow
+from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
     COUNT,
+    PLACE,
     SHORTEST_M,
     SLOPE_RAD,
     SLOPES,
     STATE,
     StepUnknowns,
     deviations_at,
+    next_slopes,
 )
 
-YAWS = np.radians(np.arange(-30, 30.1, 2.0))  # that are tried, besides those of the last step
+YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
 STILL_PX, STILL_SHARE = 0.6, 0.7  # of matched points of a vehicle that stands
 STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
@@ -44,8 +46,12 @@ MOST_PX = (30.0, 8.0)  # of points of two cameras
 LEAST_SHARE = 0.3  # of the points of two cameras that fit; where fewer do, both see nothing in common
 LEAST_SPREAD, MOST_SPREAD = 0.3, 2.0  # of residuals, while the motion is searched
 CANDIDATES = 3  # distances of a step that are measured
+SLOPES_TRIED = np.radians([-1.25, 0.0, 1.25])  # of the road along x, while none is known
+LEVEL = 0.9  # factor of the votes of such a slope
 LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
 APART_M = 0.4  # between them
+FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
+MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
 
 
@@ -197,21 +203,28 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     points = match_points(step)
     if is_still(step, points):
         start = np.concatenate([np.zeros(6), guess.slopes])
-        return [measured(step, points, start, replace(guess, still=True), 1.0)]
+        return [measured(step, points, start, replace(guess, still=True), 1.0, None)]
     if len(points.group) < FEWEST:
         return []
     rough = direction(step, points, guess)
     heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
     seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
     cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
-    distances, votes = distance_votes(step.first.road, step.second.road, heading, float(rough[2]), cells)
-    votes[np.sign(distances) == -_sense(step, points, rough)] = 0
-    found = []
+    sense, rounds = _sense(step, points, rough), []
+    for slope in np.zeros(1) if guess.state is not None else SLOPES_TRIED:
+        tried = rough + np.array([*[0] * 6, slope, 0])
+        roads = step.first.road(tried[SLOPES]), step.second.road(next_slopes(tried))
+        distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
+        votes[np.sign(distances) == -sense] = 0
+        rounds.append((votes.max() * (1.0 if slope == 0 else LEVEL), tried, roads, distances, votes))
+    _, tried, roads, distances, votes = max(rounds, key=lambda each: each[0])
+    starts = []
     for index in _peaks(votes)[:CANDIDATES]:
-        start = rough.copy()
+        start = tried.copy()
         start[3:5] = distances[index] * np.array([np.cos(heading), np.sin(heading)])
-        found.append(measured(step, points, start, guess, float(votes[index])))
-    return found
+        starts.append((start, float(votes[index])))
+    # Without road, two cameras may still tell the distance.
+    return [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
 
 
 def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
@@ -237,20 +250,29 @@ def _peaks(votes: Array) -> list[int]:
     return found
 
 
-def measured(step: StepViews, points: EpipolarResiduals, start: Array, guess: Guess, votes: float) -> Candidate:
+def measured(
+    step: StepViews,
+    points: EpipolarResiduals,
+    start: Array,
+    guess: Guess,
+    votes: float,
+    roads: tuple[RoadPicture, RoadPicture] | None,
+) -> Candidate:
     """The motion near a start (8,) that fits points and road best."""
     deviations = guess.deviations(start)
     unknowns, x = step.unknowns(start, deviations), np.zeros(len(deviations))
     for most_m, most_px in zip(MOST_M, MOST_PX, strict=True):
         fitting = _common(step, unknowns, points, x, most_px) if not guess.still else _still(step, points)
         road: GroundResiduals | RoadResiduals = _road_in_images(step, unknowns, x, ROAD_PX * most_m)
-        if len(road.group) < FEWEST_OF_ROAD:
-            road = _road(step, unknowns, x, most_m)
+        if len(road.group) < FEWEST_OF_ROAD and roads is not None:
+            road = _road(step, unknowns, x, roads, most_m)
         terms = _terms(step, unknowns, (fitting, road), x)
         x = solve(unknowns, [(each, np.clip(scale, LEAST_SPREAD, MOST_SPREAD)) for each, scale in terms], x).x
     solution = solve(unknowns, _terms(step, unknowns, (fitting, road), x), x)
-    covariance = honest_covariance(unknowns, solution, np.arange(len(unknowns.columns)))
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance)
+    groups = np.arange(len(unknowns.columns))
+    covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
+    covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
+    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + FLOOR
     kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
     seen = seen_points(step.second.cameras, *kinds)
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
@@ -288,11 +310,13 @@ def _common(
     return points.where((first == second) | (fits & (share >= LEAST_SHARE)[pairs]))
 
 
-def _road(step: StepViews, unknowns: StepUnknowns, x: Array, most_m: float) -> GroundResiduals:
+def _road(
+    step: StepViews, unknowns: StepUnknowns, x: Array, roads: tuple[RoadPicture, RoadPicture], most_m: float
+) -> GroundResiduals:
     """The points of the road near the motion of x."""
     motion = unknowns.start + x[STATE]
     yaw = float(motion[2])
-    flow = road_flow(step.first.road, step.second.road, yaw, motion[3:5], most_m)
+    flow = road_flow(*roads, yaw, motion[3:5], most_m)
     rays_a, rays_b, weights = rays_and_weights(flow, (step.first.cameras, step.second.cameras), yaw)
     group = step.group(flow.cameras[:, 0], flow.cameras[:, 1], rays_a)
     return _sorted(GroundResiduals(group, rays_a, rays_b, weights))
@@ -319,11 +343,12 @@ def is_measured(candidate: Candidate) -> bool:
     return bool(np.hypot(*place[:2]) < max(WIDEST_M, WIDEST * distance) and turn.max() < WIDEST_RAD)
 
 
-def reason_of(step: StepViews, found: list[Candidate]) -> str:
-    """The reason why a step could not be measured."""
+NOT_TOLD = "the images do not tell the distance: too few points of the road match"
+
+
+def reason_of(step: StepViews) -> str:
+    """The reason why a step has no candidate."""
     first, second = (sum(image is not None for image in view.images) for view in (step.first, step.second))
     if not min(first, second):
         return "no image shows anything (missing, dark or covered)"
-    if not found:
-        return "too few points of the images match, or no part of the road looks alike in both frames"
-    return "the images do not tell the distance: too few points of the road match"
+    return "too few points of the images match, or no part of the road looks alike in both frames"

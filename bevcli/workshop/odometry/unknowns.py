@@ -13,7 +13,10 @@ from bevcli.workshop.odometry.twist import exponential, logarithm
 TURN, PLACE, SLOPES, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 8), 8  # the indices of the unknowns
 COUNT = 9
 STATE = slice(0, 8)  # those that a start has
-SUSPENSION_RAD, SUSPENSION_M = np.radians(0.7), 0.01  # of pitch and roll, and of the height, between two frames
+SUSPENSION_RAD, SUSPENSION_M = (
+    np.radians(0.7),
+    (0.01, 0.01),
+)  # of pitch and roll, and of the height (and as a share of the way), between two frames
 YAW_RAD, ALONG = np.radians(3.0), 0.3  # by which the start may be wrong, the second as a share of the distance
 SHORTEST_M = 0.5  # distance for that share
 SLOPE_RAD, CHANGE_RAD = np.radians(1.0), np.radians(0.2)  # of the road under the vehicle, and its change in a step
@@ -47,7 +50,11 @@ class StepUnknowns:
     def geometry(self, local: Array) -> GroupGeometry:
         """The geometry of all groups."""
         x, (times, of_group) = local[0], self._times
-        poses = exponential(times[:, None] * logarithm(self.motion(x)))  # in the first ego frame
+        motion = self.motion(x)
+        if set(times.tolist()) <= {0.0, 1.0}:
+            poses = np.where(times[:, None, None] > 0, motion, np.eye(4))
+        else:
+            poses = exponential(times[:, None] * logarithm(motion))  # in the first ego frame
         between = inverse(poses)[:, None] @ poses  # (T, T, 4, 4)
         raised = rigid((0, 0, x[HEIGHT]))
         a, b = (raised @ side for side in self.sides)
@@ -84,7 +91,6 @@ def deviations_at(start: Array, height_m: float, slope_rad: float, *, known_dist
     known_distance: hold the distance of the start, and let the direction be anything.
     """
     wide = max(float(np.hypot(*start[3:5])), SHORTEST_M) * ALONG
+    over = SUSPENSION_M[0] + SUSPENSION_M[1] * float(np.hypot(*start[3:5]))
     along = 1e-3 if known_distance else wide
-    return np.array(
-        [SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, SUSPENSION_M, slope_rad, slope_rad, height_m]
-    )
+    return np.array([SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, over, slope_rad, slope_rad, height_m])
