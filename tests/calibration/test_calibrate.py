@@ -315,3 +315,20 @@ def test_small_images_name_the_size_that_would_do(matches, deviation_deg, said):
     assert calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), camera) == said
     large = make_camera("CAM_FRONT", 0.0, 1600, 900)
     assert "would do" not in calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), large)
+
+
+def test_a_rotation_about_the_way_asks_for_a_turn():
+    """Larger images do not show it: points that move along the way look the same from a camera that is rolled."""
+    camera = make_camera("CAM_FRONT", 0.0, 160, 90)
+    rolled, pitched = np.array([0.1, 0.1, 0.9]), np.array([0.9, 0.1, 0.1])
+    asked = "the road shows too little, and the vehicle turns too little; a turn at a junction would do"
+    assert calibrating._reason(500, 8, rolled, camera, 2.0) == f"the drive shows its rotation to ±0.9° only: {asked}"
+    assert "junction" not in calibrating._reason(500, 8, rolled, camera, 40.0)
+    assert "junction" not in calibrating._reason(500, 8, pitched, camera, 2.0)
+    beside = make_camera("CAM_LEFT", 90.0, 160, 90)  # its right axis points along the way
+    assert "junction" in calibrating._reason(500, 8, pitched, beside, 2.0)
+
+
+def test_images_of_any_size_may_not_do():
+    said = calibrating._reason(500, 8, np.array([0.1, 3.0, 0.1]), make_camera("CAM_FRONT", 0.0, 160, 90))
+    assert said.endswith("its images are 160 x 90: 1000 x 562 would show about ±0.5°, and a longer drive less")

@@ -336,6 +336,8 @@ def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) ->
 
 FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
+LEAST_TURNED_DEG = 20.0  # of the vehicle, see `_turned_deg`; points then tell a rotation about its way, too
+MOSTLY = 0.7  # cosine between an axis of a camera and the way
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
@@ -488,7 +490,8 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     deviations = np.sqrt(np.diag(covariance))
     mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
     count, pairs = int(mine.sum()), len(np.unique(groups[mine]))
-    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index])
+    turned_deg = _turned_deg(measurement.unknowns)
+    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index], turned_deg)
     enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
@@ -514,10 +517,16 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     )
 
 
-def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> str:
-    """Why a camera is not measurable; "" where it is. Of small images, with the size that would do."""
+def _reason(
+    matches: int, pairs: int, deviations_deg: Array, camera: Camera, turned_deg: float = LEAST_TURNED_DEG
+) -> str:
+    """Why a camera is not measurable, with the size of images or the drive that would do; "" where it is.
+
+    turned_deg: see `_turned_deg`.
+    """
     # Matches grow with the area of an image, deviations shrink with its width.
-    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), deviations_deg.max() / WIDEST_DEG)
+    widest = deviations_deg.max()
+    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
     width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
     height = round(camera.height * width / camera.width)
     stated = f"{camera.width} x {camera.height}"
@@ -526,9 +535,27 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
         return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:
         return f"matches in {pairs} frame pairs"
-    if deviations_deg.max() > WIDEST_DEG:
-        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only{size}"
-    return ""
+    if widest <= WIDEST_DEG:
+        return ""
+    shown = f"the drive shows its rotation to ±{widest:.1f}° only"
+    ahead = np.abs(camera.ego_from_camera[0, :3])  # the direction in which the vehicle drives, in the camera frame
+    if turned_deg < LEAST_TURNED_DEG and ahead[deviations_deg.argmax()] > MOSTLY:
+        return f"{shown}: the road shows too little, and the vehicle turns too little; a turn at a junction would do"
+    if wanted > WIDTH > camera.width:
+        left = widest * camera.width / WIDTH
+        size = f"; its images are {stated}: {width} x {height} would show about ±{left:.1f}°, and a longer drive less"
+    return f"{shown}{size}"
+
+
+def _turned_deg(unknowns: adjustment.Unknowns) -> float:
+    """The turns of the vehicle in all pairs, as the square root of their sum of squares.
+
+    The error of the stated rotation of a pair looks like a rotation of the camera by that error over the turn.
+    """
+    motion = solver.geometry_at(unknowns, np.zeros(len(unknowns.deviations))).ego_b_from_ego_a
+    turns = np.arctan2(motion[:, 1, 0], motion[:, 0, 0])
+    _, first = np.unique(unknowns.turns[unknowns.moves], return_index=True)
+    return float(np.degrees(np.linalg.norm(turns[unknowns.moves][first])))
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
