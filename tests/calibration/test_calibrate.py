@@ -16,6 +16,7 @@ import bevcli
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
+from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 from bevcli.workshop.calibration import calibrate as calibrating, in_turn
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, Verdict, common_delay_text, either_text, findings_of
@@ -261,6 +262,21 @@ def test_motion_and_calibration_are_measured_until_both_stand(result, street, mo
     assert found.whole.height_deviation_m == 0.2
     assert "heights count from their stated mean" in found.text()
     assert '"rounds": 3' in found.to_json()
+
+
+def test_a_rig_that_is_turned_drives_beside_x():
+    """On circles of all radii, with the ego frame ahead of the axle that does not slip."""
+    pose, poses = np.eye(4), []
+    turned = rigid((0.9, 0, 0), rotation_about_z(np.radians(-1.5)))
+    for bend in (0.0, 0.02, -0.05, 0.04, 0.0, 0.01):
+        poses.append(pose @ turned)
+        angle = 2.0 * bend
+        arc = (2.0, 0, 0) if not bend else (np.sin(angle) / bend, (1 - np.cos(angle)) / bend, 0)
+        pose = pose @ rigid(arc, rotation_about_z(angle))
+    beside, deviation = in_turn.beside_x_deg(np.stack([*poses, pose @ turned]))
+    assert beside == pytest.approx(1.5, abs=0.02)
+    assert deviation < 0.05
+    assert in_turn.beside_x_deg(np.stack([np.eye(4)] * 9)) == (0.0, 180.0)
 
 
 def delayed(estimate, delay_ms, deviation_ms=4.0):

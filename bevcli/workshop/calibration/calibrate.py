@@ -45,7 +45,9 @@ HEADER = (
 )  # fmt: skip
 MEASURED_MOTION = (
     "the motion is measured from the images, in {rounds} rounds: height and scale cannot be told apart (a rig that is "
-    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean"
+    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean; nor can yaw and "
+    "direction, so yaw counts from its stated mean: all cameras are off by {yaw:+.2f}° ± {deviation:.2f}° more if the "
+    "vehicle drives along x"
 )
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
 EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
@@ -360,6 +362,7 @@ class CalibrationResult:
         facts: of the drive, for calibration.json.
         interval_ms: between frames, if it is the same for all: such times are often nominal; None if it is not.
         rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
+        drives_beside_x_deg: direction of the measured motion, degrees to the left of x, and its deviation.
     """
 
     name: str
@@ -371,6 +374,7 @@ class CalibrationResult:
     facts: DriveFacts
     interval_ms: float | None = None
     rounds: int = 0
+    drives_beside_x_deg: tuple[float, float] = (0.0, 0.0)
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(estimate for estimate in self.cameras if estimate.camera == camera)
@@ -379,7 +383,8 @@ class CalibrationResult:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
         table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
-        measured = [MEASURED_MOTION.format(rounds=self.rounds)] if self.rounds else []
+        yaw, deviation = self.drives_beside_x_deg
+        measured = [MEASURED_MOTION.format(rounds=self.rounds, yaw=yaw, deviation=deviation)] if self.rounds else []
         return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras, self.interval_ms), *measured])
 
     def to_json(self) -> str:
@@ -391,7 +396,7 @@ class CalibrationResult:
             "rig": asdict(self.whole),
         }
         if self.rounds:
-            content["rounds"] = self.rounds
+            content |= {"rounds": self.rounds, "drives_beside_x_deg": self.drives_beside_x_deg}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
