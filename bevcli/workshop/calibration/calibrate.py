@@ -44,7 +44,7 @@ HEADER = (
     "camera", "yaw off by", "pitch", "roll", "x off by", "y", "z", "matches", "residual px", "verdict",
 )  # fmt: skip
 MEASURED_MOTION = (
-    "the motion is measured from the images, in {rounds} rounds: height and scale cannot be told apart (a rig that is "
+    "the motion is measured from the images (rounds: {rounds}): height and scale cannot be told apart (a rig that is "
     "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean; nor can yaw and "
     "direction, so yaw counts from its stated mean: all cameras are off by {yaw:+.2f}° ± {deviation:.2f}° more if the "
     "vehicle drives along x"
