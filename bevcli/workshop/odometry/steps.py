@@ -13,6 +13,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.point_votes import point_votes, ways_of_points
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
@@ -210,11 +211,12 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
     seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
     cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
-    sense, rounds = _sense(step, points, rough), []
+    sense, rounds, ways = _sense(step, points, rough), [], _ways(step, points, rough)
     for slope in np.zeros(1) if guess.state is not None else SLOPES_TRIED:
         tried = rough + np.array([*[0] * 6, slope, 0])
         roads = step.first.road(tried[SLOPES]), step.second.road(next_slopes(tried))
         distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
+        votes *= point_votes(ways, distances)
         votes[np.sign(distances) == -sense] = 0
         rounds.append((votes.max() * (1.0 if slope == 0 else LEVEL), tried, roads, distances, votes))
     _, tried, roads, distances, votes = max(rounds, key=lambda each: each[0])
@@ -237,6 +239,14 @@ def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
         return 0
     share = float((near > 0).all(-1).mean() - (near < 0).all(-1).mean())
     return int(np.sign(share) * np.sign(rough[3])) if abs(share) > CLEAR_SHARE else 0
+
+
+def _ways(step: StepViews, points: EpipolarResiduals, rough: Array) -> Array:
+    """(n,) the ways with which matched points of single cameras lie on the road."""
+    unknowns = step.unknowns(rough, np.ones(COUNT))
+    inside = points.where(np.equal(*step.pair(points.group)))
+    geometry = unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
+    return ways_of_points(inside, geometry, float(np.hypot(*rough[3:5])))
 
 
 def _peaks(votes: Array) -> list[int]:
