@@ -5,6 +5,7 @@ they have no matches that move. So these votes hold where the road from above sh
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
@@ -14,10 +15,11 @@ LEAST_DOWN = 0.03  # sine of the angle below the horizon
 FEWEST = 15  # points
 WIDTH = 0.12  # deviation of the logarithm of a point's way
 CHANCE = 0.15  # of the votes that a distance has without such a point
+UNDER = 0.7  # of the way of most points
 
 
 def ways_of_points(points: EpipolarResiduals, geometry: GroupGeometry, length: float) -> Array:
-    """(n,) metres: the ways with which points of single cameras, those below the horizon, lie on the road.
+    """(n,) metres: the ways with which points of single cameras lie on the road; NaN for those that tell none.
 
     length: way of the motion of the geometry.
     """
@@ -28,15 +30,30 @@ def ways_of_points(points: EpipolarResiduals, geometry: GroupGeometry, length: f
     down = -np.einsum("nij,nj->ni", pose[:, :3, :3], points.rays_a) @ normal
     depths = points.depths(geometry)
     kept = (moved_px > LEAST_PX) & (down > LEAST_DOWN) & (np.prod(np.sign(depths), axis=-1) > 0)
-    road = (pose[kept, :3, 3] @ normal) / down[kept]
-    return np.asarray(length * road / np.abs(depths[kept, 0]))
+    ways = np.full(len(kept), np.nan)
+    ways[kept] = length * (pose[kept, :3, 3] @ normal) / down[kept] / np.abs(depths[kept, 0])
+    return ways
 
 
 def point_votes(ways: Array, distances: Array) -> Array:
     """(D,) factors up to 1, of the votes of the road for distances (D,): the share of the points that agree."""
-    if len(ways) < FEWEST:
+    told = ways[np.isfinite(ways)]
+    if len(told) < FEWEST:
         return np.ones(len(distances))
+    shares = _shares(told, distances)
+    return np.asarray(CHANCE + (1 - CHANCE) * shares / max(float(shares.max()), 1e-9))
+
+
+def under_the_road(ways: Array) -> NDArray[np.bool_]:
+    """(n,) True for points that would lie deep under the road: they belong to vehicles that drive ahead."""
+    told = ways[np.isfinite(ways)]
+    if len(told) < FEWEST:
+        return np.zeros(len(ways), dtype=bool)
+    return np.nan_to_num(ways, nan=np.inf) < UNDER * told[int(np.argmax(_shares(told, told)))]
+
+
+def _shares(ways: Array, distances: Array) -> Array:
+    """(D,) the shares of points with ways (n,) that agree with distances (D,)."""
     logarithms = np.log(np.maximum(np.abs(distances), 1e-3))
     apart = (np.log(ways)[:, None] - logarithms) / WIDTH
-    shares = np.exp(-(apart**2) / 2).mean(0)
-    return np.asarray(CHANCE + (1 - CHANCE) * shares / max(float(shares.max()), 1e-9))
+    return np.asarray(np.exp(-(apart**2) / 2).mean(0))
