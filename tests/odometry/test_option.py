@@ -140,6 +140,13 @@ def test_a_conversion_writes_the_measured_poses(folder, tmp_path, measuring, tru
     assert len(again.load(0).ground_truth) == len(bevcli.open_sequence(STREET).load(0).ground_truth)
 
 
+def test_a_drive_is_shown_with_measured_poses(folder, tmp_path, measuring):
+    done = command(tmp_path, "viz", str(folder), "--odometry", "--frames", "0:2", "--out", "drive.rrd")
+    assert done.returncode == 0, done.stderr
+    assert "1/1 steps of the ego-motion" in done.stderr
+    assert (tmp_path / "drive.rrd").exists()
+
+
 def test_a_drive_of_a_batch_is_measured(folder, measuring):
     job = Job("runs/fleet", source=SequenceOptions(odometry=True))
     assert job.open(folder, None).has_ego_motion
