@@ -25,7 +25,7 @@ def odometry(
     Prints the length of the way, the mean speed, the deviation of its end, and the steps that could not be measured.
     Writes ego_motion.csv, which can be used as it is in a sequence folder or with --ego-motion; report.json with all
     numbers of each step; odometry.png, the way on the road and the curves of speed and yaw rate; and odometry.rrd,
-    the same for `bevcli viz`. A drive with more than 10 frames per second is thinned to that, unless --rate or --every
+    the same for `bevcli viz`. A drive with more than 15 frames per second is thinned to 10, unless --rate or --every
     is given. Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --odometry` measures first and then runs a model.
     """
     from bevcli.cli.progress import Progress
