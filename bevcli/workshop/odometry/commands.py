@@ -35,12 +35,11 @@ def odometry(
     from bevcli.workshop.odometry.picture import WatchedDrive, stitched, write_picture
     from bevcli.workshop.odometry.recording import write_recording
     from bevcli.workshop.odometry.report import against_stated, check_measured, report_text, to_json, write_report
-    from bevcli.workshop.odometry.run_option import at_most_rate, frames_between
+    from bevcli.workshop.odometry.run_option import at_most_rate
     from bevcli.writing import check_output
 
     reading = replace(source, ego_motion="measured")
     found = open_sequence(sequence, reading, ground_truth=False, **format_options)
-    found = frames_between(found, found)
     drive = WatchedDrive(found if source.rate_hz or source.every else at_most_rate(found))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
