@@ -95,7 +95,7 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         found = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
     if found.share >= MOST:
-        return (*found.findings, *_jumps(shown, found.steps, numbers))
+        return found.findings or _jumps(shown, found.steps, numbers)
     return (_wrong(shown, steps),)
 
 
@@ -196,10 +196,7 @@ def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
         return _candidate(measured, undone, parameters=1)
     side = "left" if turn > 0 else "right"
     found = f"x points {np.degrees(abs(turn)):.1f}° ± {np.degrees(deviation):.1f}° to the {side} of forward"
-    message, advice = (
-        "x of the poses is not forward",
-        "turn the rotations of the poses about z, or check the cameras' yaw",
-    )
+    message, advice = "x of the poses is not forward", "turn their rotations about z, or check the cameras' yaw"
     finding = _error("motion-axes", message, found, "x forward", advice, abs(turn) > LARGE_TURN)
     return _candidate(measured, undone, (finding,), 1)
 
