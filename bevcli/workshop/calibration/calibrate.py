@@ -6,7 +6,7 @@ from matched points and heights from the road; the verdicts. `motion_findings` i
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence as Items
+from collections.abc import Callable, Sequence as Items
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -48,6 +48,7 @@ MEASURED_MOTION = (
     "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean"
 )
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
+EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
 TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
 MOST_DELAY_MS = 300.0  # a larger one is a rotation
 
@@ -125,17 +126,40 @@ class RigEstimate:
     tilt_deviation_deg: tuple[float, float]
 
 
-def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
-    """Lines about the whole rig, and about the capture times of its cameras."""
+def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate], interval_ms: float | None = None) -> str:
+    """Lines about the whole rig, and about the capture times of its cameras. interval_ms: see `CalibrationResult`."""
     pitch, roll = (f"{a:+.2f}° ± {d:.2f}°" for a, d in zip(whole.tilt_deg, whole.tilt_deviation_deg, strict=True))
     lines = [
         f"height of the rig over the road off by {_metres(whole.height_m, whole.height_deviation_m)}; "
         f"tilt of the ego frame: pitch {pitch}, roll {roll}",
         f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
     ]
-    for estimate in cameras:
-        lines += [f"time offset: {text}" for text in (delay_text(estimate), either_text(estimate)) if text]
-    return "\n".join(lines)
+    common = common_delay_text(cameras, interval_ms)
+    texts = [common] if common else [delay_text(estimate) for estimate in cameras]
+    texts += [either_text(estimate) for estimate in cameras]
+    return "\n".join([*lines, *(f"time offset: {text}" for text in texts if text)])
+
+
+def common_delay_text(cameras: Items[CameraEstimate], interval_ms: float | None) -> str:
+    """A time offset that is certain and the same for all cameras, in words; "" where there is none."""
+    told = [each for each in cameras if each.delay_deviation_ms <= TOLD_DELAY_MS]
+    if not told or len(told) < min(2, len(cameras)):
+        return ""
+    delays, deviations = np.array([(each.delay_ms, each.delay_deviation_ms) for each in told]).T
+    delay, deviation = float(np.average(delays, weights=1 / deviations**2)), float(deviations.min())
+    differ = np.abs(delays - delay) > CERTAIN_DELAY[0] * deviations
+    if differ.any() or abs(delay) < max(CERTAIN_DELAY[0] * deviation, CERTAIN_DELAY[1]):
+        return ""
+    of = "all cameras" if len(cameras) > 1 else told[0].camera
+    text = (
+        f"the images of {of} were taken {abs(delay):.0f} ± {deviation:.0f} ms {_word(delay)} than stated, or the poses "
+        f"are of times that much {_word(-delay)}"
+    )
+    if interval_ms is None:
+        return text
+    return (
+        f"{text}, or the frames, one each {interval_ms:g} ms as stated, were not taken evenly: all of it explains this"
+    )
 
 
 def delay_text(estimate: CameraEstimate) -> str:
@@ -332,6 +356,7 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
+        interval_ms: between frames, if it is the same for all: such times are often nominal; None if it is not.
         rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
     """
 
@@ -342,6 +367,7 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
+    interval_ms: float | None = None
     rounds: int = 0
 
     def __getitem__(self, camera: str) -> CameraEstimate:
@@ -352,7 +378,7 @@ class CalibrationResult:
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
         table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
         measured = [MEASURED_MOTION.format(rounds=self.rounds)] if self.rounds else []
-        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras), *measured])
+        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras, self.interval_ms), *measured])
 
     def to_json(self) -> str:
         """The content of report.json."""
@@ -447,7 +473,13 @@ def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
             )
         ),
     )
-    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts)
+    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
+
+
+def _even_interval_ms(drive: Sequence) -> float | None:
+    """The time from each frame to the next one, if all are the same but for rounding; else None."""
+    steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps]) / 1e6
+    return float(np.median(steps)) if len(steps) and np.ptp(steps) < EVEN_MS else None
 
 
 def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:
@@ -549,18 +581,24 @@ def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
         result = calibrate(drive, pairs=SHORT_PAIRS)
     except InputError as error:
         return (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
-    return findings_of(result.cameras)
+    return findings_of(result.cameras, result.interval_ms)
 
 
-def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
-    """A finding for each camera that is corrected, and for each whose capture times are off."""
-    findings = []
+def findings_of(cameras: Items[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:
+    """A finding for each camera that is corrected, and for each whose capture times are off, or one for all.
+
+    interval_ms: see `CalibrationResult`.
+    """
+    findings, common = [], common_delay_text(cameras, interval_ms)
+    if common:
+        advice = "correct the timestamps of the images or those of the poses"
+        findings.append(Finding("capture-times-off", "warning", None, common, "", "", advice))
     for estimate in cameras:
         name = estimate.camera
         if estimate.verdict is Verdict.CORRECTED:
             message, advice = "does not fit how the vehicle moves", "measure it with `bevcli calibrate`"
             findings.append(Finding("calibration-off", "warning", name, message, change_text(estimate), "", advice))
-        if delay_text(estimate):
+        if delay_text(estimate) and not common:
             late = f"{estimate.delay_ms:+.0f} ms ± {estimate.delay_deviation_ms:.0f} ms"
             message, advice = "its images were taken at another time than stated", "correct its timestamps"
             findings.append(Finding("capture-times-off", "warning", name, message, late, "0 ms", advice))

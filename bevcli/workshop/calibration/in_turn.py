@@ -14,17 +14,21 @@ from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.options import gather
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import CalibrationResult, DriveWithRig, RigEstimate, calibrate
+from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, RigEstimate, calibrate
+from bevcli.workshop.odometry.run_option import with_measured_motion
 
 MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more
+MOTION_STEPS = 10  # of progress, in each round
+ALL_STEPS = MOST_ROUNDS * (MOTION_STEPS + STEPS)
+AfterStep = Callable[[int, int], None]  # steps that are done, and of how many
 
 
 def calibrate_in_turn(
     drive: Sequence,
-    with_motion: Callable[[Sequence], Sequence],
     options: CalibrateOptions | None = None,
     *,
+    with_motion: Callable[[Sequence, AfterStep], Sequence] | None = None,
     after_step: Callable[[], None] = lambda: None,
     **changes: Any,
 ) -> CalibrationResult:
@@ -32,19 +36,36 @@ def calibrate_in_turn(
 
     Args:
         drive: as in `calibrate`, but its poses are not used.
-        with_motion: the drive with the motion that its images show, for its rig.
         options, changes: see `CalibrateOptions`.
-        after_step: called STEPS times in each of at most MOST_ROUNDS rounds.
+        with_motion: the drive with the motion that its images show for its rig. Default: that of `bevcli odometry`.
+        after_step: called at most ALL_STEPS times; less often if fewer than MOST_ROUNDS rounds are needed.
 
-    Raises InputError as `calibrate` does.
+    Raises InputError as `calibrate` does, and where the motion cannot be measured.
     """
-    chosen, rig = gather(CalibrateOptions, options, changes), drive.rig
+    chosen, rig, measured = gather(CalibrateOptions, options, changes), drive.rig, with_motion or _with_motion
     rounds, still = 0, False
     while rounds < MOST_ROUNDS and not still:
-        moving = DriveWithRig(with_motion(DriveWithRig(drive, rig)), drive.rig)
-        result = calibrate(moving, chosen, after_step=after_step)
+        moving = measured(DriveWithRig(drive, rig), _in_parts(after_step))
+        result = calibrate(DriveWithRig(moving, drive.rig), chosen, after_step=after_step)
         rounds, still, rig = rounds + 1, stands_still(rig, result.rig), result.rig
     return replace(result, name=drive.name, whole=_without_scale(result, chosen), rounds=rounds)
+
+
+def _with_motion(drive: Sequence, after_step: AfterStep) -> Sequence:
+    return with_measured_motion(drive, drive, after_step)
+
+
+def _in_parts(after_step: Callable[[], None]) -> AfterStep:
+    """Calls `after_step` MOTION_STEPS times while a motion is measured."""
+    reached = 0
+
+    def advance(done: int, total: int) -> None:
+        nonlocal reached
+        for _ in range(MOTION_STEPS * done // max(total, 1) - reached):
+            after_step()
+            reached += 1
+
+    return advance
 
 
 def stands_still(before: CameraRig, after: CameraRig) -> bool:
