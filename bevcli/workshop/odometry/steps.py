@@ -13,6 +13,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.point_votes import point_votes, under_the_road, ways_of_points
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
@@ -37,7 +38,7 @@ WIDEST_RAD = np.radians(1.5)  # the same of the turn
 WAY_M = 3.5  # points of the road nearer to the way are preferred
 LEAST_M = 0.12  # of a start: without a way, points have no epipolar lines
 USUAL_M = 4.0  # distance at which directions are searched
-ROUGH_PX = 6.0  # of residuals while directions are searched
+ROUGH_PX, FINE_PX = 6.0, 0.4  # of residuals while directions are searched, at first and at last
 FASTEST, BACK = 45.0, 6.0  # m/s, of the distances that are tried
 MOST_M = (0.8, 0.25)  # between points of the road and where they are expected, pass by pass
 ROAD_PX = 60.0  # the same in one image, for a metre
@@ -189,9 +190,11 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
         squares = (values(unknowns, inside, np.zeros(COUNT)) ** 2).sum(-1)
         costs.append(float(np.log1p(squares / ROUGH_PX**2).sum()))
     best = starts[int(np.argmin(costs))]
-    for scale in (ROUGH_PX, 1.0):
+    for scale in (ROUGH_PX, 1.0, FINE_PX):
         unknowns = step.unknowns(best, guess.deviations(best, known_distance=True))
         best = best + solve(unknowns, [(inside, scale)], np.zeros(COUNT)).x[STATE]
+        if scale < ROUGH_PX:
+            inside = inside.where(~under_the_road(_ways(step, inside, best)))
     return best
 
 
@@ -207,8 +210,11 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
     seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
     cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
-    sense, roads = _sense(step, points, rough), (step.first.road(rough[SLOPES]), step.second.road(next_slopes(rough)))
+    sense, ways = _sense(step, points, rough), _ways(step, points, rough)
+    points = points.where(~under_the_road(ways))
+    roads = step.first.road(rough[SLOPES]), step.second.road(next_slopes(rough))
     distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
+    votes *= point_votes(ways, distances)
     votes[np.sign(distances) == -sense] = 0
     starts = []
     for index in _peaks(votes)[:CANDIDATES]:
@@ -230,6 +236,14 @@ def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
         return 0
     share = float((near > 0).all(-1).mean() - (near < 0).all(-1).mean())
     return int(np.sign(share) * np.sign(rough[3])) if abs(share) > CLEAR_SHARE else 0
+
+
+def _ways(step: StepViews, points: EpipolarResiduals, state: Array) -> Array:
+    """(n,) the ways with which matched points of single cameras lie on the road; NaN for those that tell none."""
+    unknowns = step.unknowns(state, np.ones(COUNT))
+    geometry = unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
+    ways = ways_of_points(points, geometry, float(np.hypot(*state[3:5])))
+    return np.where(np.equal(*step.pair(points.group)), ways, np.nan)
 
 
 def _peaks(votes: Array) -> list[int]:
@@ -255,7 +269,7 @@ def measured(
     deviations = guess.deviations(start)
     unknowns, x = step.unknowns(start, deviations), np.zeros(len(deviations))
     for most_m, most_px in zip(MOST_M, MOST_PX, strict=True):
-        fitting = _common(step, unknowns, points, x, most_px) if not guess.still else _still(step, points)
+        fitting = _still(step, points) if guess.still else _common(step, unknowns, points, x, most_px)
         road: GroundResiduals | RoadResiduals = _road_in_images(step, unknowns, x, ROAD_PX * most_m)
         if len(road.group) < FEWEST_OF_ROAD and roads is not None:
             road = _road(step, unknowns, x, roads, most_m)
