@@ -173,7 +173,7 @@ class Session:
                 does not move. Ego frame: x forward, y left, z up, origin on the ground under the rear axle.
                 None: it is measured from the images, which must be of one moment, and so are the kinematics. The world
                 frame is then the ego frame of the first frame. The step from the frame before is measured at once, and
-                again when the next frame is there: the history then has the better pose.
+                decided again by the next one: the history then has the better pose.
             timestamp_ns: the frame's time; later than that of the frame before.
             world_from_ego_at: camera -> the vehicle's pose when its image was taken. Default: `world_from_ego`.
             kinematics: acceleration, angular rate and velocity at the frame's time. Default: derived from the poses.
@@ -228,8 +228,12 @@ class Session:
             )
 
     def _measured(self, frame: Frame, kinematics: Kinematics | None) -> Frame:
-        """The frame with its measured pose. The history gets the pose of the frame before as it is known now."""
-        if self._meter is None:
+        """The frame with its measured pose. The history gets the pose of the frame before as it is known now.
+
+        After a gap that ends the history, the measurement begins anew.
+        """
+        gap_ns = 0 if self._last_ns is None else frame.stamp.timestamp_ns - self._last_ns
+        if self._meter is None or gap_ns > self._runner.config.max_gap_s * 1e9:
             self._meter = load("bevcli.motion", "live")()
         before, pose = self._meter.add(frame)
         if before is not None and self.frame is not None:

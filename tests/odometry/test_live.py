@@ -10,6 +10,7 @@ from memory_drive import MemorySequence
 
 import bevcli
 from bevcli.errors import InputError
+from bevcli.frame import StartReason
 from bevcli.geometry.ego_motion import RecentPoses
 from bevcli.geometry.transforms import Pose, inverse, rigid
 from bevcli.inference import run
@@ -113,6 +114,14 @@ def test_a_reset_begins_a_new_world(session):
     session.reset()
     session.step(images_of(drive.load(0)), None, 0)
     np.testing.assert_array_equal(session.frame.world_from_ego.matrix, np.eye(4))
+
+
+def test_a_gap_begins_a_new_world(session):
+    drive = MemorySequence(2)
+    for time in (0, 10**9, 60 * 10**9):
+        prediction = session.step(images_of(drive.load(0)), None, time)
+    assert prediction.started_anew.reason is StartReason.GAP
+    np.testing.assert_array_equal(prediction.world_from_ego.matrix, np.eye(4))
 
 
 def test_only_the_known_pose_of_a_memory_is_exchanged():

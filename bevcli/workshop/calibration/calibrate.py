@@ -6,7 +6,7 @@ from matched points and heights from the road; the verdicts. `motion_findings` i
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence as Items
+from collections.abc import Callable, Sequence as Items
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -45,9 +45,12 @@ HEADER = (
 )  # fmt: skip
 MEASURED_MOTION = (
     "the motion is measured from the images, in {rounds} rounds: height and scale cannot be told apart (a rig that is "
-    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean"
+    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean; nor can yaw and "
+    "direction, so yaw counts from its stated mean: all cameras are off by {yaw:+.2f}° ± {deviation:.2f}° more if the "
+    "vehicle drives along x"
 )
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
+EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
 TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
 MOST_DELAY_MS = 300.0  # a larger one is a rotation
 
@@ -125,17 +128,40 @@ class RigEstimate:
     tilt_deviation_deg: tuple[float, float]
 
 
-def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
-    """Lines about the whole rig, and about the capture times of its cameras."""
+def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate], interval_ms: float | None = None) -> str:
+    """Lines about the whole rig, and about the capture times of its cameras. interval_ms: see `CalibrationResult`."""
     pitch, roll = (f"{a:+.2f}° ± {d:.2f}°" for a, d in zip(whole.tilt_deg, whole.tilt_deviation_deg, strict=True))
     lines = [
         f"height of the rig over the road off by {_metres(whole.height_m, whole.height_deviation_m)}; "
         f"tilt of the ego frame: pitch {pitch}, roll {roll}",
         f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
     ]
-    for estimate in cameras:
-        lines += [f"time offset: {text}" for text in (delay_text(estimate), either_text(estimate)) if text]
-    return "\n".join(lines)
+    common = common_delay_text(cameras, interval_ms)
+    texts = [common] if common else [delay_text(estimate) for estimate in cameras]
+    texts += [either_text(estimate) for estimate in cameras]
+    return "\n".join([*lines, *(f"time offset: {text}" for text in texts if text)])
+
+
+def common_delay_text(cameras: Items[CameraEstimate], interval_ms: float | None) -> str:
+    """A time offset that is certain and the same for all cameras, in words; "" where there is none."""
+    told = [each for each in cameras if each.delay_deviation_ms <= TOLD_DELAY_MS]
+    if not told or len(told) < min(2, len(cameras)):
+        return ""
+    delays, deviations = np.array([(each.delay_ms, each.delay_deviation_ms) for each in told]).T
+    delay, deviation = float(np.average(delays, weights=1 / deviations**2)), float(deviations.min())
+    differ = np.abs(delays - delay) > CERTAIN_DELAY[0] * deviations
+    if differ.any() or abs(delay) < max(CERTAIN_DELAY[0] * deviation, CERTAIN_DELAY[1]):
+        return ""
+    of = "all cameras" if len(cameras) > 1 else told[0].camera
+    text = (
+        f"the images of {of} were taken {abs(delay):.0f} ± {deviation:.0f} ms {_word(delay)} than stated, or the poses "
+        f"are of times that much {_word(-delay)}"
+    )
+    if interval_ms is None:
+        return text
+    return (
+        f"{text}, or the frames, one each {interval_ms:g} ms as stated, were not taken evenly: all of it explains this"
+    )
 
 
 def delay_text(estimate: CameraEstimate) -> str:
@@ -312,6 +338,8 @@ def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) ->
 
 FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
+LEAST_TURNED_DEG = 20.0  # of the vehicle, see `_turned_deg`; points then tell a rotation about its way, too
+MOSTLY = 0.7  # cosine between an axis of a camera and the way
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
@@ -332,7 +360,9 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
+        interval_ms: between frames, if it is the same for all: such times are often nominal; None if it is not.
         rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
+        drives_beside_x_deg: direction of the measured motion, degrees to the left of x, and its deviation.
     """
 
     name: str
@@ -342,7 +372,9 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
+    interval_ms: float | None = None
     rounds: int = 0
+    drives_beside_x_deg: tuple[float, float] = (0.0, 0.0)
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(estimate for estimate in self.cameras if estimate.camera == camera)
@@ -351,8 +383,9 @@ class CalibrationResult:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
         table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
-        measured = [MEASURED_MOTION.format(rounds=self.rounds)] if self.rounds else []
-        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras), *measured])
+        yaw, deviation = self.drives_beside_x_deg
+        measured = [MEASURED_MOTION.format(rounds=self.rounds, yaw=yaw, deviation=deviation)] if self.rounds else []
+        return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras, self.interval_ms), *measured])
 
     def to_json(self) -> str:
         """The content of report.json."""
@@ -363,7 +396,7 @@ class CalibrationResult:
             "rig": asdict(self.whole),
         }
         if self.rounds:
-            content["rounds"] = self.rounds
+            content |= {"rounds": self.rounds, "drives_beside_x_deg": self.drives_beside_x_deg}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -447,7 +480,13 @@ def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
             )
         ),
     )
-    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts)
+    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
+
+
+def _even_interval_ms(drive: Sequence) -> float | None:
+    """The time from each frame to the next one, if all are the same but for rounding; else None."""
+    steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps]) / 1e6
+    return float(np.median(steps)) if len(steps) and np.ptp(steps) < EVEN_MS else None
 
 
 def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:
@@ -456,7 +495,8 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     deviations = np.sqrt(np.diag(covariance))
     mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
     count, pairs = int(mine.sum()), len(np.unique(groups[mine]))
-    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index])
+    turned_deg = _turned_deg(measurement.unknowns)
+    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index], turned_deg)
     enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
@@ -482,10 +522,16 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     )
 
 
-def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> str:
-    """Why a camera is not measurable; "" where it is. Of small images, with the size that would do."""
+def _reason(
+    matches: int, pairs: int, deviations_deg: Array, camera: Camera, turned_deg: float = LEAST_TURNED_DEG
+) -> str:
+    """Why a camera is not measurable, with the size of images or the drive that would do; "" where it is.
+
+    turned_deg: see `_turned_deg`.
+    """
     # Matches grow with the area of an image, deviations shrink with its width.
-    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), deviations_deg.max() / WIDEST_DEG)
+    widest = deviations_deg.max()
+    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
     width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
     height = round(camera.height * width / camera.width)
     stated = f"{camera.width} x {camera.height}"
@@ -494,9 +540,27 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
         return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:
         return f"matches in {pairs} frame pairs"
-    if deviations_deg.max() > WIDEST_DEG:
-        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only{size}"
-    return ""
+    if widest <= WIDEST_DEG:
+        return ""
+    shown = f"the drive shows its rotation to ±{widest:.1f}° only"
+    ahead = np.abs(camera.ego_from_camera[0, :3])  # the direction in which the vehicle drives, in the camera frame
+    if turned_deg < LEAST_TURNED_DEG and ahead[deviations_deg.argmax()] > MOSTLY:
+        return f"{shown}: the road shows too little, and the vehicle turns too little; a turn at a junction would do"
+    if wanted > WIDTH > camera.width:
+        left = widest * camera.width / WIDTH
+        size = f"; its images are {stated}: {width} x {height} would show about ±{left:.1f}°, and a longer drive less"
+    return f"{shown}{size}"
+
+
+def _turned_deg(unknowns: adjustment.Unknowns) -> float:
+    """The turns of the vehicle in all pairs, as the square root of their sum of squares.
+
+    The error of the stated rotation of a pair looks like a rotation of the camera by that error over the turn.
+    """
+    motion = solver.geometry_at(unknowns, np.zeros(len(unknowns.deviations))).ego_b_from_ego_a
+    turns = np.arctan2(motion[:, 1, 0], motion[:, 0, 0])
+    _, first = np.unique(unknowns.turns[unknowns.moves], return_index=True)
+    return float(np.degrees(np.linalg.norm(turns[unknowns.moves][first])))
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
@@ -549,18 +613,24 @@ def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
         result = calibrate(drive, pairs=SHORT_PAIRS)
     except InputError as error:
         return (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
-    return findings_of(result.cameras)
+    return findings_of(result.cameras, result.interval_ms)
 
 
-def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
-    """A finding for each camera that is corrected, and for each whose capture times are off."""
-    findings = []
+def findings_of(cameras: Items[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:
+    """A finding for each camera that is corrected, and for each whose capture times are off, or one for all.
+
+    interval_ms: see `CalibrationResult`.
+    """
+    findings, common = [], common_delay_text(cameras, interval_ms)
+    if common:
+        advice = "correct the timestamps of the images or those of the poses"
+        findings.append(Finding("capture-times-off", "warning", None, common, "", "", advice))
     for estimate in cameras:
         name = estimate.camera
         if estimate.verdict is Verdict.CORRECTED:
             message, advice = "does not fit how the vehicle moves", "measure it with `bevcli calibrate`"
             findings.append(Finding("calibration-off", "warning", name, message, change_text(estimate), "", advice))
-        if delay_text(estimate):
+        if delay_text(estimate) and not common:
             late = f"{estimate.delay_ms:+.0f} ms ± {estimate.delay_deviation_ms:.0f} ms"
             message, advice = "its images were taken at another time than stated", "correct its timestamps"
             findings.append(Finding("capture-times-off", "warning", name, message, late, "0 ms", advice))

@@ -4,6 +4,7 @@ And its short form, the check of `bevcli project-debug`.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +23,7 @@ PANEL = "Look"
 def calibrate(
     sequence: InputDrive,
     options: CalibrateOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
+    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "odometry", "allow_outside"))],
     format_options: FormatValues,
     output: CalibrateOutputOptions,
     as_json: Json = False,
@@ -31,18 +32,22 @@ def calibrate(
 
     Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
     fine, corrected, or not measurable. Writes calibration.json with the corrected rig and report.json with all numbers.
-    Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
+    Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig. With --odometry the
+    motion comes from the images, too: it and the calibration are measured in turn until both stand still.
     """
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
     from bevcli.workshop.calibration.calibrate import STEPS, calibrate as measure
+    from bevcli.workshop.calibration.in_turn import ALL_STEPS, calibrate_in_turn
     from bevcli.writing import check_output
 
-    drive = open_sequence(sequence, source, ego_motion="optional", ground_truth=False, **format_options)
+    steps, measure_it = (ALL_STEPS, calibrate_in_turn) if source.odometry else (STEPS, measure)
+    reading = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
+    drive = open_sequence(sequence, reading, ground_truth=False, **format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
-    with Progress(STEPS, "steps", drive.notes) as progress:
-        result = measure(drive, options, after_step=progress.advance)
+    with Progress(steps, "steps", drive.notes) as progress:
+        result = measure_it(drive, options, after_step=progress.advance)
     written = result.write(out)
     say(result.to_json() if as_json else as_flags(result.text()))
     say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -1,7 +1,7 @@
 """A calibration of a drive without poses: its motion and its calibration are measured in turn.
 
 The motion in metres follows from the stated heights of the cameras. So their mean stays as it is stated: a rig that is
-higher, on a vehicle that is faster, sees the same.
+higher, on a vehicle that is faster, sees the same. So does a rig that is turned, on a vehicle that drives sideways.
 """
 
 from collections.abc import Callable
@@ -12,19 +12,25 @@ import numpy as np
 
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import CalibrationResult, DriveWithRig, RigEstimate, calibrate
+from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, RigEstimate, calibrate
+from bevcli.workshop.odometry.run_option import with_measured_motion
 
 MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more
+LEAST_STEP_M, FEWEST_STEPS = 0.5, 4  # steps that tell the direction in which the vehicle drives
+MOTION_STEPS = 10  # of progress, in each round
+ALL_STEPS = MOST_ROUNDS * (MOTION_STEPS + STEPS)
+AfterStep = Callable[[int, int], None]  # steps that are done, and of how many
 
 
 def calibrate_in_turn(
     drive: Sequence,
-    with_motion: Callable[[Sequence], Sequence],
     options: CalibrateOptions | None = None,
     *,
+    with_motion: Callable[[Sequence, AfterStep], Sequence] | None = None,
     after_step: Callable[[], None] = lambda: None,
     **changes: Any,
 ) -> CalibrationResult:
@@ -32,19 +38,60 @@ def calibrate_in_turn(
 
     Args:
         drive: as in `calibrate`, but its poses are not used.
-        with_motion: the drive with the motion that its images show, for its rig.
         options, changes: see `CalibrateOptions`.
-        after_step: called STEPS times in each of at most MOST_ROUNDS rounds.
+        with_motion: the drive with the motion that its images show for its rig. Default: that of `bevcli odometry`.
+        after_step: called at most ALL_STEPS times; less often if fewer than MOST_ROUNDS rounds are needed.
 
-    Raises InputError as `calibrate` does.
+    Raises InputError as `calibrate` does, and where the motion cannot be measured.
     """
-    chosen, rig = gather(CalibrateOptions, options, changes), drive.rig
+    chosen, rig, measured = gather(CalibrateOptions, options, changes), drive.rig, with_motion or _with_motion
     rounds, still = 0, False
     while rounds < MOST_ROUNDS and not still:
-        moving = DriveWithRig(with_motion(DriveWithRig(drive, rig)), drive.rig)
-        result = calibrate(moving, chosen, after_step=after_step)
+        moving = measured(DriveWithRig(drive, rig), _in_parts(after_step))
+        result = calibrate(DriveWithRig(moving, drive.rig), chosen, after_step=after_step)
         rounds, still, rig = rounds + 1, stands_still(rig, result.rig), result.rig
-    return replace(result, name=drive.name, whole=_without_scale(result, chosen), rounds=rounds)
+    whole, motion, places = _without_scale(result, chosen), moving.ego_motion, range(len(moving.stamps))
+    poses = [
+        moving.load(k).world_from_ego if motion is None else motion.pose_at(moving.stamps[k].timestamp_ns)
+        for k in places
+    ]
+    beside = beside_x_deg(np.stack([pose.matrix for pose in poses]))
+    return replace(result, name=drive.name, whole=whole, rounds=rounds, drives_beside_x_deg=beside)
+
+
+def beside_x_deg(poses: Array) -> tuple[float, float]:
+    """The direction in which a vehicle drives, to the left of x of its ego frame, and its deviation; degrees.
+
+    poses: (F, 4, 4) world_from_ego. In a turn the direction depends on where the ego frame is, so it is that without.
+    """
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    steps = steps[np.hypot(steps[:, 0, 3], steps[:, 1, 3]) > LEAST_STEP_M]
+    if len(steps) < FEWEST_STEPS:
+        return 0.0, 180.0
+    turns = np.arctan2(steps[:, 1, 0], steps[:, 0, 0])
+    directions = np.arctan2(steps[:, 1, 3], steps[:, 0, 3])
+    columns = np.stack([np.ones(len(steps)), turns], axis=-1)
+    found, _, rank, _ = np.linalg.lstsq(columns, directions, rcond=None)
+    scatter = float(np.sum((directions - columns @ found) ** 2)) / (len(steps) - rank)
+    deviation = np.sqrt(scatter * np.linalg.pinv(columns.T @ columns)[0, 0])
+    return float(np.degrees(found[0])), float(np.degrees(deviation))
+
+
+def _with_motion(drive: Sequence, after_step: AfterStep) -> Sequence:
+    return with_measured_motion(drive, drive, after_step)
+
+
+def _in_parts(after_step: Callable[[], None]) -> AfterStep:
+    """Calls `after_step` MOTION_STEPS times while a motion is measured."""
+    reached = 0
+
+    def advance(done: int, total: int) -> None:
+        nonlocal reached
+        for _ in range(MOTION_STEPS * done // max(total, 1) - reached):
+            after_step()
+            reached += 1
+
+    return advance
 
 
 def stands_still(before: CameraRig, after: CameraRig) -> bool:

@@ -106,8 +106,8 @@ def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = 
 def _check(drive: Sequence) -> None:
     if not drive.has_ego_motion:
         raise InputError(
-            f"{drive.name}: has no ego-motion (expected the vehicle's poses): add it, since a calibration is measured "
-            "from motion"
+            f"{drive.name}: has no ego-motion (expected the vehicle's poses, since a calibration is measured from "
+            "motion): add it, or measure it from the images too: `odometry`"
         )
     if len(drive.stamps) < 2:
         raise InputError(f"{drive.name}: has one frame (expected {FEWEST_PAIRS + 1} or more): choose more frames")

@@ -39,6 +39,24 @@ class RoadPicture:
     slopes: Array  # (2,) of the road along x and y
 
 
+def nearest_cameras(cameras: Items[Camera], points: Array) -> tuple[list[NDArray[np.float32]], NDArray[np.int8], Array]:
+    """The cameras that see points (H, W, 3) of the road sharply, ego frame.
+
+    Returns the pixels (H, W, 2) of the points in each camera; the index (H, W) of the nearest one that sees them, -1
+    where none does; and the distance (H, W) to it.
+    """
+    maps, distances = [], []
+    for camera in cameras:
+        pixels, depth = camera.project_ego(points)
+        away = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=-1)
+        blur = away**2 / max(camera.ego_from_camera[2, 3] * camera.intrinsics[0, 0], 1e-3)
+        usable = camera.contains(pixels, depth) & (blur < MOST_BLUR_M)
+        distances.append(np.where(usable, away, np.inf))
+        maps.append(np.nan_to_num(pixels, nan=OUTSIDE).astype(np.float32))
+    nearest, distance = np.argmin(distances, axis=0), np.min(distances, axis=0)
+    return maps, np.where(np.isinf(distance), -1, nearest).astype(np.int8), distance
+
+
 class RoadGrid:
     """The cells of a road picture, of a road with slopes (2,) in the ego frame, in the images of a rig."""
 
@@ -47,17 +65,7 @@ class RoadGrid:
         rows, columns = np.indices(SHAPE)
         x, y = BEGIN_M[0] + CELL_M * columns, BEGIN_M[1] + CELL_M * rows
         points = np.stack([x, y, slopes[0] * x + slopes[1] * y], axis=-1)
-        self._maps, distances = [], []
-        for camera in cameras:
-            pixels, depth = camera.project_ego(points)
-            away = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=-1)
-            blur = away**2 / max(camera.ego_from_camera[2, 3] * camera.intrinsics[0, 0], 1e-3)
-            usable = camera.contains(pixels, depth) & (blur < MOST_BLUR_M)
-            distances.append(np.where(usable, away, np.inf))
-            self._maps.append(np.nan_to_num(pixels, nan=OUTSIDE).astype(np.float32))
-        nearest = np.argmin(distances, axis=0)
-        none = np.isinf(np.min(distances, axis=0))
-        self._of = np.where(none, -1, nearest).astype(np.int8)
+        self._maps, self._of, _ = nearest_cameras(cameras, points)
 
     def picture(self, images: Items[GreyImage | None]) -> RoadPicture:
         """The road in the images of a frame."""

@@ -17,9 +17,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bevcli.frame import DerivedSequence, Frame, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.road import sampled
+from bevcli.workshop.odometry.above import nearest_cameras
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg
 from bevcli.writing import whole_file
@@ -27,7 +28,6 @@ from bevcli.writing import whole_file
 Pixels = NDArray[np.uint8]
 CELL_M, REACH_M = 0.1, 15.0  # of the road around one frame
 SIDE = round(2 * REACH_M / CELL_M)  # pixels
-BLUR_M = 0.4  # ground that a pixel covers: cells that a camera sees less sharply are left out
 BODY_M = (-1.2, 4.2, 1.1)  # of the vehicle: back and front, and half its width, from the origin of the ego frame
 MOST_PIXELS = 1600  # of a side of the stitched road
 SHOWN_WIDTH, MOST_SHOWN = 320, 100  # of images in the recording: pixels, and frames
@@ -43,19 +43,13 @@ class GroundView:
     """
 
     def __init__(self, rig: CameraRig) -> None:
-        self.rig = rig
-        shape = SIDE, SIDE
-        self._camera, self._pixels = np.full(shape, -1), np.zeros((*shape, 2), np.float32)
-        nearest = np.full(shape, np.inf)
-        cells = ground_cells()
+        self.rig, cells = rig, ground_cells()
+        self._pixels, self._camera, distance = nearest_cameras(rig.cameras, cells)
         back, front, half = BODY_M
         body = (cells[..., 0] > back) & (cells[..., 0] < front) & (np.abs(cells[..., 1]) < half)
-        for index, camera in enumerate(rig.cameras):
-            pixels, distance = _seen_from(camera, cells)
-            closer = (distance < nearest) & ~body
-            self._camera[closer], self._pixels[closer], nearest[closer] = index, pixels[closer], distance[closer]
-        seen = cv2.erode(np.isfinite(nearest).astype(np.float32), np.ones((5, 5)))  # an edge mixes with black
-        self.weight = np.asarray(seen / (1 + nearest), dtype=np.float32)
+        self._camera[body | (distance > REACH_M)] = -1
+        seen = cv2.erode((self._camera >= 0).astype(np.float32), np.ones((5, 5)))  # an edge mixes with black
+        self.weight = np.asarray(seen / (1 + distance), dtype=np.float32)
 
     def of(self, frame: Frame) -> Pixels:
         """(SIDE, SIDE, 3) BGR, the road around the vehicle; ahead is up. Black where no image shows it."""
@@ -63,7 +57,7 @@ class GroundView:
         for index, name in enumerate(self.rig.names):
             mine = self._camera == index
             if name in frame.images and mine.any():
-                road[mine] = sampled(frame.images[name].pixels_bgr, self._pixels)[mine]
+                road[mine] = sampled(frame.images[name].pixels_bgr, self._pixels[index])[mine]
         return road
 
 
@@ -71,16 +65,6 @@ def ground_cells() -> Array:
     """(SIDE, SIDE, 3) centres of the cells on the ground, ego frame: the first row is farthest ahead, left first."""
     along = REACH_M - CELL_M * (np.arange(SIDE) + 0.5)
     return np.stack([*np.meshgrid(along, along, indexing="ij"), np.zeros((SIDE, SIDE))], axis=-1)
-
-
-def _seen_from(camera: Camera, cells: Array) -> tuple[Array, Array]:
-    """Pixels (SIDE, SIDE, 2) of the cells, and their distances to the camera; infinite where it does not see them."""
-    pixels, depth = camera.project_ego(cells)
-    offset = cells - camera.ego_from_camera[:3, 3]
-    distance = np.linalg.norm(offset, axis=-1)
-    blur = distance**2 / (np.abs(offset[..., 2]) * camera.intrinsics[0, 0])
-    sharp = camera.contains(pixels, depth) & (blur < BLUR_M) & (distance < REACH_M)
-    return pixels, np.where(sharp, distance, np.inf)
 
 
 def _small(image: Pixels) -> bytes:

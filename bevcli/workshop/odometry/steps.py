@@ -30,14 +30,12 @@ from bevcli.workshop.odometry.unknowns import (
 
 YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
-STILL_PX, STILL_SHARE = 0.6, 0.7  # of matched points of a vehicle that stands
+STILL_PX, STILL_SHARE = 0.35, 0.85  # of matched points of a vehicle that stands
 STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
 CLEAR_M, CLEAR_SHARE = 60.0, 0.4  # of points that tell whether the vehicle drives backwards
-WIDEST_M, WIDEST, WIDEST_RAD = (
-    0.15,
-    0.1,
-    np.radians(1.5),
-)  # deviations of what counts as measured: way, share of it, turn
+WIDEST_M, WIDEST = 0.3, 0.3  # deviation of the way of a step that counts as measured, and as a share of the way
+WIDEST_RAD = np.radians(1.5)  # the same of the turn
+LEAST_M = 0.12  # of a start: without a way, points have no epipolar lines
 USUAL_M = 4.0  # distance at which directions are searched
 ROUGH_PX, FINE_PX = 6.0, 0.4  # of residuals while directions are searched, at first and at last
 FASTEST, BACK = 45.0, 6.0  # m/s, of the distances that are tried
@@ -226,7 +224,8 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     starts = []
     for index in _peaks(votes)[:CANDIDATES]:
         start = tried.copy()
-        start[3:5] = distances[index] * np.array([np.cos(heading), np.sin(heading)])
+        distance = max(abs(distances[index]), LEAST_M) * (sense or np.sign(distances[index]) or 1)
+        start[3:5] = distance * np.array([np.cos(heading), np.sin(heading)])
         starts.append((start, float(votes[index])))
     # Without road, two cameras may still tell the distance.
     return [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
@@ -343,7 +342,7 @@ def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: 
         a, b = step.first.images[index], step.second.images[index]
         if a is not None and b is not None:
             group = (index * step.cameras + index) * PARTS
-            parts.append(road_points(camera, (a.texture, b.texture), geometry, group, most_px))
+            parts.append(road_points(camera, (a.pixels, b.pixels), geometry, group, most_px, grey=True))
             groups.append(step.group(index, index, parts[-1].rays_a))
     columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
     return _sorted(RoadResiduals(np.concatenate(groups), *columns))
