@@ -193,7 +193,8 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
     best = starts[int(np.argmin(costs))]
     for scale in (ROUGH_PX, 1.0, FINE_PX):
         unknowns = step.unknowns(best, guess.deviations(best, known_distance=True))
-        best = best + solve(unknowns, [(inside, scale)], np.zeros(COUNT)).x[STATE]
+        seen_px = np.minimum(spread(unknowns, inside, np.zeros(COUNT), 0 * inside.group), ROUGH_PX)
+        best = best + solve(unknowns, [(inside, np.maximum(scale, seen_px))], np.zeros(COUNT)).x[STATE]
         if scale < ROUGH_PX:
             inside = inside.where(~under_the_road(_ways(step, inside, best)))
     return best
