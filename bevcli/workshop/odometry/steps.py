@@ -27,10 +27,10 @@ from bevcli.workshop.odometry.unknowns import (
     deviations_at,
     next_slopes,
 )
+from bevcli.workshop.odometry.unmoved import stands
 
 YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
-STILL_PX, STILL_SHARE = 0.35, 0.85  # of matched points of a vehicle that stands
 STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
 CLEAR_M, CLEAR_SHARE = 60.0, 0.4  # of points that tell whether the vehicle drives backwards
 WIDEST_M, WIDEST = 0.3, 0.3  # deviation of the way of a step that counts as measured, and as a share of the way
@@ -49,6 +49,7 @@ CANDIDATES = 3  # distances of a step that are measured
 LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
 APART_M = 0.4  # between them
 FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
+STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
 
@@ -172,10 +173,10 @@ class Guess:
 
 
 def is_still(step: StepViews, points: EpipolarResiduals) -> bool:
-    """True where most points of single cameras stay where they are in the image."""
-    inside = points.where(np.equal(*step.pair(points.group)))
-    moved = np.linalg.norm(inside.rays_a - inside.rays_b, axis=-1) * inside.focal
-    return len(moved) >= FEWEST and bool((moved < STILL_PX).mean() > STILL_SHARE)
+    """True where the matched points of single cameras stay where they are in the image."""
+    inside = _still(step, points)
+    poses = np.stack([camera.ego_from_camera for camera in step.first.cameras])
+    return stands(inside, poses[step.pair(inside.group)[0]])
 
 
 def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array:
@@ -192,7 +193,8 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
     best = starts[int(np.argmin(costs))]
     for scale in (ROUGH_PX, 1.0, FINE_PX):
         unknowns = step.unknowns(best, guess.deviations(best, known_distance=True))
-        best = best + solve(unknowns, [(inside, scale)], np.zeros(COUNT)).x[STATE]
+        seen_px = np.minimum(spread(unknowns, inside, np.zeros(COUNT), 0 * inside.group), ROUGH_PX)
+        best = best + solve(unknowns, [(inside, np.maximum(scale, seen_px))], np.zeros(COUNT)).x[STATE]
         if scale < ROUGH_PX:
             inside = inside.where(~under_the_road(_ways(step, inside, best)))
     return best
@@ -279,7 +281,8 @@ def measured(
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
     covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + FLOOR
+    floor = STILL_FLOOR if guess.still else FLOOR
+    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + floor
     kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
     seen = seen_points(step.second.cameras, *kinds)
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
