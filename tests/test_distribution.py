@@ -36,7 +36,22 @@ DATA = re.compile(
     r"bevcli/(py\.typed|configs/[\w-]+\.toml|weights/(demo\.safetensors|sources\.toml)"
     r"|samples/(street/.*|first_steps\.ipynb))"
 )
+TEST_PROGRAMS = ("pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support")
 EXTRAS = "ros,video,onnx,openvino,tensorboard,ray,hub"
+# These tests run with the lowest versions, too. They use OpenCV, numba, PyTorch, SciPy, Shapely, trimesh, rerun, mcap,
+# rosbags, protobuf, PyAV, ONNX and its runtime, OpenVINO and pycurl.
+WITH_LOWEST = (
+    "geometry/test_cameras.py",
+    "model/test_deformable_attention_backends.py",
+    "inference/test_tracking.py",
+    "sequences/test_map_expansion.py",
+    "recording/test_vehicle.py",
+    "recording/test_write_mcap.py",
+    "recording/test_video_images.py",
+    "sequences/test_ros.py",
+    "engines/test_engines.py",
+    "weights/test_fetch.py",
+)
 PROGRAM = """
 import bevcli
 
@@ -144,8 +159,8 @@ class Environment:
     name: str
     folder: Path
 
-    def python(self, *arguments: object) -> subprocess.CompletedProcess:
-        return ran(self.folder / "bin/python", *arguments, folder=self.folder / "work")
+    def python(self, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess:
+        return ran(self.folder / "bin/python", *arguments, folder=folder or self.folder / "work")
 
     def pip(self, *arguments: object) -> subprocess.CompletedProcess:
         return ran(sys.executable, "-m", "pip", "--python", self.folder / "bin/python", *arguments)
@@ -175,7 +190,9 @@ def installed(
     else:
         pins = environment.folder / "lowest.txt"
         pins.write_text("\n".join(lowest(metadata)))
-        done = environment.pip("install", "--no-compile", "--constraint", pins, f"bevcli[{EXTRAS}] @ {wheel.as_uri()}")
+        done = environment.pip(
+            "install", "--no-compile", "--constraint", pins, f"bevcli[{EXTRAS}] @ {wheel.as_uri()}", *TEST_PROGRAMS
+        )
         if NO_INDEX.search(done.stderr):
             pytest.skip("no package index can be reached")
     assert done.returncode == 0, done.stderr
@@ -221,3 +238,22 @@ def test_programs_that_use_the_wheel_are_type_checked(installed: Environment):
     errors = [line for line in done.stdout.splitlines() if ": error:" in line]
     assert len(errors) == 1, done.stdout
     assert errors[0].startswith('program.py:8: error: Argument 1 to "open_sequence"')
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_extras_are_added_to_the_installed_wheel(installed: Environment):
+    """`pip install 'bevcli[ros]'` works where bevcli is on no index, but installed."""
+    done = installed.pip("install", "--no-index", "--dry-run", "bevcli[ros]")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_lowest_versions_pass_tests(installed: Environment):
+    if installed.name != "lowest":
+        pytest.skip("the versions of here: all other tests")
+    tests = [ROOT / "tests" / name for name in WITH_LOWEST]
+    options = ("-p", "no:cacheprovider", "-m", "not slow and not gpu", "--maxfail", "5")
+    done = installed.python("-P", "-m", "pytest", *options, *tests, folder=ROOT)
+    assert done.returncode == 0, done.stdout[-4000:]

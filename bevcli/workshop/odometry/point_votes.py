@@ -12,7 +12,7 @@ from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeo
 
 LEAST_PX = 1.5  # of the way in the image that is due to driving, without the turn
 LEAST_DOWN = 0.03  # sine of the angle below the horizon
-FEWEST = 15  # points
+FEWEST, FEWEST_FOR_ALL = 15, 30  # points that vote for a way, and that tell which of them drive by themselves
 WIDTH = 0.12  # deviation of the logarithm of a point's way
 CHANCE = 0.15  # of the votes that a distance has without such a point
 UNDER = 0.7  # of the way of most points
@@ -47,7 +47,7 @@ def point_votes(ways: Array, distances: Array) -> Array:
 def under_the_road(ways: Array) -> NDArray[np.bool_]:
     """(n,) True for points that would lie deep under the road: they belong to vehicles that drive ahead."""
     told = ways[np.isfinite(ways)]
-    if len(told) < FEWEST:
+    if len(told) < FEWEST_FOR_ALL:
         return np.zeros(len(ways), dtype=bool)
     return np.nan_to_num(ways, nan=np.inf) < UNDER * told[int(np.argmax(_shares(told, told)))]
 
