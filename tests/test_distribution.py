@@ -1,7 +1,9 @@
 """The distributions: two builds are equal, the index page leads to files, the installed wheel works without a clone.
 
-The wheel is installed into an environment that does not see the clone. bevcli comes from the wheel, its dependencies
-from the environment of the tests, which a .pth file names: so it takes seconds and no network.
+The wheel is installed into two environments:
+
+- "as here": bevcli comes from the wheel, its dependencies from the environment of the tests (a .pth file names it).
+- "lowest": everything comes from the index, in the lowest versions that the wheel allows. Skipped without an index.
 """
 
 import os
@@ -12,6 +14,7 @@ import sys
 import sysconfig
 import tarfile
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from email import message_from_bytes
 from email.message import Message
@@ -27,10 +30,27 @@ import bevcli
 ROOT = Path(__file__).parents[1]
 TOOLS = ("git", "pyproject-build", "twine", "check-wheel-contents")
 PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+NO_INDEX = re.compile(r"NewConnectionError|NameResolutionError|\(from versions: none\)")
 # Files of the package that are no code. NOTICE states where each comes from.
 DATA = re.compile(
     r"bevcli/(py\.typed|configs/[\w-]+\.toml|weights/(demo\.safetensors|sources\.toml)"
     r"|samples/(street/.*|first_steps\.ipynb))"
+)
+TEST_PROGRAMS = ("pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support")
+EXTRAS = "ros,video,onnx,openvino,tensorboard,ray,hub"
+# These tests run with the lowest versions, too. They use OpenCV, numba, PyTorch, SciPy, Shapely, trimesh, rerun, mcap,
+# rosbags, protobuf, PyAV, ONNX and its runtime, OpenVINO and pycurl.
+WITH_LOWEST = (
+    "geometry/test_cameras.py",
+    "model/test_deformable_attention_backends.py",
+    "inference/test_tracking.py",
+    "sequences/test_map_expansion.py",
+    "recording/test_vehicle.py",
+    "recording/test_write_mcap.py",
+    "recording/test_video_images.py",
+    "sequences/test_ros.py",
+    "engines/test_engines.py",
+    "weights/test_fetch.py",
 )
 PROGRAM = """
 import bevcli
@@ -136,28 +156,52 @@ def test_the_index_page_leads_to_files_of_the_release(metadata: Message):
 class Environment:
     """A virtual environment with the wheel, and an empty folder to work in; neither sees the clone."""
 
+    name: str
     folder: Path
 
-    def python(self, *arguments: object) -> subprocess.CompletedProcess:
-        return ran(self.folder / "bin/python", *arguments, folder=self.folder / "work")
+    def python(self, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess:
+        return ran(self.folder / "bin/python", *arguments, folder=folder or self.folder / "work")
+
+    def pip(self, *arguments: object) -> subprocess.CompletedProcess:
+        return ran(sys.executable, "-m", "pip", "--python", self.folder / "bin/python", *arguments)
 
     def bevcli(self, *arguments: object) -> subprocess.CompletedProcess:
         return self.python(self.folder / "bin/bevcli", *arguments)
 
 
-@pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
-    environment = Environment(tmp_path_factory.mktemp("environment"))
+def lowest(metadata: Message) -> list[str]:
+    """The lowest versions that the distribution allows of all that it may need, as pins of pip."""
+    needs = [re.match(r"([\w.-]+)(?:\[.*?\])?(?:>=|~=)([\w.]+)", need) for need in metadata.get_all("Requires-Dist")]
+    assert all(needs)
+    return sorted({f"{need[1]}=={need[2]}" for need in needs})
+
+
+@pytest.fixture(scope="module", params=["as here", "lowest"])
+def installed(
+    request: pytest.FixtureRequest, wheel: Path, metadata: Message, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Environment]:
+    environment = Environment(request.param, tmp_path_factory.mktemp("environment"))
     (environment.folder / "work").mkdir()
-    ran(sys.executable, "-m", "venv", environment.folder)
-    there = environment.python("-c", "import sysconfig; print(sysconfig.get_path('purelib'))").stdout.strip()
-    Path(there, "dependencies.pth").write_text(sysconfig.get_path("purelib"))
-    done = environment.python("-m", "pip", "install", "--no-index", "--no-deps", wheel)
+    ran(sys.executable, "-m", "venv", "--without-pip", environment.folder)
+    if environment.name == "as here":
+        there = environment.python("-c", "import sysconfig; print(sysconfig.get_path('purelib'))").stdout.strip()
+        Path(there, "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+        done = environment.pip("install", "--no-index", "--no-deps", wheel)
+    else:
+        pins = environment.folder / "lowest.txt"
+        pins.write_text("\n".join(lowest(metadata)))
+        done = environment.pip(
+            "install", "--no-compile", "--constraint", pins, f"bevcli[{EXTRAS}] @ {wheel.as_uri()}", *TEST_PROGRAMS
+        )
+        if NO_INDEX.search(done.stderr):
+            pytest.skip("no package index can be reached")
     assert done.returncode == 0, done.stderr
-    return environment
+    yield environment
+    shutil.rmtree(environment.folder)  # with PyTorch for CUDA it has 7 GB
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_the_wheel_runs_without_the_clone(installed: Environment):
     found = installed.python("-c", "import bevcli; print(bevcli.__file__, bevcli.__version__)").stdout.split()
     assert Path(found[0]).is_relative_to(installed.folder)
@@ -174,6 +218,7 @@ def test_the_wheel_runs_without_the_clone(installed: Environment):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_the_viewer_of_the_wheel_draws_a_recording(installed: Environment):
     done = installed.bevcli("viz", "runs/first", "--screenshot", "image.png")
     if NO_DRIVER in " ".join(done.stderr.split()):
@@ -183,6 +228,7 @@ def test_the_viewer_of_the_wheel_draws_a_recording(installed: Environment):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_programs_that_use_the_wheel_are_type_checked(installed: Environment):
     pytest.importorskip("mypy")
     (installed.folder / "work/program.py").write_text(PROGRAM)
@@ -192,3 +238,22 @@ def test_programs_that_use_the_wheel_are_type_checked(installed: Environment):
     errors = [line for line in done.stdout.splitlines() if ": error:" in line]
     assert len(errors) == 1, done.stdout
     assert errors[0].startswith('program.py:8: error: Argument 1 to "open_sequence"')
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_extras_are_added_to_the_installed_wheel(installed: Environment):
+    """`pip install 'bevcli[ros]'` works where bevcli is on no index, but installed."""
+    done = installed.pip("install", "--no-index", "--dry-run", "bevcli[ros]")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_lowest_versions_pass_tests(installed: Environment):
+    if installed.name != "lowest":
+        pytest.skip("the versions of here: all other tests")
+    tests = [ROOT / "tests" / name for name in WITH_LOWEST]
+    options = ("-p", "no:cacheprovider", "-m", "not slow and not gpu", "--maxfail", "5")
+    done = installed.python("-P", "-m", "pytest", *options, *tests, folder=ROOT)
+    assert done.returncode == 0, done.stdout[-4000:]

@@ -16,6 +16,7 @@ import bevcli
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
+from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 from bevcli.workshop.calibration import calibrate as calibrating, in_turn
 from bevcli.workshop.calibration.calibrate import CorrectedDrive, Verdict, common_delay_text, either_text, findings_of
@@ -263,6 +264,21 @@ def test_motion_and_calibration_are_measured_until_both_stand(result, street, mo
     assert '"rounds": 3' in found.to_json()
 
 
+def test_a_rig_that_is_turned_drives_beside_x():
+    """On circles of all radii, with the ego frame ahead of the axle that does not slip."""
+    pose, poses = np.eye(4), []
+    turned = rigid((0.9, 0, 0), rotation_about_z(np.radians(-1.5)))
+    for bend in (0.0, 0.02, -0.05, 0.04, 0.0, 0.01):
+        poses.append(pose @ turned)
+        angle = 2.0 * bend
+        arc = (2.0, 0, 0) if not bend else (np.sin(angle) / bend, (1 - np.cos(angle)) / bend, 0)
+        pose = pose @ rigid(arc, rotation_about_z(angle))
+    beside, deviation = in_turn.beside_x_deg(np.stack([*poses, pose @ turned]))
+    assert beside == pytest.approx(1.5, abs=0.02)
+    assert deviation < 0.05
+    assert in_turn.beside_x_deg(np.stack([np.eye(4)] * 9)) == (0.0, 180.0)
+
+
 def delayed(estimate, delay_ms, deviation_ms=4.0):
     return replace(estimate, delay_ms=delay_ms, delay_deviation_ms=deviation_ms)
 
@@ -315,3 +331,20 @@ def test_small_images_name_the_size_that_would_do(matches, deviation_deg, said):
     assert calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), camera) == said
     large = make_camera("CAM_FRONT", 0.0, 1600, 900)
     assert "would do" not in calibrating._reason(matches, 8, np.array([deviation_deg, 0.1, 0.1]), large)
+
+
+def test_a_rotation_about_the_way_asks_for_a_turn():
+    """Larger images do not show it: points that move along the way look the same from a camera that is rolled."""
+    camera = make_camera("CAM_FRONT", 0.0, 160, 90)
+    rolled, pitched = np.array([0.1, 0.1, 0.9]), np.array([0.9, 0.1, 0.1])
+    asked = "the road shows too little, and the vehicle turns too little; a turn at a junction would do"
+    assert calibrating._reason(500, 8, rolled, camera, 2.0) == f"the drive shows its rotation to ±0.9° only: {asked}"
+    assert "junction" not in calibrating._reason(500, 8, rolled, camera, 40.0)
+    assert "junction" not in calibrating._reason(500, 8, pitched, camera, 2.0)
+    beside = make_camera("CAM_LEFT", 90.0, 160, 90)  # its right axis points along the way
+    assert "junction" in calibrating._reason(500, 8, pitched, beside, 2.0)
+
+
+def test_images_of_any_size_may_not_do():
+    said = calibrating._reason(500, 8, np.array([0.1, 3.0, 0.1]), make_camera("CAM_FRONT", 0.0, 160, 90))
+    assert said.endswith("its images are 160 x 90: 1000 x 562 would show about ±0.5°, and a longer drive less")

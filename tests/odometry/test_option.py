@@ -21,7 +21,7 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.batch.job import Job
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredDrive
-from bevcli.workshop.odometry.run_option import MOST_RATE_HZ, at_most_rate, frames_between
+from bevcli.workshop.odometry.run_option import MOST_RATE_HZ, at_most_rate, with_measured_motion
 
 FRAMES = 4
 
@@ -101,10 +101,15 @@ def test_a_fast_drive_is_thinned(folder):
     assert at_most_rate(slow) is slow
 
 
-def test_several_scenes_are_refused():
-    drive = MemorySequence(4, scenes="aabb")
-    with pytest.raises(InputError, match="memory: has 2 scenes"):
-        frames_between(drive, drive)
+def test_scenes_have_motions_of_their_own(monkeypatch):
+    drive = MemorySequence(5, scenes="aabbb")
+    monkeypatch.setattr(measure, "measure_motion", lambda scene, after_step: motion_of(scene))
+    found = with_measured_motion(drive, drive)
+    assert found.has_ego_motion
+    assert len(found.notes) == 2
+    for place, first in ((0, 0), (1, 0), (2, 2), (4, 2)):
+        expected = inverse(drive.load(first).world_from_ego.matrix) @ drive.load(place).world_from_ego.matrix
+        assert found.load(place).world_from_ego.matrix == pytest.approx(expected, abs=1e-6)
 
 
 def test_static_and_odometry_exclude_each_other():
@@ -138,6 +143,13 @@ def test_a_conversion_writes_the_measured_poses(folder, tmp_path, measuring, tru
     again = bevcli.open_sequence(tmp_path / "out")
     assert again.load(3).world_from_ego.matrix == pytest.approx(true_motion.poses[3], abs=1e-6)
     assert len(again.load(0).ground_truth) == len(bevcli.open_sequence(STREET).load(0).ground_truth)
+
+
+def test_a_drive_is_shown_with_measured_poses(folder, tmp_path, measuring):
+    done = command(tmp_path, "viz", str(folder), "--odometry", "--frames", "0:2", "--out", "drive.rrd")
+    assert done.returncode == 0, done.stderr
+    assert "1/1 steps of the ego-motion" in done.stderr
+    assert (tmp_path / "drive.rrd").exists()
 
 
 def test_a_drive_of_a_batch_is_measured(folder, measuring):

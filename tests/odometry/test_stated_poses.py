@@ -69,6 +69,13 @@ def test_two_mistakes_have_two_findings():
     assert [finding.code for finding in findings] == ["motion-angles", "motion-scale"]
 
 
+def test_poses_of_the_frames_alone_show_another_time():
+    rows = np.arange(FIRST, FIRST + EVERY * FRAMES, EVERY)
+    (finding,) = compare(planar(POSITIONS[rows], YAWS[rows], TIMES[rows] + 500_000_000), SHOWN)
+    assert finding.code == "motion-time"
+    assert re.search(r"are (49|50)\d ", finding.found)
+
+
 def test_images_that_stand_still_are_told():
     shown = measured(TIMES, 0 * POSITIONS, 0 * YAWS)
     (finding,) = compare(stated(), shown)

@@ -1,5 +1,8 @@
 """The whole way on the sample drive without its poses, with the measurement itself."""
 
+import contextlib
+import re
+
 import pytest
 from command_line import command
 from true_motion import STREET, motion_of, street_copy
@@ -7,6 +10,7 @@ from true_motion import STREET, motion_of, street_copy
 import bevcli
 
 FRAMES = 5
+ROOT = STREET.parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +45,10 @@ def test_a_stopped_run_goes_on_to_the_same_boxes(folder, tmp_path):
     bevcli.run_into_folder(model, drives[1], tmp_path / "cut", resume=True)
     whole, cut = ((tmp_path / name / "predictions.json").read_bytes() for name in ("whole", "cut"))
     assert whole == cut
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_runs():
+    [example] = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/odometry.md").read_text(), re.MULTILINE | re.DOTALL)
+    with contextlib.chdir(ROOT):
+        exec(example, {})

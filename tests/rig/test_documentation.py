@@ -105,7 +105,8 @@ def motion_codes():
         "CAM_FRONT", Verdict.CORRECTED, "", (2, 0, 0), (0.1, 0.1, 0.1), (0, 0, 0), (0.1, 0.1, 0.1), 100, 5,
         500, 500, 9, 1, np.zeros(6), np.eye(6),
     )  # fmt: skip
-    of_poses = [finding for poses, *_ in MISTAKES.values() for finding in compare(poses, SHOWN)]
+    wrong = {code: poses for poses, code, *_ in MISTAKES.values()}
+    of_poses = [finding for poses in wrong.values() for finding in compare(poses, SHOWN)]
     of_calibration = (*findings_of([late]), *motion_findings(MemorySequence(count=1)))
     return {finding.code for finding in (*of_calibration, *of_poses, not_compared(""))}
 

@@ -44,8 +44,10 @@ HEADER = (
     "camera", "yaw off by", "pitch", "roll", "x off by", "y", "z", "matches", "residual px", "verdict",
 )  # fmt: skip
 MEASURED_MOTION = (
-    "the motion is measured from the images, in {rounds} rounds: height and scale cannot be told apart (a rig that is "
-    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean"
+    "the motion is measured from the images (rounds: {rounds}): height and scale cannot be told apart (a rig that is "
+    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean; nor can yaw and "
+    "direction, so yaw counts from its stated mean: all cameras are off by {yaw:+.2f}° ± {deviation:.2f}° more if the "
+    "vehicle drives along x"
 )
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
 EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
@@ -336,6 +338,8 @@ def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) ->
 
 FEWEST_MATCHES = 100  # of a camera
 WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
+LEAST_TURNED_DEG = 20.0  # of the vehicle, see `_turned_deg`; points then tell a rotation about its way, too
+MOSTLY = 0.7  # cosine between an axis of a camera and the way
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
@@ -358,6 +362,7 @@ class CalibrationResult:
         facts: of the drive, for calibration.json.
         interval_ms: between frames, if it is the same for all: such times are often nominal; None if it is not.
         rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
+        drives_beside_x_deg: direction of the measured motion, degrees to the left of x, and its deviation.
     """
 
     name: str
@@ -369,6 +374,7 @@ class CalibrationResult:
     facts: DriveFacts
     interval_ms: float | None = None
     rounds: int = 0
+    drives_beside_x_deg: tuple[float, float] = (0.0, 0.0)
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(estimate for estimate in self.cameras if estimate.camera == camera)
@@ -377,7 +383,8 @@ class CalibrationResult:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
         table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
-        measured = [MEASURED_MOTION.format(rounds=self.rounds)] if self.rounds else []
+        yaw, deviation = self.drives_beside_x_deg
+        measured = [MEASURED_MOTION.format(rounds=self.rounds, yaw=yaw, deviation=deviation)] if self.rounds else []
         return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras, self.interval_ms), *measured])
 
     def to_json(self) -> str:
@@ -389,7 +396,7 @@ class CalibrationResult:
             "rig": asdict(self.whole),
         }
         if self.rounds:
-            content["rounds"] = self.rounds
+            content |= {"rounds": self.rounds, "drives_beside_x_deg": self.drives_beside_x_deg}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -488,7 +495,8 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     deviations = np.sqrt(np.diag(covariance))
     mine = (measurement.unknowns.groups[groups, 1:] == index).all(-1)
     count, pairs = int(mine.sum()), len(np.unique(groups[mine]))
-    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index])
+    turned_deg = _turned_deg(measurement.unknowns)
+    reason = _reason(count, pairs, np.degrees(deviations[:3]), views.stated.cameras[index], turned_deg)
     enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
@@ -514,10 +522,16 @@ def _estimate(index: int, measurement: Measurement, change: Array, covariance: A
     )
 
 
-def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> str:
-    """Why a camera is not measurable; "" where it is. Of small images, with the size that would do."""
+def _reason(
+    matches: int, pairs: int, deviations_deg: Array, camera: Camera, turned_deg: float = LEAST_TURNED_DEG
+) -> str:
+    """Why a camera is not measurable, with the size of images or the drive that would do; "" where it is.
+
+    turned_deg: see `_turned_deg`.
+    """
     # Matches grow with the area of an image, deviations shrink with its width.
-    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), deviations_deg.max() / WIDEST_DEG)
+    widest = deviations_deg.max()
+    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
     width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
     height = round(camera.height * width / camera.width)
     stated = f"{camera.width} x {camera.height}"
@@ -526,9 +540,27 @@ def _reason(matches: int, pairs: int, deviations_deg: Array, camera: Camera) -> 
         return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:
         return f"matches in {pairs} frame pairs"
-    if deviations_deg.max() > WIDEST_DEG:
-        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only{size}"
-    return ""
+    if widest <= WIDEST_DEG:
+        return ""
+    shown = f"the drive shows its rotation to ±{widest:.1f}° only"
+    ahead = np.abs(camera.ego_from_camera[0, :3])  # the direction in which the vehicle drives, in the camera frame
+    if turned_deg < LEAST_TURNED_DEG and ahead[deviations_deg.argmax()] > MOSTLY:
+        return f"{shown}: the road shows too little, and the vehicle turns too little; a turn at a junction would do"
+    if wanted > WIDTH > camera.width:
+        left = widest * camera.width / WIDTH
+        size = f"; its images are {stated}: {width} x {height} would show about ±{left:.1f}°, and a longer drive less"
+    return f"{shown}{size}"
+
+
+def _turned_deg(unknowns: adjustment.Unknowns) -> float:
+    """The turns of the vehicle in all pairs, as the square root of their sum of squares.
+
+    The error of the stated rotation of a pair looks like a rotation of the camera by that error over the turn.
+    """
+    motion = solver.geometry_at(unknowns, np.zeros(len(unknowns.deviations))).ego_b_from_ego_a
+    turns = np.arctan2(motion[:, 1, 0], motion[:, 0, 0])
+    _, first = np.unique(unknowns.turns[unknowns.moves], return_index=True)
+    return float(np.degrees(np.linalg.norm(turns[unknowns.moves][first])))
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:

@@ -1,7 +1,7 @@
 """A calibration of a drive without poses: its motion and its calibration are measured in turn.
 
 The motion in metres follows from the stated heights of the cameras. So their mean stays as it is stated: a rig that is
-higher, on a vehicle that is faster, sees the same.
+higher, on a vehicle that is faster, sees the same. So does a rig that is turned, on a vehicle that drives sideways.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,7 @@ import numpy as np
 
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, RigEstimate, calibrate
@@ -19,6 +20,7 @@ from bevcli.workshop.odometry.run_option import with_measured_motion
 
 MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more
+LEAST_STEP_M, FEWEST_STEPS = 0.5, 4  # steps that tell the direction in which the vehicle drives
 MOTION_STEPS = 10  # of progress, in each round
 ALL_STEPS = MOST_ROUNDS * (MOTION_STEPS + STEPS)
 AfterStep = Callable[[int, int], None]  # steps that are done, and of how many
@@ -48,7 +50,31 @@ def calibrate_in_turn(
         moving = measured(DriveWithRig(drive, rig), _in_parts(after_step))
         result = calibrate(DriveWithRig(moving, drive.rig), chosen, after_step=after_step)
         rounds, still, rig = rounds + 1, stands_still(rig, result.rig), result.rig
-    return replace(result, name=drive.name, whole=_without_scale(result, chosen), rounds=rounds)
+    whole, motion, places = _without_scale(result, chosen), moving.ego_motion, range(len(moving.stamps))
+    poses = [
+        moving.load(k).world_from_ego if motion is None else motion.pose_at(moving.stamps[k].timestamp_ns)
+        for k in places
+    ]
+    beside = beside_x_deg(np.stack([pose.matrix for pose in poses]))
+    return replace(result, name=drive.name, whole=whole, rounds=rounds, drives_beside_x_deg=beside)
+
+
+def beside_x_deg(poses: Array) -> tuple[float, float]:
+    """The direction in which a vehicle drives, to the left of x of its ego frame, and its deviation; degrees.
+
+    poses: (F, 4, 4) world_from_ego. In a turn the direction depends on where the ego frame is, so it is that without.
+    """
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    steps = steps[np.hypot(steps[:, 0, 3], steps[:, 1, 3]) > LEAST_STEP_M]
+    if len(steps) < FEWEST_STEPS:
+        return 0.0, 180.0
+    turns = np.arctan2(steps[:, 1, 0], steps[:, 0, 0])
+    directions = np.arctan2(steps[:, 1, 3], steps[:, 0, 3])
+    columns = np.stack([np.ones(len(steps)), turns], axis=-1)
+    found, _, rank, _ = np.linalg.lstsq(columns, directions, rcond=None)
+    scatter = float(np.sum((directions - columns @ found) ** 2)) / (len(steps) - rank)
+    deviation = np.sqrt(scatter * np.linalg.pinv(columns.T @ columns)[0, 0])
+    return float(np.degrees(found[0])), float(np.degrees(deviation))
 
 
 def _with_motion(drive: Sequence, after_step: AfterStep) -> Sequence:

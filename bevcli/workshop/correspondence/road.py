@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import OUTSIDE, Camera
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.correspondence.images import texture
 from bevcli.workshop.correspondence.residuals import GroupGeometry, rays_of_road_points
 
 NEAREST, FARTHEST = 1.3, 9.0  # road points, from the camera, in heights of the camera
@@ -76,23 +77,28 @@ def votes(correlations: Array) -> Array:
 
 def road_points(
     camera: Camera,
-    textures: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    images: tuple[NDArray[np.uint8], NDArray[np.uint8]],
     geometry: GroupGeometry,
     group: int,
     most_px: float,
     least_signal: float = 0.0,
+    *,
+    grey: bool = False,
 ) -> RoadPoints:
     """The points of the road in both images of a group (of one camera), at most `most_px` from where they should be.
 
     least_signal: contrast over noise that a point needs along an axis to count there (see `shared`); 0: all count.
+    images: textures, or `grey` pixels, whose texture is then taken at one scale: after a long way it has changed much.
     """
     nothing = RoadPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0))
-    first, second = textures
+    first, second = images
     warped_from = warp(camera, geometry, group)
     if warped_from is None:
         return nothing
     field, road = warped_from
     warped = sampled(second, field)
+    if grey:
+        first, warped = texture(first, road), texture(warped, road)
     inside = cv2.erode(road.astype(np.uint8), np.ones((WINDOW, WINDOW)))
     at = np.argwhere(inside[::SPACING, ::SPACING] > 0)[:, ::-1].astype(np.float32) * SPACING
     if len(at) < FEWEST:

@@ -25,7 +25,7 @@ def odometry(
     Prints the length of the way, the mean speed, the deviation of its end, and the steps that could not be measured.
     Writes ego_motion.csv, which can be used as it is in a sequence folder or with --ego-motion; report.json with all
     numbers of each step; odometry.png, the way on the road and the curves of speed and yaw rate; and odometry.rrd,
-    the same for `bevcli viz`. A drive with more than 10 frames per second is thinned to that, unless --rate or --every
+    the same for `bevcli viz`. A drive with more than 15 frames per second is thinned to 10, unless --rate or --every
     is given. Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --odometry` measures first and then runs a model.
     """
     from bevcli.cli.progress import Progress
@@ -35,12 +35,11 @@ def odometry(
     from bevcli.workshop.odometry.picture import WatchedDrive, stitched, write_picture
     from bevcli.workshop.odometry.recording import write_recording
     from bevcli.workshop.odometry.report import against_stated, check_measured, report_text, to_json, write_report
-    from bevcli.workshop.odometry.run_option import at_most_rate, frames_between
+    from bevcli.workshop.odometry.run_option import at_most_rate
     from bevcli.writing import check_output
 
     reading = replace(source, ego_motion="measured")
     found = open_sequence(sequence, reading, ground_truth=False, **format_options)
-    found = frames_between(found, found)
     drive = WatchedDrive(found if source.rate_hz or source.every else at_most_rate(found))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")

@@ -16,7 +16,7 @@ from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.measured_steps import FREEDOMS, MeasuredSteps
-from bevcli.workshop.odometry.stated import Mistake, Poses, mistakes, steps_between, turn_between
+from bevcli.workshop.odometry.stated import Poses, mistakes, steps_between, turn_between
 
 FEWEST_STEPS = 3  # that are measured
 FITS = 5.0  # largest distance of a step that fits, in deviations
@@ -95,7 +95,7 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         found = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
     if found.share >= MOST:
-        return (*found.findings, *_jumps(shown, found.steps, numbers))
+        return found.findings or _jumps(shown, found.steps, numbers)
     return (_wrong(shown, steps),)
 
 
@@ -109,9 +109,14 @@ def _error(code: str, message: str, found: str, expected: str, advice: str, is_e
 
 
 def _candidate(
-    measured: MeasuredSteps, steps: Array, findings: Iterable[Finding] = (), parameters: int = 0
+    measured: MeasuredSteps,
+    steps: Array,
+    findings: Iterable[Finding] = (),
+    parameters: int = 0,
+    distances: Array | None = None,
 ) -> _Candidate:
-    distances = measured.distances(steps)
+    """distances: of the steps, (K,), where they are known."""
+    distances = measured.distances(steps) if distances is None else distances
     share = float((distances < FITS)[measured.is_used].mean())
     return _Candidate(steps, float(measured.cost(distances)) + PARAMETER * parameters, share, tuple(findings))
 
@@ -122,16 +127,14 @@ def _candidates(measured: MeasuredSteps, rows: Poses, steps: Array) -> Iterator[
     yield _turned(measured, steps)
     yield from _of_another_time(measured, rows)
     yield _of_another_point(measured, steps)
-    undone = mistakes(rows, measured.times_ns, measured.poses)
-    yield from _scaled(measured, [((_finding(measured, each, steps),), each.steps) for each in undone])
-
-
-def _finding(measured: MeasuredSteps, mistake: Mistake, steps: Array) -> Finding:
-    fit, fit_undone = (
-        int((measured.distances(each) < FITS)[measured.is_used].sum()) for each in (steps, mistake.steps)
-    )
-    found = mistake.found or f"{fit} of {int(measured.is_used.sum())} steps fit, {fit_undone} where it is undone"
-    return _error(mistake.code, mistake.message, found, mistake.expected, mistake.advice)
+    undone = list(mistakes(rows, measured.times_ns, measured.poses))
+    both = np.stack([steps, *(each.steps for each in undone)])
+    fit, *counts = (measured.distances(both) < FITS)[:, measured.is_used].sum(1).tolist()
+    mistaken: list[tuple[tuple[Finding, ...], Array]] = []
+    for each, count in zip(undone, counts, strict=True):
+        found = each.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
+        mistaken.append(((_error(each.code, each.message, found, each.expected, each.advice),), each.steps))
+    yield from _scaled(measured, mistaken)
 
 
 def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Array]]) -> Iterator[_Candidate]:
@@ -148,14 +151,16 @@ def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Arr
         weights = measured.weights(squared)
         scales = (weights * along).sum(1) / (weights * length).sum(1)
     deviations = np.sqrt(np.maximum((weights * squared).sum(1) / (3 * weights.sum(1)), 1) / (weights * length).sum(1))
-    for (findings, steps), scale, deviation in zip(undone, scales.tolist(), deviations.tolist(), strict=True):
+    longer = stacked.copy()
+    longer[..., :3, 3] *= scales[:, None, None]
+    far, far_longer = measured.distances(stacked), measured.distances(longer)
+    for place, (findings, steps) in enumerate(undone):
         if findings:
-            yield _candidate(measured, steps, findings)
-        if scale > 0:
-            longer = steps.copy()
-            longer[:, :3, 3] *= scale
+            yield _candidate(measured, steps, findings, 0, far[place])
+        if scales[place] > 0:
+            scale, deviation = float(scales[place]), float(deviations[place])
             told = (*findings, *_scale_finding(1 / scale, deviation / scale**2))
-            yield _candidate(measured, longer, told, 1)
+            yield _candidate(measured, longer[place], told, 1, far_longer[place])
 
 
 def _scale_finding(factor: float, deviation: float) -> tuple[Finding, ...]:
@@ -191,10 +196,7 @@ def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
         return _candidate(measured, undone, parameters=1)
     side = "left" if turn > 0 else "right"
     found = f"x points {np.degrees(abs(turn)):.1f}° ± {np.degrees(deviation):.1f}° to the {side} of forward"
-    message, advice = (
-        "x of the poses is not forward",
-        "turn the rotations of the poses about z, or check the cameras' yaw",
-    )
+    message, advice = "x of the poses is not forward", "turn their rotations about z, or check the cameras' yaw"
     finding = _error("motion-axes", message, found, "x forward", advice, abs(turn) > LARGE_TURN)
     return _candidate(measured, undone, (finding,), 1)
 

@@ -1,11 +1,10 @@
 """The option `odometry` of `open_sequence`: a drive with the motion that its images show."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.sequences.open import select, select_rate
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion
@@ -15,40 +14,52 @@ MOST_RATE_HZ = 10.0  # a faster drive is measured at this rate: shorter steps co
 FASTER = 1.5  # times this rate is thinned to it
 
 
+class MeasuredScenes(DerivedSequence):
+    """A drive of several scenes, each with a measured motion of its own, which begins at its first frame."""
+
+    def __init__(self, scenes: Mapping[str, MeasuredDrive]) -> None:
+        first = next(iter(scenes.values()))
+        super().__init__(first.sequence)
+        self.has_ego_motion, self.facts, self._scenes, self.ego_motion = True, first.facts, scenes, None
+
+    def load(self, place: int) -> Frame:
+        return self._scenes[self.stamps[place].scene].load(place)
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._scenes[self.stamps[place].scene].ground_truth_frame(place)
+
+
 def with_measured_motion(
     drive: Sequence, whole: Sequence, after_step: Callable[[int, int], None] | None = None
-) -> MeasuredDrive:
-    """The drive with its measured motion, which a note states.
+) -> MeasuredDrive | MeasuredScenes:
+    """The drive with its measured motion, which a note of each scene states.
 
     Args:
         drive: the frames that are used.
-        whole: a drive with further frames: those between the first and the last one are measured too.
-        after_step: called with the number of steps that are done, and of all.
+        whole: a drive with further frames: those between the first and the last one of a scene are measured too.
+        after_step: called with the number of steps that are done, and of all, scene by scene.
 
-    Raises InputError where the drive has several scenes, or not one step can be measured.
+    Raises InputError where not one step of a scene can be measured.
     """
-    frames = at_most_rate(frames_between(drive, whole))
-    motion = measured(frames, after_step)
-    result = MeasuredDrive(drive, motion)
-    result.notes = (*drive.notes, measured_note(motion))
+    scenes, notes = dict[str, MeasuredDrive](), list(drive.notes)
+    for scene in dict.fromkeys(stamp.scene for stamp in drive.stamps):
+        motion = measured(at_most_rate(frames_between(drive, whole, scene)), after_step)
+        scenes[scene] = MeasuredDrive(drive, motion)
+        notes.append(measured_note(motion))
+    result = MeasuredScenes(scenes) if len(scenes) > 1 else next(iter(scenes.values()))
+    result.notes = tuple(notes)
     return result
 
 
-def frames_between(drive: Sequence, whole: Sequence) -> Sequence:
-    """The frames of `whole` from the first to the last frame of `drive`. Raises InputError for several scenes."""
-    scenes = {stamp.scene for stamp in drive.stamps}
-    if len(scenes) > 1:
-        raise InputError(
-            f"{drive.name}: has {len(scenes)} scenes (expected one, since its motion is measured from frame to frame): "
-            "choose a `scene`"
-        )
-    first, last = drive.stamps[0], drive.stamps[-1]
+def frames_between(drive: Sequence, whole: Sequence, scene: str) -> Sequence:
+    """The frames of `whole` from the first to the last frame of `drive` in a scene."""
+    times = [stamp.timestamp_ns for stamp in drive.stamps if stamp.scene == scene]
     return select(
         whole,
         [
             place
             for place, stamp in enumerate(whole.stamps)
-            if stamp.scene == first.scene and first.timestamp_ns <= stamp.timestamp_ns <= last.timestamp_ns
+            if stamp.scene == scene and times[0] <= stamp.timestamp_ns <= times[-1]
         ],
     )
 

@@ -13,6 +13,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
+from bevcli.workshop.odometry.point_votes import point_votes, under_the_road, ways_of_points
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
@@ -26,19 +27,18 @@ from bevcli.workshop.odometry.unknowns import (
     deviations_at,
     next_slopes,
 )
+from bevcli.workshop.odometry.unmoved import stands
 
 YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
-STILL_PX, STILL_SHARE = 0.6, 0.7  # of matched points of a vehicle that stands
 STANDING = np.array([*np.radians([0.3] * 3), 0.02, 0.02, 0.01, 1, 1, 1])  # deviations of its motion
 CLEAR_M, CLEAR_SHARE = 60.0, 0.4  # of points that tell whether the vehicle drives backwards
-WIDEST_M, WIDEST, WIDEST_RAD = (
-    0.15,
-    0.1,
-    np.radians(1.5),
-)  # deviations of what counts as measured: way, share of it, turn
+WIDEST_M, WIDEST = 0.3, 0.3  # deviation of the way of a step that counts as measured, and as a share of the way
+WIDEST_RAD = np.radians(1.5)  # the same of the turn
+WAY_M = 3.5  # points of the road nearer to the way are preferred
+LEAST_M = 0.12  # of a start: without a way, points have no epipolar lines
 USUAL_M = 4.0  # distance at which directions are searched
-ROUGH_PX = 6.0  # of residuals while directions are searched
+ROUGH_PX, FINE_PX = 6.0, 0.4  # of residuals while directions are searched, at first and at last
 FASTEST, BACK = 45.0, 6.0  # m/s, of the distances that are tried
 MOST_M = (0.8, 0.25)  # between points of the road and where they are expected, pass by pass
 ROAD_PX = 60.0  # the same in one image, for a metre
@@ -46,11 +46,10 @@ MOST_PX = (30.0, 8.0)  # of points of two cameras
 LEAST_SHARE = 0.3  # of the points of two cameras that fit; where fewer do, both see nothing in common
 LEAST_SPREAD, MOST_SPREAD = 0.3, 2.0  # of residuals, while the motion is searched
 CANDIDATES = 3  # distances of a step that are measured
-SLOPES_TRIED = np.radians([-1.25, 0.0, 1.25])  # of the road along x, while none is known
-LEVEL = 0.9  # factor of the votes of such a slope
 LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
 APART_M = 0.4  # between them
 FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
+STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
 
@@ -174,10 +173,10 @@ class Guess:
 
 
 def is_still(step: StepViews, points: EpipolarResiduals) -> bool:
-    """True where most points of single cameras stay where they are in the image."""
-    inside = points.where(np.equal(*step.pair(points.group)))
-    moved = np.linalg.norm(inside.rays_a - inside.rays_b, axis=-1) * inside.focal
-    return len(moved) >= FEWEST and bool((moved < STILL_PX).mean() > STILL_SHARE)
+    """True where the matched points of single cameras stay where they are in the image."""
+    inside = _still(step, points)
+    poses = np.stack([camera.ego_from_camera for camera in step.first.cameras])
+    return stands(inside, poses[step.pair(inside.group)[0]])
 
 
 def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array:
@@ -192,9 +191,12 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
         squares = (values(unknowns, inside, np.zeros(COUNT)) ** 2).sum(-1)
         costs.append(float(np.log1p(squares / ROUGH_PX**2).sum()))
     best = starts[int(np.argmin(costs))]
-    for scale in (ROUGH_PX, 1.0):
+    for scale in (ROUGH_PX, 1.0, FINE_PX):
         unknowns = step.unknowns(best, guess.deviations(best, known_distance=True))
-        best = best + solve(unknowns, [(inside, scale)], np.zeros(COUNT)).x[STATE]
+        seen_px = np.minimum(spread(unknowns, inside, np.zeros(COUNT), 0 * inside.group), ROUGH_PX)
+        best = best + solve(unknowns, [(inside, np.maximum(scale, seen_px))], np.zeros(COUNT)).x[STATE]
+        if scale < ROUGH_PX:
+            inside = inside.where(~under_the_road(_ways(step, inside, best)))
     return best
 
 
@@ -210,18 +212,17 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
     seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
     cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
-    sense, rounds = _sense(step, points, rough), []
-    for slope in np.zeros(1) if guess.state is not None else SLOPES_TRIED:
-        tried = rough + np.array([*[0] * 6, slope, 0])
-        roads = step.first.road(tried[SLOPES]), step.second.road(next_slopes(tried))
-        distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
-        votes[np.sign(distances) == -sense] = 0
-        rounds.append((votes.max() * (1.0 if slope == 0 else LEVEL), tried, roads, distances, votes))
-    _, tried, roads, distances, votes = max(rounds, key=lambda each: each[0])
+    sense, ways = _sense(step, points, rough), _ways(step, points, rough)
+    points = points.where(~under_the_road(ways))
+    roads = step.first.road(rough[SLOPES]), step.second.road(next_slopes(rough))
+    distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
+    votes *= point_votes(ways, distances)
+    votes[np.sign(distances) == -sense] = 0
     starts = []
     for index in _peaks(votes)[:CANDIDATES]:
-        start = tried.copy()
-        start[3:5] = distances[index] * np.array([np.cos(heading), np.sin(heading)])
+        start = rough.copy()
+        distance = max(abs(distances[index]), LEAST_M) * (sense or np.sign(distances[index]) or 1)
+        start[3:5] = distance * np.array([np.cos(heading), np.sin(heading)])
         starts.append((start, float(votes[index])))
     # Without road, two cameras may still tell the distance.
     return [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
@@ -237,6 +238,14 @@ def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
         return 0
     share = float((near > 0).all(-1).mean() - (near < 0).all(-1).mean())
     return int(np.sign(share) * np.sign(rough[3])) if abs(share) > CLEAR_SHARE else 0
+
+
+def _ways(step: StepViews, points: EpipolarResiduals, state: Array) -> Array:
+    """(n,) the ways with which matched points of single cameras lie on the road; NaN for those that tell none."""
+    unknowns = step.unknowns(state, np.ones(COUNT))
+    geometry = unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
+    ways = ways_of_points(points, geometry, float(np.hypot(*state[3:5])))
+    return np.where(np.equal(*step.pair(points.group)), ways, np.nan)
 
 
 def _peaks(votes: Array) -> list[int]:
@@ -262,7 +271,7 @@ def measured(
     deviations = guess.deviations(start)
     unknowns, x = step.unknowns(start, deviations), np.zeros(len(deviations))
     for most_m, most_px in zip(MOST_M, MOST_PX, strict=True):
-        fitting = _common(step, unknowns, points, x, most_px) if not guess.still else _still(step, points)
+        fitting = _still(step, points) if guess.still else _common(step, unknowns, points, x, most_px)
         road: GroundResiduals | RoadResiduals = _road_in_images(step, unknowns, x, ROAD_PX * most_m)
         if len(road.group) < FEWEST_OF_ROAD and roads is not None:
             road = _road(step, unknowns, x, roads, most_m)
@@ -272,7 +281,8 @@ def measured(
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
     covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + FLOOR
+    floor = STILL_FLOOR if guess.still else FLOOR
+    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + floor
     kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
     seen = seen_points(step.second.cameras, *kinds)
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
@@ -330,10 +340,12 @@ def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: 
         a, b = step.first.images[index], step.second.images[index]
         if a is not None and b is not None:
             group = (index * step.cameras + index) * PARTS
-            parts.append(road_points(camera, (a.texture, b.texture), geometry, group, most_px))
+            parts.append(road_points(camera, (a.pixels, b.pixels), geometry, group, most_px, grey=True))
             groups.append(step.group(index, index, parts[-1].rays_a))
     columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
-    return _sorted(RoadResiduals(np.concatenate(groups), *columns))
+    road = _sorted(RoadResiduals(np.concatenate(groups), *columns))
+    near = road.beside_m < WAY_M
+    return road.where(near) if near.sum() >= FEWEST_OF_ROAD else road  # farther aside may be a pavement: it is higher
 
 
 def is_measured(candidate: Candidate) -> bool:

@@ -19,7 +19,7 @@ SUSPENSION_RAD, SUSPENSION_M = (
 )  # of pitch and roll, and of the height (and as a share of the way), between two frames
 YAW_RAD, ALONG = np.radians(3.0), 0.3  # by which the start may be wrong, the second as a share of the distance
 SHORTEST_M = 0.5  # distance for that share
-SLOPE_RAD, CHANGE_RAD = np.radians(1.0), np.radians(0.2)  # of the road under the vehicle, and its change in a step
+SLOPE_RAD, CHANGE_RAD = np.radians(0.5), np.radians(0.2)  # of the road under the vehicle, and its change in a step
 
 
 @dataclass(frozen=True)
