@@ -117,11 +117,10 @@ def test_an_error_of_a_finished_step_ends_the_run(mini_model, monkeypatch, overl
     assert len(calls) == 2
 
 
-@pytest.mark.usefixtures("unchecked_recordings")
-def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, overlapping):
-    model, drive = Model(mini_model, tracker=TRACKER), Drive()
-    run_into_folder(model, drive, tmp_path / "whole")
-    out, drive.broken = tmp_path / "out", 4
+def interrupt_and_resume(model, out):
+    """A run that ends at a frame that cannot be read, then after one frame, then with the drive."""
+    drive = Drive()
+    drive.broken = 4
     with pytest.raises(InputError, match="frame 4"):
         run_into_folder(model, drive, out)
     assert len(read_boxes(out / "predictions.json").frames) == 4
@@ -129,8 +128,28 @@ def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, over
     run_into_folder(model, drive, out, resume=True, should_stop=lambda: True)
     assert len(read_boxes(out / "predictions.json").frames) == 5
     run_into_folder(model, drive, out, resume=True)
+
+
+@pytest.mark.usefixtures("unchecked_recordings")
+def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, overlapping):
+    model = Model(mini_model, tracker=TRACKER)
+    run_into_folder(model, Drive(), tmp_path / "whole")
+    interrupt_and_resume(model, tmp_path / "out")
     for name in ("predictions.json", "tracks.csv"):
-        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked_recordings")
+def test_an_interrupted_run_on_a_gpu_has_all_frames(mini_model, tmp_path, monkeypatch):
+    run_into_folder(Model(mini_model, tracker=TRACKER), Drive(), tmp_path / "cpu")
+    with simulated("cuda:0", monkeypatch, sample_plainly) as device:
+        interrupt_and_resume(Model(mini_model, device.device, tracker=TRACKER), tmp_path / "gpu")
+    found, expected = (read_boxes(tmp_path / name / "predictions.json").frames for name in ("gpu", "cpu"))
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.stamp == theirs.stamp
+        np.testing.assert_allclose(ours.boxes.centers, theirs.boxes.centers, atol=1e-3)
+        np.testing.assert_array_equal(ours.boxes.instances, theirs.boxes.instances)
 
 
 @pytest.mark.parametrize(
