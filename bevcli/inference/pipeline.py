@@ -76,17 +76,10 @@ class WriteBehind(AbstractContextManager["WriteBehind[S]"], Generic[S]):
         """depth: items that may wait, beside the one that is worked on."""
         self._work, self._depth, self._goes_on = work, depth, True
         self._pending: deque[Future[None]] = deque()
-        self._put, self._begun = 0, 0  # numbers of items
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
-
-    @property
-    def is_behind(self) -> bool:
-        """Some items wait for the one that is worked on."""
-        return self._begun < self._put
 
     def put(self, item: S) -> bool:
         """Add an item, and wait while too many of them are pending. False once `work` has returned False."""
-        self._put += 1
         self._pending.append(self._pool.submit(self._write, item))
         self._finish(1 + self._depth)
         return self._goes_on
@@ -101,7 +94,6 @@ class WriteBehind(AbstractContextManager["WriteBehind[S]"], Generic[S]):
             self._pool.shutdown(wait=False)
 
     def _write(self, item: S) -> None:
-        self._begun += 1
         try:
             self._goes_on = self._goes_on and self._work(item)
         except BaseException:

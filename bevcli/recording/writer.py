@@ -30,7 +30,6 @@ TIMEOUT_S = 20.0
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
-FRAMES_AT_ONCE = 4  # that `Recording.log` may flush together
 INDEXED_FRAMES = 200  # a longer recording has no index, see `RrdFile`
 
 
@@ -175,8 +174,7 @@ class RecordingState:
 class Recording:
     """Writes a recording: `with Recording(...) as recording: recording.log(frame, prediction)`, frames in order.
 
-    Each frame is on the disk when `log` returns, so a killed run keeps all frames up to then, but for those that were
-    logged with `more`.
+    Each frame is on the disk when `log` returns, so a killed run keeps all frames up to then.
 
     Args:
         path: the .rrd file to write; an existing one is replaced.
@@ -207,7 +205,7 @@ class Recording:
         threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         batches = rr.ChunkBatcherConfig(flush_num_rows=ROWS_AT_ONCE)
         self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id, batcher_config=batches)
-        self._frames = self._flushed = 0
+        self._frames = 0
         frames = None if resume is None else resume.frames
         self._frame_log = FrameLog(self._stream, self._recorded, frames)
 
@@ -264,25 +262,17 @@ class Recording:
     def state(self) -> RecordingState | None:
         """The state from which a later Recording goes on; None as long as it cannot be resumed."""
         frames = self._frame_log.state()
-        if self._flushed < self._frames:
-            self._flush()
         return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
 
-    def log(self, frame: Frame, found: Prediction | FileBoxes, *, more: bool = False) -> None:
+    def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals.
 
-        Args:
-            frame: as it was read.
-            found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the
-                frame.
-            more: the next frame is there already: some frames go to the disk together, which takes less time.
+        found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the frame.
         """
         self._frame_log.log(frame, found)
+        self._flush()
         self._frames += 1
-        new_stream = self._frames % INDEXED_FRAMES == 0
-        if new_stream or not more or self._frames - self._flushed >= FRAMES_AT_ONCE:
-            self._flush()
-        if new_stream:
+        if self._frames % INDEXED_FRAMES == 0:
             self._connect(None)  # a new stream frees the index of the one before
 
     def event(self, text: str, level: str = "INFO") -> None:
@@ -296,6 +286,5 @@ class Recording:
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
             self.file.sync()
-            self._flushed = self._frames
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error

@@ -123,8 +123,8 @@ class RunFiles:
 
             restore_index(self._out / RECORDING)
 
-    def write(self, frame: Frame, prediction: Prediction, *, more: bool = False) -> None:
-        """Add a frame to every file. more: see `Recording.log`."""
+    def write(self, frame: Frame, prediction: Prediction) -> None:
+        """Add a frame to every file."""
         if prediction.segmentation is not None:
             maps = self._out / SEGMENTATION
             self._folder.add(map_path(maps, frame.stamp.index))
@@ -133,7 +133,7 @@ class RunFiles:
         if self._options.save_bev is not None and prediction.bev is not None:
             _save_bev(self._options.save_bev, prediction, self._model)
             self._bev_frames.append(frame.stamp.index)
-        self._recording.log(frame, prediction, more=more)
+        self._recording.log(frame, prediction)
         extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
         if prediction.not_finite:
             extras["not_finite"] = prediction.not_finite

@@ -78,7 +78,7 @@ def run_into_folder(
         writer = RunWriter(folder.state_path, facts, files, summary)
 
         def write(step: Step) -> bool:
-            writer.write(*step, more=background.is_behind)
+            writer.write(*step)
             after_frame(*step[:2])
             return not should_stop()
 

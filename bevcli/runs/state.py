@@ -129,10 +129,10 @@ class RunWriter(contextlib.AbstractContextManager["RunWriter"]):
         if self._is_whole and self._after is not None:
             self.save(self._after)
 
-    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any], *, more: bool = False) -> None:
-        """Write the next frame. after: the state of the runner after it. more: see `Recording.log`."""
+    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any]) -> None:
+        """Write the next frame. after: the state of the runner after it."""
         self._is_whole, began = False, time.perf_counter()
-        self._files.write(frame, prediction, more=more)
+        self._files.write(frame, prediction)
         now = time.perf_counter()
         self._summary.add(frame, prediction, recording_s=now - began, whole_s=now - self._frame_began)
         self._after, self._is_whole, self._frame_began = after, True, now

@@ -92,18 +92,3 @@ def test_after_an_error_in_the_work_nothing_more_is_done():
     with pytest.raises(ZeroDivisionError):
         write_behind(work, range(1000))
     assert worked == [0, 1]
-
-
-def test_it_is_behind_while_items_wait():
-    found, all_put = [], threading.Event()
-
-    def work(item):
-        assert all_put.wait(5)
-        found.append(writer.is_behind)
-        return True
-
-    with WriteBehind(work, depth=3) as writer:
-        for item in range(3):
-            writer.put(item)
-        all_put.set()
-    assert found == [True, True, False]

@@ -259,24 +259,6 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
 
 
-def test_frames_that_follow_at_once_are_written_together(tmp_path):
-    drive, options = MemorySequence(6), RecordingOptions(level="minimal")
-    frames, sizes, contents = [drive.load(place) for place in range(6)], [], []
-    for more in (False, True):
-        path = tmp_path / f"{more}.rrd"
-        with Recording(path, drive, NamedModel(), options) as recording:
-            for frame in frames:
-                recording.log(frame, predict(frame), more=more)
-                sizes.append(recording.file.synced)
-            assert recording.state().size == recording.file.size
-        contents.append([recorded_boxes(frame) for frame in RecordingReader(path).frames()])
-    assert [len(set(sizes[:6])), len(set(sizes[6:]))] == [6, 2]  # after the fourth; the last two wait for `state`
-    alone, together = contents
-    assert [read.stamp for read in together] == [frame.stamp for frame in frames]
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.boxes.centers, other.boxes.centers)
-
-
 def test_a_resumed_recording_can_be_read_before_it_is_closed(tmp_path, monkeypatch):
     """Its last stream has an index that does not fit the file: a kill before the index was cut off left it there."""
     drive, path, close, read = MemorySequence(2), tmp_path / "r.rrd", RrdFile.close, []

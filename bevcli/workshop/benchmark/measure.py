@@ -274,7 +274,7 @@ def _time_run(
 
     def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
         made.append(time.perf_counter())  # recording begins as soon as the model has made the step, or late
-        recording.log(*step[:2], more=writer.is_behind)
+        recording.log(*step[:2])
         fast.state = step[2]
         return True
 
