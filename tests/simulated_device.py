@@ -65,6 +65,7 @@ class SimulatedDevice(TorchFunctionMode):
     Attributes:
         device: what its tensors claim.
         waits: each operation for which the CPU would wait for the device, in order.
+        copies: to pinned memory, which hold no numbers before the CPU has waited for them.
         tape: the operations since a capture began, with their arguments and results; None outside of one.
     """
 
@@ -72,6 +73,7 @@ class SimulatedDevice(TorchFunctionMode):
         super().__init__()
         self.device = torch.device(name)
         self.waits: list[str] = []
+        self.copies: list[Callable[[], object]] = []
         self.tape: list[tuple[Any, Any, Any, Any]] | None = None
 
     def wait(self, name: str) -> None:
@@ -110,6 +112,10 @@ class SimulatedDevice(TorchFunctionMode):
         if function == torch.Tensor.device.__get__:
             return self.device
         self._check(function, tensors, args, kwargs)
+        if function is torch.Tensor.copy_ and is_pinned(args[0]):
+            held = args[1].held.clone()
+            self.copies.append(lambda: args[0].copy_(held))
+            return args[0].fill_(0)
         if comes:
             assert device is not None
             self.check(device)
@@ -215,6 +221,7 @@ class Stream:
 
     def synchronize(self) -> None:
         self.device.wait("synchronize")
+        arrive(self.device.copies)
 
     def wait_stream(self, other: Stream) -> None:
         assert other.device is self.device
@@ -234,17 +241,28 @@ class Graph:
                     old.copy_(new)
 
 
+def arrive(copies: list[Callable[[], object]]) -> None:
+    """The copies have their numbers."""
+    for copy in copies:
+        copy()
+    copies.clear()
+
+
 class Event:
-    """An event that takes no time."""
+    """An event that takes no time. It comes after the copies that were begun before it."""
 
     def __init__(self, device: SimulatedDevice, *, enable_timing: bool = False) -> None:
         self.device, self.enable_timing = device, enable_timing
+        self.copies: list[Callable[[], object]] = []
 
     def record(self, stream: Stream | None = None) -> None:
         assert stream is None or isinstance(stream, Stream)
+        if not self.enable_timing:
+            self.copies, self.device.copies = self.device.copies, []
 
     def synchronize(self) -> None:
         self.device.wait("event")
+        arrive(self.copies)
 
     def elapsed_time(self, later: Event) -> float:
         assert self.enable_timing

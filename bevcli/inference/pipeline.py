@@ -1,7 +1,7 @@
 """Around the model: other threads read and write frames, images go up, results come back, stages are timed.
 
 While the model computes a frame, threads prepare the next ones and write those before. Results come back from a GPU
-with one wait, and are checked.
+with one wait, which may come after the next frame was launched, and are checked.
 """
 
 import re
@@ -134,10 +134,11 @@ def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFr
     return uploaded
 
 
-def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
-    """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
+def read_back(outputs: ModelOutputs, images: Tensor) -> Callable[[], tuple[ModelOutputs, bool]]:
+    """A function that waits for the last layers' outputs on the CPU, and tells whether all numbers are finite.
 
-    There is one copy from a CUDA GPU. What `ModelOutputs.stay_on_device` names stays there. The input images
+    Checked are the BEV map, the class logits and the box codes. There is one copy from a CUDA GPU: it is launched now,
+    and what is launched later is not waited for. What `ModelOutputs.stay_on_device` names stays there. The input images
     must be finite too: the ReLU of oneDNN, and of cuDNN, turns NaN into zero, so that it may not reach the outputs.
     Weights are checked when they are read and when they are prepared. Not seen are numbers inside of the backbone that
     grow beyond the range of their type and that ReLU then turns into zeros.
@@ -147,16 +148,32 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool
     sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
     tensors = [sums, *(tensor for _, tensor in tensors_in(list(moved.values())))]
-    if sums.device.type == "cuda":
-        memory = packed(tensors)
-        copy = pinned_place(memory).copy_(memory, non_blocking=True)
-        torch.cuda.current_stream(sums.device).synchronize()
-        sums, *copies = unpacked(copy, tensors)
-    else:
-        sums, *copies = (tensor.cpu() for tensor in tensors)
-    source = iter(copies)
-    on_cpu = replace(last, **{name: exchanged(value, source) for name, value in moved.items()})
-    return on_cpu, bool(torch.isfinite(sums).all())
+    copied = _copies(tensors)
+
+    def read() -> tuple[ModelOutputs, bool]:
+        sums, *copies = copied()
+        source = iter(copies)
+        on_cpu = replace(last, **{name: exchanged(value, source) for name, value in moved.items()})
+        return on_cpu, bool(torch.isfinite(sums).all())
+
+    return read
+
+
+def _copies(tensors: list[Tensor]) -> Callable[[], list[Tensor]]:
+    """A function that waits for copies of the tensors on the CPU. From a CUDA GPU there is one, launched now."""
+    device = tensors[0].device
+    if device.type != "cuda":
+        return lambda: [tensor.cpu() for tensor in tensors]
+    memory = packed(tensors)
+    copy = pinned_place(memory).copy_(memory, non_blocking=True)
+    is_there = torch.cuda.Event()
+    is_there.record(torch.cuda.current_stream(device))
+
+    def awaited() -> list[Tensor]:
+        is_there.synchronize()
+        return unpacked(copy, tensors)
+
+    return awaited
 
 
 def pinned_place(tensor: Tensor) -> Tensor:
@@ -195,17 +212,23 @@ def describe(name: str) -> str:
 
 
 class StageClock(ExitStack):
-    """Seconds of each stage of one step. The model has hooks inside the `with` block only:
+    """Seconds of each stage of a step. The model has hooks inside the `with` block only:
 
         with clock:
             outputs = model(inputs)
-            results = outputs.cpu()
-            clock.waited()
-            clock.mark("decoding")
+            marks = clock.marks
+        results = outputs.cpu()
+        clock.waited(marks)
+        clock.mark("decoding")
         clock.read()
+
+    The next step may begin before `waited`.
 
     Time is attributed by marks: the time since the last mark belongs to the stage of the new mark. On a GPU, marks are
     events in its queue, until the CPU has waited for it. On "mps", every mark waits for it.
+
+    Attributes:
+        marks: of a step so far: stages, with seconds or events of a GPU's queue.
     """
 
     def __init__(
@@ -225,7 +248,7 @@ class StageClock(ExitStack):
         """
         super().__init__()
         self._device = device
-        self._marks: list[tuple[str, Any]] = []  # with seconds, or events of a GPU's queue
+        self.marks: list[tuple[str, Any]] = []
         self._has_waited = False
         modules = dict(model.named_modules())
         ends = [(modules[name].register_forward_hook, stage) for name, stage in stages.items() if name in modules]
@@ -236,7 +259,7 @@ class StageClock(ExitStack):
         """A new step begins now."""
         for register, stage in self._marked:
             self.enter_context(register(lambda *_, stage=stage: self.mark(stage)))
-        self._marks, self._has_waited = [], False
+        self.marks, self._has_waited = [], False
         self.mark("")
         return self
 
@@ -249,17 +272,17 @@ class StageClock(ExitStack):
         elif self._device.type == "mps" and not self._has_waited:
             torch.mps.synchronize()  # its queue has no events that could be read later
             now = time.perf_counter()
-        self._marks.append((stage, now))
+        self.marks.append((stage, now))
 
-    def waited(self) -> None:
-        """The CPU has waited for the GPU, and only the CPU computes in the rest of the step."""
-        self._has_waited = True
-        self._marks.append(("", time.perf_counter()))
+    def waited(self, marks: list[tuple[str, Any]]) -> None:
+        """The CPU has waited for the step that has these marks, and only the CPU computes in the rest of it."""
+        self.marks, self._has_waited = marks, True
+        self.marks.append(("", time.perf_counter()))
 
     def read(self) -> Mapping[str, float]:
-        """Stage -> seconds, of the last step. To call after `waited`, so that a GPU has passed its events."""
+        """Stage -> seconds, of the step. To call after `waited`, so that a GPU has passed its events."""
         seconds: dict[str, float] = {}
-        for (_, before), (stage, now) in pairwise(self._marks):
+        for (_, before), (stage, now) in pairwise(self.marks):
             if stage:
                 took = now - before if isinstance(now, float) else before.elapsed_time(now) / 1000
                 seconds[stage] = seconds.get(stage, 0.0) + took

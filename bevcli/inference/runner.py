@@ -71,6 +71,31 @@ class StepOptions:
     untrained: bool = False
 
 
+@dataclass(frozen=True)
+class BegunStep:
+    """A step that the device may still be computing, see `Runner.begin`.
+
+    Attributes:
+        prepared: the frame.
+        marks: of the clock, so far.
+        upcoming: the frames after it that the model sees.
+        start: the state before the frame, without history where it starts anew.
+        started_anew: the reason for it, None where it does not.
+        after: the state after the frame where its numbers are finite, without tracks.
+        read: waits for the outputs, see `read_back`; None for a frame without images.
+        probe: of the attention, where it was asked for.
+    """
+
+    prepared: PreparedFrame
+    marks: list[tuple[str, Any]]
+    upcoming: Items[PreparedFrame]
+    start: RunnerState[Any]
+    started_anew: NewStart | None
+    after: RunnerState[Any]
+    read: Callable[[], tuple[ModelOutputs, bool]] | None = None
+    probe: AttentionProbe | None = None
+
+
 class Runner:
     """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none.
 
@@ -88,6 +113,15 @@ class Runner:
         self._probed: Tensor | None = None
         if self.options.ask_attention and isinstance(model, Network):
             self._probed = probe_cells(self.options.probes, self.config.bev_grid).to(device)
+
+    @property
+    def overlap(self) -> int:
+        """1 where `run` launches the next frame before it waits for a frame: a CUDA GPU computes while the CPU decodes.
+
+        0 on other devices, and where this gains nothing, because more is read of the device than the outputs.
+        """
+        reads_once = self.model.reads_once and not self.options.ask_attention
+        return int(self.device.type == "cuda" and reads_once)
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
         """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
@@ -108,37 +142,52 @@ class Runner:
             upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
                 or without images are not used.
         """
-        state, frame = state or RunnerState(), prepared.frame
+        state = state or RunnerState()
+        return self.finish(self.begin(state, prepared, upcoming), state.tracks)
+
+    def begin(self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()) -> BegunStep:
+        """Launches a step, of which a GPU computes most afterwards. Arguments: see `step`; tracks are not used."""
+        frame = prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
             state = self._restarted(state)
         if not frame.images:
-            return state, self._prediction(prepared, started_anew, skipped=True)
+            return BegunStep(prepared, self.clock.marks, (), state, started_anew, state)
         probe = None
         if self._probed is not None:
             probe = AttentionProbe(self.model, self.config.encoder.layers - 1, self._probed)
+        later = self._usable(prepared, upcoming)
         autocast = torch.autocast(self.device.type, enabled=False)  # the parts of a model have precisions of their own
-        with torch.inference_mode(), self.clock:
-            with autocast, probe or contextlib.nullcontext():
-                later = self._usable(prepared, upcoming)
-                outputs, memory = self.model.step(prepared, state.memory, later)
-                last_layers, is_finite = read_back(outputs, prepared.images)
-                part = "" if is_finite else origin(self.model, lambda: self.model.step(prepared, state.memory, later))
+        with torch.inference_mode(), autocast, self.clock, probe or contextlib.nullcontext():
+            outputs, memory = self.model.step(prepared, state.memory, later)
+            read = read_back(outputs, prepared.images)
+        after = RunnerState(memory, frame.stamp)
+        return BegunStep(prepared, self.clock.marks, later, state, started_anew, after, read, probe)
+
+    def finish(self, begun: BegunStep, tracks: TrackerState | None) -> tuple[RunnerState[Any], Prediction]:
+        """Waits for a step; returns what `step` does. tracks: before the frame."""
+        prepared, start, probe = begun.prepared, begun.start, begun.probe
+        if begun.read is None:
+            prediction = self._prediction(prepared, begun.started_anew, skipped=True)
+            return replace(start, tracks=tracks), prediction
+        with torch.inference_mode():
+            last_layers, is_finite = begun.read()
             if is_finite:
-                after = RunnerState(memory, frame.stamp)
-                fields = {"bev": outputs.bev[0], **self._decoded(last_layers, frame.stamp.index)}
+                after, fields = begun.after, {"bev": last_layers.bev[0], **self._decoded(last_layers, begun)}
                 fields["attention"] = None if probe is None else attention_view(probe, prepared, self.config)
                 fields["stage_seconds"] = self.clock.read()
             else:
-                after, fields = self._restarted(state), {"not_finite": part}
-        tracks, prediction = state.tracks, self._prediction(prepared, started_anew, **fields)
+                with torch.autocast(self.device.type, enabled=False), probe or contextlib.nullcontext():
+                    part = origin(self.model, lambda: self.model.step(prepared, start.memory, begun.upcoming))
+                after, fields = self._restarted(start), {"not_finite": part}
+        prediction = self._prediction(prepared, begun.started_anew, **fields)
         if self.options.tracker is not None and not self._tracks:
             tracks, prediction = track(self.options.tracker, tracks, prediction)
         return replace(after, tracks=tracks), prediction
 
-    def _decoded(self, last_layers: ModelOutputs, frame: int) -> dict[str, Any]:
+    def _decoded(self, last_layers: ModelOutputs, begun: BegunStep) -> dict[str, Any]:
         """The fields of a prediction that are decoded from the outputs of the last layers, on the CPU."""
-        self.clock.waited()
+        self.clock.waited(begun.marks)
         boxes, segmentation, results = Boxes3D.empty(), None, []
         for decoded in self.model.decode(last_layers):
             if isinstance(decoded, Boxes3D):
@@ -149,7 +198,7 @@ class Runner:
                 self.clock.mark("map_merging")
             else:
                 results.append(decoded)
-        shown = with_command(tuple(results), self.options.commands, frame)
+        shown = with_command(tuple(results), self.options.commands, begun.prepared.frame.stamp.index)
         return {"boxes": boxes, "results": shown, "segmentation": segmentation}
 
     def frames(
@@ -175,10 +224,31 @@ class Runner:
     def run(
         self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
     ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
-        """Yields frame, prediction and state after each of these frames of a sequence."""
-        for prepared, upcoming in self.frames(sequence, indices, preprocessor):
-            state, prediction = self.step(state, prepared, upcoming)
-            yield prepared.frame, prediction, state
+        """Yields frame, prediction and state after each of these frames of a sequence.
+
+        The next frame may be launched before a frame is finished, see `overlap`; its errors are raised afterwards.
+        """
+        before, begun = state or RunnerState(), deque[BegunStep]()
+
+        def finished(kept: int) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
+            nonlocal before
+            while len(begun) > kept:
+                step, *later = begun
+                begun.clear()  # an error in this step is the end
+                before, prediction = self.finish(step, before.tracks)
+                yield step.prepared.frame, prediction, before
+                if prediction.not_finite:  # the next one was begun with its history
+                    later = [self.begin(before, each.prepared, each.upcoming) for each in later]
+                begun.extend(later)
+
+        try:
+            for prepared, upcoming in self.frames(sequence, indices, preprocessor):
+                begun.append(self.begin(begun[-1].after if begun else before, prepared, upcoming))
+                yield from finished(self.overlap)
+        except Exception:
+            yield from finished(0)
+            raise
+        yield from finished(0)
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""

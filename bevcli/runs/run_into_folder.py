@@ -86,10 +86,9 @@ def run_into_folder(
             with files, writer, WriteBehind(write) as background:
                 asked = {"ask_attention": options.recording.shows_internals, "probes": tuple(options.recording.probes)}
                 runner = model.runner(track=options.track, temporal=options.temporal, commands=commands, **asked)
-                after, indices = state.runner, range(done, len(sequence.stamps))
-                for prepared, upcoming in runner.frames(sequence, indices, runner.preprocessor(options.cameras)):
-                    after, prediction = runner.step(after, prepared, upcoming)
-                    if not background.put((prepared.frame, prediction, after)):
+                indices, preprocessor = range(done, len(sequence.stamps)), runner.preprocessor(options.cameras)
+                for step in runner.run(sequence, indices, preprocessor, state.runner):
+                    if not background.put(step):
                         break
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:
                 raise no_image_error(sequence.name, (image[1:] for image in summary.counts.dropped))

@@ -188,14 +188,14 @@ def test_runs_and_the_model_alone_take_turns_without_a_gap(window_model, monkeyp
     monkeypatch.setattr(measure, "RUNS", 2)
     version, drive = Version(window_model(-1, 0), torch.device("cpu")), MadeUpDrive(17)
     version.step(Preprocessor(version.runner.config)(drive.load(0)))
-    step, seen = version.runner.step, []
+    finish, seen = version.runner.finish, []
 
     def watched(*arguments):
-        state, prediction = step(*arguments)
+        state, prediction = finish(*arguments)
         seen.append((prediction.stamp.index, prediction.started_anew))
         return state, prediction
 
-    monkeypatch.setattr(version.runner, "step", watched)
+    monkeypatch.setattr(version.runner, "finish", watched)
     run_s, ratio = measure.time_runs(version, drive, 1, 4)
     assert seen == [(place, None) for place in range(1, 17)]
     assert run_s > 0

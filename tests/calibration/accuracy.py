@@ -19,7 +19,8 @@ from bevcli.geometry.transforms import Array
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import CalibrationResult, CameraEstimate, Verdict, delay_text, judge, measure
+from bevcli.workshop.calibration.calibrate import CalibrationResult, judge, measure
+from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, delay_text
 from bevcli.workshop.calibration.views import Views, match_points, read_views
 from bevcli.workshop.robustness.conditions import CalibrationNoise, Draws
 

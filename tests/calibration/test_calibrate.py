@@ -19,7 +19,8 @@ from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 from bevcli.workshop.calibration import calibrate as calibrating, in_turn
-from bevcli.workshop.calibration.calibrate import CorrectedDrive, Verdict, common_delay_text, either_text, findings_of
+from bevcli.workshop.calibration.calibrate import CorrectedDrive, findings_of
+from bevcli.workshop.calibration.estimates import Verdict, common_delay_text, either_text
 from bevcli.workshop.calibration.views import match_points
 
 STREET = Path(__file__).parents[2] / "samples/street"

@@ -26,7 +26,8 @@ from test_project_debug import calibration, write_drive, write_motion
 import bevcli
 from bevcli.rig.check_calibration import check_calibration
 from bevcli.rig.sequence_checks import check_ego_motion
-from bevcli.workshop.calibration.calibrate import CameraEstimate, Verdict, findings_of, motion_findings
+from bevcli.workshop.calibration.calibrate import findings_of, motion_findings
+from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict
 from bevcli.workshop.odometry.compare import compare, not_compared
 
 DOCUMENT = Path(bevcli.__file__).parents[1] / "docs" / "calibration.md"

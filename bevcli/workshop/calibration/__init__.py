@@ -4,6 +4,7 @@ In the order of the work, on top of the wing `correspondence`, which finds what 
     adjustment           what is estimated, and the geometry that follows from it
     views                the frame pairs that are used, their grey images, matched points
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
+    estimates            what is said of each camera and of the whole rig
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
     in_turn              the same for a drive without poses, whose motion the wing `odometry` measures
 """

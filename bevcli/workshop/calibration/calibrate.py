@@ -1,14 +1,12 @@
 """`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames.
 
-In this order: what is said of each camera and the whole rig, with its texts; the rounds of the measurement, rotations
-from matched points and heights from the road; the verdicts. `motion_findings` is the same in short, as findings for
-`bevcli project-debug`.
+In this order: the rounds of the measurement, rotations from matched points and heights from the road; the verdicts.
+`motion_findings` is the same in short, as findings for `bevcli project-debug`.
 """
 
 import json
 from collections.abc import Callable, Sequence as Items
 from dataclasses import asdict, dataclass, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,19 @@ from bevcli.options import gather
 from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.workshop.calibration import CalibrateOptions, adjustment
+from bevcli.workshop.calibration.estimates import (
+    HEADER,
+    MEASURED_MOTION,
+    CameraEstimate,
+    RigEstimate,
+    Verdict,
+    change_text,
+    common_delay_text,
+    delay_text,
+    either_text,
+    rig_text,
+    row,
+)
 from bevcli.workshop.calibration.road import followed, level_corrections, road_residuals, search_heights, sees_road
 from bevcli.workshop.calibration.views import (
     FEWEST_PAIRS,
@@ -39,192 +50,7 @@ from bevcli.workshop.correspondence.images import WIDTH
 from bevcli.workshop.correspondence.residuals import DepthResiduals, RoadResiduals
 from bevcli.writing import write_whole
 
-Triple = tuple[float, float, float]
-HEADER = (
-    "camera", "yaw off by", "pitch", "roll", "x off by", "y", "z", "matches", "residual px", "verdict",
-)  # fmt: skip
-MEASURED_MOTION = (
-    "the motion is measured from the images (rounds: {rounds}): height and scale cannot be told apart (a rig that is "
-    "higher, on a vehicle that is faster, sees the same), so heights count from their stated mean; nor can yaw and "
-    "direction, so yaw counts from its stated mean: all cameras are off by {yaw:+.2f}° ± {deviation:.2f}° more if the "
-    "vehicle drives along x"
-)
-CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
 EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
-TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
-MOST_DELAY_MS = 300.0  # a larger one is a rotation
-
-
-class Verdict(Enum):
-    """What is done with a camera's calibration."""
-
-    FINE = "fine"
-    CORRECTED = "corrected"
-    NOT_MEASURABLE = "not measurable"
-
-
-@dataclass(frozen=True)
-class CameraEstimate:
-    """What a drive says about one camera.
-
-    Attributes:
-        camera: its name.
-        verdict: what is done with its calibration.
-        reason: why it is not measurable; "" else.
-        rotation_deg: yaw, pitch and roll of the stated rotation minus the measured one, degrees, as in `Mounting`.
-        rotation_deviation_deg: standard deviations.
-        position_m: x, y, z of the stated position minus the measured one, metres, ego frame.
-        position_deviation_m: standard deviations; that of the stated position where nothing is measured.
-        delay_ms: how much later than stated its images were taken.
-        delay_deviation_ms: standard deviation.
-        matches: matched points.
-        road_points: points of the road.
-        before_px: median residual of the matched points with the stated calibration, pixels of the original image.
-        after_px: the same with the measured one.
-        change: (7,) rotation in the camera frame, radians; position in the ego frame, metres; delay, seconds.
-        covariance: (7, 7) of it.
-    """
-
-    camera: str
-    verdict: Verdict
-    reason: str
-    rotation_deg: Triple
-    rotation_deviation_deg: Triple
-    position_m: Triple
-    position_deviation_m: Triple
-    delay_ms: float
-    delay_deviation_ms: float
-    matches: int
-    road_points: int
-    before_px: float
-    after_px: float
-    change: Array
-    covariance: Array
-
-    def to_dict(self) -> dict[str, Any]:
-        """For the report."""
-        entry = asdict(self) | {"verdict": self.verdict.value}
-        return entry | {"change": self.change.tolist(), "covariance": self.covariance.tolist()}
-
-
-@dataclass(frozen=True)
-class RigEstimate:
-    """What a drive says about the whole rig.
-
-    Attributes:
-        scale: of the ego-motion minus 1: 0.01 if the vehicle drove 1 % farther than stated.
-        scale_deviation: standard deviation.
-        height_m: mean height of the cameras above the road, stated minus measured, metres.
-        height_deviation_m: standard deviation.
-        tilt_deg: pitch and roll of the ego frame over the road, degrees: positive if its front, its left points down.
-        tilt_deviation_deg: standard deviations.
-    """
-
-    scale: float
-    scale_deviation: float
-    height_m: float
-    height_deviation_m: float
-    tilt_deg: tuple[float, float]
-    tilt_deviation_deg: tuple[float, float]
-
-
-def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate], interval_ms: float | None = None) -> str:
-    """Lines about the whole rig, and about the capture times of its cameras. interval_ms: see `CalibrationResult`."""
-    pitch, roll = (f"{a:+.2f}° ± {d:.2f}°" for a, d in zip(whole.tilt_deg, whole.tilt_deviation_deg, strict=True))
-    lines = [
-        f"height of the rig over the road off by {_metres(whole.height_m, whole.height_deviation_m)}; "
-        f"tilt of the ego frame: pitch {pitch}, roll {roll}",
-        f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
-    ]
-    common = common_delay_text(cameras, interval_ms)
-    texts = [common] if common else [delay_text(estimate) for estimate in cameras]
-    texts += [either_text(estimate) for estimate in cameras]
-    return "\n".join([*lines, *(f"time offset: {text}" for text in texts if text)])
-
-
-def common_delay_text(cameras: Items[CameraEstimate], interval_ms: float | None) -> str:
-    """A time offset that is certain and the same for all cameras, in words; "" where there is none."""
-    told = [each for each in cameras if each.delay_deviation_ms <= TOLD_DELAY_MS]
-    if not told or len(told) < min(2, len(cameras)):
-        return ""
-    delays, deviations = np.array([(each.delay_ms, each.delay_deviation_ms) for each in told]).T
-    delay, deviation = float(np.average(delays, weights=1 / deviations**2)), float(deviations.min())
-    differ = np.abs(delays - delay) > CERTAIN_DELAY[0] * deviations
-    if differ.any() or abs(delay) < max(CERTAIN_DELAY[0] * deviation, CERTAIN_DELAY[1]):
-        return ""
-    of = "all cameras" if len(cameras) > 1 else told[0].camera
-    text = (
-        f"the images of {of} were taken {abs(delay):.0f} ± {deviation:.0f} ms {_word(delay)} than stated, or the poses "
-        f"are of times that much {_word(-delay)}"
-    )
-    if interval_ms is None:
-        return text
-    return (
-        f"{text}, or the frames, one each {interval_ms:g} ms as stated, were not taken evenly: all of it explains this"
-    )
-
-
-def delay_text(estimate: CameraEstimate) -> str:
-    """A time offset that is certain, in words; "" where there is none."""
-    deviations, least = CERTAIN_DELAY
-    size, deviation = abs(estimate.delay_ms), estimate.delay_deviation_ms
-    if deviation > TOLD_DELAY_MS or size < max(deviations * deviation, least):
-        return ""
-    word = _word(estimate.delay_ms)
-    return f"the images of {estimate.camera} were taken {size:.0f} ± {deviation:.0f} ms {word} than stated"
-
-
-def either_text(estimate: CameraEstimate) -> str:
-    """A time offset or a rotation, in words, where the motion does not tell which of both; "" where it does.
-
-    A vehicle that turns evenly moves a late camera as if it were turned.
-    """
-    rotation, covariance = estimate.change[:3], estimate.covariance
-    if estimate.verdict is Verdict.FINE or estimate.delay_deviation_ms <= TOLD_DELAY_MS:
-        return ""
-    gain = np.linalg.solve(covariance[:3, :3], covariance[:3, 6])
-    delay_ms = 1000 * float(estimate.change[6] - gain @ rotation)  # if the stated rotation is right
-    deviation_ms = 1000 * float(np.sqrt(max(covariance[6, 6] - gain @ covariance[:3, 6], 0)))
-    certain = max(CERTAIN_DELAY[0] * deviation_ms, CERTAIN_DELAY[1])
-    if deviation_ms > TOLD_DELAY_MS or not certain <= abs(delay_ms) <= MOST_DELAY_MS:
-        return ""
-    turned = rotation - covariance[:3, 6] / covariance[6, 6] * estimate.change[6]  # if the stated times are right
-    return (
-        f"the images of {estimate.camera} were taken {abs(delay_ms):.0f} ms {_word(delay_ms)} than stated, or it is "
-        f"turned by {np.degrees(np.linalg.norm(turned)):.1f}°: the drive does not tell which of both"
-    )
-
-
-def _word(delay_ms: float) -> str:
-    return "later" if delay_ms > 0 else "earlier"
-
-
-def change_text(estimate: CameraEstimate) -> str:
-    """How far a camera is off, in words: "off by yaw +1.98° ± 0.05°, z +0.150 m ± 0.005 m", and so on."""
-    rotation = zip(("yaw", "pitch", "roll"), estimate.rotation_deg, estimate.rotation_deviation_deg, strict=True)
-    position = zip("xyz", estimate.position_m, estimate.position_deviation_m, strict=True)
-    parts = [f"{name} {value:+.2f}° ± {deviation:.2f}°" for name, value, deviation in rotation]
-    parts += [f"{name} {value:+.3f} m ± {deviation:.3f} m" for name, value, deviation in position if value]
-    return "off by " + ", ".join(parts)
-
-
-def _row(estimate: CameraEstimate) -> tuple[str, ...]:
-    if estimate.verdict is Verdict.NOT_MEASURABLE:
-        cells = ["–"] * 6
-    else:
-        pairs = zip(estimate.rotation_deg, estimate.rotation_deviation_deg, strict=True)
-        cells = [f"{value:+.2f}±{deviation:.2f}°" for value, deviation in pairs]
-        places = zip(estimate.position_m, estimate.position_deviation_m, strict=True)
-        cells += [_metres(value, deviation) for value, deviation in places]
-    verdict = estimate.verdict.value + (f": {estimate.reason}" if estimate.reason else "")
-    residual = f"{estimate.before_px:.2f} → {estimate.after_px:.2f}" if estimate.matches else "–"
-    return (estimate.camera, *cells, f"{estimate.matches}", residual, verdict)
-
-
-def _metres(value: float, deviation: float) -> str:
-    return f"{value:+.3f}±{deviation:.3f} m"
-
-
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
 POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
 CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
@@ -382,7 +208,7 @@ class CalibrationResult:
     def text(self) -> str:
         """One row a camera, and lines about the whole rig, for a terminal."""
         pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
-        table = aligned([HEADER, *map(_row, self.cameras)], left=(0, 9))
+        table = aligned([HEADER, *map(row, self.cameras)], left=(0, 9))
         yaw, deviation = self.drives_beside_x_deg
         measured = [MEASURED_MOTION.format(rounds=self.rounds, yaw=yaw, deviation=deviation)] if self.rounds else []
         return "\n".join([table, "", pairs, rig_text(self.whole, self.cameras, self.interval_ms), *measured])

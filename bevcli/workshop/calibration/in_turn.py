@@ -15,7 +15,8 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, RigEstimate, calibrate
+from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, calibrate
+from bevcli.workshop.calibration.estimates import RigEstimate
 from bevcli.workshop.odometry.run_option import with_measured_motion
 
 MOST_ROUNDS = 4

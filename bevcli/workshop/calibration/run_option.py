@@ -26,11 +26,12 @@ def _corrected(options: CalibrateFirstOptions, drive: "Sequence") -> "Sequence":
         return drive
     from bevcli.cli.progress import Progress
     from bevcli.workshop.calibration import calibrate as calibration
+    from bevcli.workshop.calibration.estimates import Verdict, change_text
 
     with Progress(calibration.STEPS, "steps of the calibration") as progress:
         result = calibration.calibrate(drive, after_step=progress.advance)
     for camera in result.cameras:
-        reason = calibration.change_text(camera) if camera.verdict is calibration.Verdict.CORRECTED else camera.reason
+        reason = change_text(camera) if camera.verdict is Verdict.CORRECTED else camera.reason
         say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
     return calibration.CorrectedDrive(drive, result)
 

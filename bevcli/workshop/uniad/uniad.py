@@ -184,6 +184,7 @@ class UniAD(BEVFormer):
 
     config: UniADConfig
     config_class = UniADConfig
+    reads_once = False  # the CPU chooses the tracks
     memory_type = TrackMemory
     stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
     official_names = OFFICIAL_NAMES
