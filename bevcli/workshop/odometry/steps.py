@@ -52,7 +52,7 @@ FEW = 10  # points of the road, of a motion that has none of its own
 CLIMB = 5  # cells, to the most votes of the road near a distance on which matched points agree
 APART_M = 0.4  # between them
 FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
-STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands
+STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands or creeps
 SURE_OF_ROAD, UNSURE = 15, 2.0  # points of the road, and the factor of all deviations where there are fewer
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
@@ -297,10 +297,11 @@ def measured(
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
     covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
-    floor = STILL_FLOOR if guess.still else FLOOR
     if len(road.group) < SURE_OF_ROAD and not guess.still:
         covariance = UNSURE**2 * covariance
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + floor
+    state = start + solution.x[STATE]
+    floor = STILL_FLOOR if guess.still or np.hypot(*state[3:5]) < LEAST_M else FLOOR
+    motion = unknowns.covariance(solution.x, covariance) + floor
     kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
     seen = seen_points(step.second.cameras, *kinds)
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
