@@ -1,8 +1,10 @@
 """The choice among the motions that each step may have."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from bevcli.workshop.odometry.chain import Chain
+from bevcli.workshop.odometry.chain import Chain, leaps
 from bevcli.workshop.odometry.steps import Candidate
 
 
@@ -31,6 +33,15 @@ def test_many_votes_outweigh_a_change_of_speed() -> None:
 
 def test_backwards_is_not_the_same_speed() -> None:
     assert chosen([[driven(-2.0, 5.0)], [driven(2.0, 4.1), driven(-2.0, 4.0)]]) == [-2.0, -2.0]
+
+
+def test_a_leap_with_few_points_of_the_road_is_not_believed() -> None:
+    before, short, after = driven(4.0, 1.0), driven(0.9, 1.0), driven(4.2, 1.0)
+    times = 0.5, 0.5, 0.5
+    assert leaps(before, short, after, times)
+    assert not leaps(before, replace(short, road_points=400), after, times)
+    assert not leaps(before, short, driven(0.2, 1.0), times)  # it brakes
+    assert not leaps(before, driven(3.5, 1.0), after, times)
 
 
 def test_a_step_is_decided_one_step_later() -> None:

@@ -14,6 +14,18 @@ from bevcli.workshop.odometry.steps import Candidate
 VOTES = 6.0  # cost of a motion with 1/e of the votes
 ACCELERATION, TURN = 2.0, np.radians(15.0)  # usual changes a second of speed (m/s) and of yaw rate (radians a second)
 
+LEAP, LEAP_M = 2.0, 0.5  # m/s² and metres, of a way that differs from those of both neighbours alike
+SURE = 60  # points of the road, of a motion that may leap all the same
+
+
+def leaps(before: Candidate, candidate: Candidate, after: Candidate, seconds: tuple[float, float, float]) -> bool:
+    """True for a motion with few points of the road whose speed is far above, or below, that of both neighbours."""
+    steps = zip((before, candidate, after), seconds, strict=True)
+    first, speed, last = (float(each.speed_and_rate(time)[0]) for each, time in steps)
+    apart = min(abs(speed - first), abs(speed - last)) * seconds[1]
+    alike = (speed - first) * (speed - last) > 0
+    return candidate.road_points < SURE and alike and apart > LEAP_M + LEAP * seconds[1] ** 2
+
 
 @dataclass
 class Chain:

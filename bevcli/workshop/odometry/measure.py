@@ -12,13 +12,14 @@ from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.workshop.odometry import OdometryOptions
-from bevcli.workshop.odometry.chain import Chain
+from bevcli.workshop.odometry.chain import Chain, leaps
 from bevcli.workshop.odometry.frames import FrameView, Viewer
 from bevcli.workshop.odometry.seen_points import SeenPoints
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, StepViews, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.twist import exponential, logarithm
 from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
 
+LEAPS = "its length contradicts the steps before and after, and few points of the road match"
 SUBSTEP_NS = 25_000_000  # between the poses of `MeasuredMotion.ego_motion`
 BEYOND_NS = 100_000_000  # of constant velocity before the first and after the last frame, for cameras with other times
 
@@ -104,6 +105,7 @@ class MotionMeter:
         self._last: FrameView | None = None
         self._before: tuple[Array, float] | None = None  # the state of the step before and its seconds
         self._seconds, self._guessed = 0.0, 0  # of the step that is not decided; guesses in a row
+        self._sure: tuple[Candidate, float] | None = None  # the measured step before that one, and its seconds
 
     def add(self, frame: Frame) -> list[MeasuredStep]:
         """The steps that are certain now: of the frame before at the latest."""
@@ -120,7 +122,8 @@ class MotionMeter:
         decided = self._chain.add(found, seconds)
         likeliest = self._chain.likeliest
         assert likeliest is not None
-        steps, self._seconds = [] if decided is None else [self._decided(decided)], seconds
+        steps = [] if decided is None else [self._decided(decided, (likeliest, seconds))]
+        self._seconds = seconds
         if is_measured(likeliest):
             self._before = likeliest.state, seconds
         return steps
@@ -136,7 +139,15 @@ class MotionMeter:
         decided = self._chain.end()
         return [] if decided is None else [self._decided(decided)]
 
-    def _decided(self, candidate: Candidate) -> MeasuredStep:
+    def _decided(self, candidate: Candidate, after: tuple[Candidate, float] | None = None) -> MeasuredStep:
+        """A step, whose neighbours may contradict it. after: the motion of the next one and its seconds."""
+        before, self._sure = self._sure, (candidate, self._seconds) if is_measured(candidate) else None
+        if before and after and is_measured(candidate) and is_measured(after[0]):
+            lasted = before[1], self._seconds, after[1]
+            if leaps(before[0], candidate, after[0], lasted):
+                self._before, self._sure = (before[0].state, before[1]), None
+                self._guessed += 1
+                return self._guess(self._seconds, LEAPS)
         self._guessed = 0 if is_measured(candidate) else self._guessed + 1
         return self._step(candidate)
 

@@ -47,9 +47,13 @@ LEAST_SHARE = 0.3  # of the points of two cameras that fit; where fewer do, both
 LEAST_SPREAD, MOST_SPREAD = 0.3, 2.0  # of residuals, while the motion is searched
 CANDIDATES = 3  # distances of a step that are measured
 LEAST_VOTES = 0.5  # share of the most votes, of another distance that is measured
+SHORT = 0.25  # of the way that matched points tell
+FEW = 10  # points of the road, of a motion that has none of its own
+CLIMB = 5  # cells, to the most votes of the road near a distance on which matched points agree
 APART_M = 0.4  # between them
 FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covariance: the calibration is no better
-STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands
+STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands or creeps
+SURE_OF_ROAD, UNSURE = 15, 2.0  # points of the road, and the factor of all deviations where there are fewer
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
 
@@ -215,17 +219,22 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     sense, ways = _sense(step, points, rough), _ways(step, points, rough)
     points = points.where(~under_the_road(ways))
     roads = step.first.road(rough[SLOPES]), step.second.road(next_slopes(rough))
-    distances, votes = distance_votes(*roads, heading, float(rough[2]), cells)
-    votes *= point_votes(ways, distances)
-    votes[np.sign(distances) == -sense] = 0
+    distances, of_road = distance_votes(*roads, heading, float(rough[2]), cells)
+    of_road[np.sign(distances) == -sense] = 0
+    votes = of_road * point_votes(ways, distances)
     starts = []
     for index in _peaks(votes)[:CANDIDATES]:
-        start = rough.copy()
-        distance = max(abs(distances[index]), LEAST_M) * (sense or np.sign(distances[index]) or 1)
+        start, way = rough.copy(), distances[_top(of_road, index)]
+        distance = max(abs(way), LEAST_M) * (sense or np.sign(way) or 1)
         start[3:5] = distance * np.array([np.cos(heading), np.sin(heading)])
         starts.append((start, float(votes[index])))
     # Without road, two cameras may still tell the distance.
-    return [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
+    found = [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
+    # Where matched points tell a far longer way, the points of the road are drops on the lens, or the own shadow.
+    least = SHORT * float(np.nanmedian(ways)) if np.isfinite(ways).any() else 0.0
+    counts = [each.road_points if np.hypot(*each.state[3:5]) > least else 0 for each in found]
+    shares = (FEW + np.array(counts)) / (FEW + max(counts))
+    return [replace(each, votes=each.votes * float(share)) for each, share in zip(found, shares, strict=True)]
 
 
 def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
@@ -259,6 +268,13 @@ def _peaks(votes: Array) -> list[int]:
     return found
 
 
+def _top(votes: Array, index: int) -> int:
+    """The index of the most votes near one, or the same where votes only rise towards others."""
+    first = max(0, index - CLIMB)
+    top = first + int(votes[first : index + CLIMB + 1].argmax())
+    return top if abs(top - index) < CLIMB else index
+
+
 def measured(
     step: StepViews,
     points: EpipolarResiduals,
@@ -281,8 +297,11 @@ def measured(
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
     covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
-    floor = STILL_FLOOR if guess.still else FLOOR
-    state, motion = start + solution.x[STATE], unknowns.covariance(solution.x, covariance) + floor
+    if len(road.group) < SURE_OF_ROAD and not guess.still:
+        covariance = UNSURE**2 * covariance
+    state = start + solution.x[STATE]
+    floor = STILL_FLOOR if guess.still or np.hypot(*state[3:5]) < LEAST_M else FLOOR
+    motion = unknowns.covariance(solution.x, covariance) + floor
     kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
     seen = seen_points(step.second.cameras, *kinds)
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
