@@ -25,6 +25,7 @@ BEYOND_NS = 100_000_000  # of constant velocity before the first and after the l
 
 # Deviations of a guess, for a second: of pitch and roll, of yaw (radians) and of the speed along the way (metres).
 ROCKING, TURNING, SPEEDING = np.radians(3.0), np.radians(15.0), 4.0
+LASTING = 0.75  # share of a slope that the next step expects: else an error of slopes would grow from step to step
 UNKNOWN = 4.0  # factor of the deviations of a guess where nothing was measured before
 
 
@@ -169,7 +170,7 @@ class MotionMeter:
             return None
         state, lasted = self._before
         expected = state * seconds / lasted
-        expected[SLOPES], expected[5] = next_slopes(state), 0
+        expected[SLOPES], expected[5] = LASTING * next_slopes(state), 0
         return expected
 
     def _guess(self, seconds: float, reason: str) -> MeasuredStep:
