@@ -24,6 +24,7 @@ from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import read_json
+from bevcli.registry import for_model
 
 Memory = TypeVar("Memory")
 # Commands of the driver, such as "straight": each chooses one of the paths that a model plans. Index of a frame and the
@@ -120,8 +121,8 @@ class Runner:
 
         0 on other devices, and where this gains nothing, because more is read of the device than the outputs.
         """
-        reads_once = self.model.reads_once and not self.options.ask_attention
-        return int(self.device.type == "cuda" and reads_once)
+        reads_more = self.options.ask_attention or for_model("read_within_a_step", type(self.model))
+        return int(self.device.type == "cuda" and not reads_more)
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
         """A preprocessor of frames for this model. cameras: see `Preprocessor`."""

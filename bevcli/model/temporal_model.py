@@ -56,7 +56,6 @@ class TemporalModel(nn.Module):
         config_class: class of the configuration, which a TOML file fills in.
         memory_type: class of the memory, by which the state of an interrupted run is read.
         official_names: of the tensors in the released files of the model.
-        reads_once: `step` reads nothing of its device, and `decode` only what was copied to the CPU.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
         config: of the model.
     """
@@ -64,7 +63,6 @@ class TemporalModel(nn.Module):
     config_class: ClassVar[type[ModelConfig]] = ModelConfig
     memory_type: ClassVar[type] = type(None)
     official_names: ClassVar[OfficialNames] = OfficialNames()
-    reads_once: ClassVar[bool] = True
     stages: Mapping[str, str] = {}
 
     def __init__(self, config: ModelConfig) -> None:

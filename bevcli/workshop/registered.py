@@ -32,6 +32,7 @@ OWN: dict[Group, dict[str, str]] = {
         "outputs_of_file VAD": "bevcli.workshop.vad.vad:outputs_of_file",
         "part_names UniAD": "bevcli.workshop.uniad.uniad:PART_NAMES",
         "part_names VAD": "bevcli.workshop.vad.vad:PART_NAMES",
+        "read_within_a_step UniAD": "bevcli.workshop.uniad.uniad:READ_WITHIN_A_STEP",
         "past BEVFormerV2": "bevcli.workshop.benchmark.versions:with_past",
     },
     "bevcli.sequences": {

@@ -164,6 +164,7 @@ _RENAMES: Renames = (
 # The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
 OFFICIAL_NAMES = OfficialNames(r"^(query_embedding|memory_bank|query_interact|seg_head)\.", _RENAMES, _UNUSED)
 
+READ_WITHIN_A_STEP = "tracks"  # the CPU chooses them, so a step waits for its device
 PART_NAMES = (
     ("tracks: memory bank", "memory_bank"),
     ("tracks: query interaction", "query_interaction"),
@@ -184,7 +185,6 @@ class UniAD(BEVFormer):
 
     config: UniADConfig
     config_class = UniADConfig
-    reads_once = False  # the CPU chooses the tracks
     memory_type = TrackMemory
     stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
     official_names = OFFICIAL_NAMES
