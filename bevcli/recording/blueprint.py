@@ -1,16 +1,21 @@
 """The layout of a recording in the viewer: cameras above and below scene and BEV; curves and texts to the right."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.parsing.files import plain_name
 from bevcli.recording import entities
 from bevcli.recording.log_static import COLUMN_WIDTH, LEGEND_COLUMNS, ROW_HEIGHT, Recorded, legend_entries
+from bevcli.writing import whole_file
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
 HIDDEN = rrb.EntityBehavior(visible=False)
@@ -84,6 +89,18 @@ class Layout(rrb.Blueprint):
         """Frees what sending it took, with rerun's next `flush_and_cleanup_orphaned_recordings`."""
         while self._streams:
             self._streams.pop().disconnect()
+
+    @contextmanager
+    def saved_to(self, path: Path, application: str) -> Iterator[rr.RecordingStream]:
+        """The stream of a recording with this layout, for one block. Frees the layout. Raises OutputError."""
+        with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream(application) as stream:
+            try:
+                stream.save(unfinished, default_blueprint=self)
+            except RuntimeError as error:
+                raise OutputError(f"{path}: the recording cannot be written ({error})") from error
+            finally:
+                self.free()
+            yield stream
 
 
 def recording_blueprint(recorded: Recorded, *, follows: bool = False) -> Layout:

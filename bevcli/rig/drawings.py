@@ -20,13 +20,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bevcli.errors import OutputError
 from bevcli.findings import Finding
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.parsing.files import plain_name
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.components import log
@@ -375,14 +373,7 @@ OVERLAYS = ("pillars", "ground_grid", "pillar_lines", "horizon")
 
 def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
-    layout = _layout(rig)
-    with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream("bevcli-project-debug") as stream:
-        try:
-            stream.save(unfinished, default_blueprint=layout)
-        except RuntimeError as error:
-            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        finally:
-            layout.free()
+    with _layout(rig).saved_to(path, "bevcli-project-debug") as stream:
         log_static.log_scene(stream, rig, {})
         _log_coverage(stream, rig, report.coverage)
         for camera in rig.cameras:

@@ -8,17 +8,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevcli.errors import OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.parsing.files import plain_name
 from bevcli.recording import entities
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.picture import SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
 from bevcli.workshop.odometry.seen_points import SeenPoints
-from bevcli.writing import whole_file
 
 WAY, ROAD, CAMERAS = "way", "road", "cameras"
 CURVES = {"speed": "speed, m/s", "yaw_rate": "yaw rate, °/s"}
@@ -33,14 +30,7 @@ def write_recording(
     path: Path, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, stated: Items[Array] | None
 ) -> None:
     """Write the recording. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
-    layout = _layout(drive, road)
-    with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream("bevcli-odometry") as stream:
-        try:
-            stream.save(unfinished, default_blueprint=layout)
-        except RuntimeError as error:
-            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        finally:
-            layout.free()
+    with _layout(drive, road).saved_to(path, "bevcli-odometry") as stream:
         _log_way(stream, motion, road, stated)
         for name in CURVES:
             for part, text, color, width in SERIES:

@@ -108,6 +108,15 @@ class StepViews:
         part = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
         return np.asarray((first * self.cameras + second) * PARTS + part, dtype=np.int64)
 
+    def of_single_cameras(self, points: EpipolarResiduals) -> EpipolarResiduals:
+        """The points whose images are of the same camera."""
+        return points.where(np.equal(*self.pair(points.group)))
+
+    def geometry(self, state: Array) -> GroupGeometry:
+        """The geometry of all groups for a state (8,)."""
+        unknowns = self.unknowns(state, np.ones(COUNT))
+        return unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
+
     def unknowns(self, start: Array, deviations: Array) -> StepUnknowns:
         """The unknowns about a start (8,)."""
         groups = self.pair(np.arange(self.cameras**2 * PARTS))
@@ -185,7 +194,7 @@ def is_still(step: StepViews, points: EpipolarResiduals) -> bool:
 
 def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array:
     """(8,) the motion that fits the matched points of single cameras; its length is that of the guess, if any."""
-    inside = points.where(np.equal(*step.pair(points.group)))
+    inside = step.of_single_cameras(points)
     known = guess.state is not None and np.hypot(*guess.state[3:5]) > SHORTEST_M
     length = float(guess.state[3]) if known and guess.state is not None else USUAL_M
     starts = [along_arc(length, yaw, guess.slopes) for yaw in YAWS] + ([] if guess.state is None else [guess.state])
@@ -239,9 +248,7 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
 
 def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
     """1 for a vehicle that drives forwards, -1 for backwards, since points are in front of cameras; 0: not clear."""
-    unknowns = step.unknowns(rough, np.ones(COUNT))
-    inside = points.where(np.equal(*step.pair(points.group)))
-    depths = inside.depths(unknowns.geometry(np.zeros((len(unknowns.shares), COUNT))))
+    depths = step.of_single_cameras(points).depths(step.geometry(rough))
     near = depths[(np.abs(depths) < CLEAR_M).all(-1)]
     if len(near) < FEWEST:
         return 0
@@ -251,9 +258,7 @@ def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
 
 def _ways(step: StepViews, points: EpipolarResiduals, state: Array) -> Array:
     """(n,) the ways with which matched points of single cameras lie on the road; NaN for those that tell none."""
-    unknowns = step.unknowns(state, np.ones(COUNT))
-    geometry = unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
-    ways = ways_of_points(points, geometry, float(np.hypot(*state[3:5])))
+    ways = ways_of_points(points, step.geometry(state), float(np.hypot(*state[3:5])))
     return np.where(np.equal(*step.pair(points.group)), ways, np.nan)
 
 
@@ -319,7 +324,7 @@ class StillPoints(EpipolarResiduals):
 
 def _still(step: StepViews, points: EpipolarResiduals) -> StillPoints:
     """The points of single cameras."""
-    inside = points.where(np.equal(*step.pair(points.group)))
+    inside = step.of_single_cameras(points)
     return StillPoints(inside.group, inside.rays_a, inside.rays_b, inside.focal)
 
 
