@@ -108,5 +108,6 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.extensions": {
         "project-debug.motion": "bevcli.workshop.calibration.commands:CHECK_MOTION",
         "run.calibrate": "bevcli.workshop.calibration.run_option:CALIBRATE_FIRST",
+        "run-done.score": "bevcli.workshop.trust.run_option:SCORE_WITHOUT_LABELS",
     },
 }

@@ -34,7 +34,7 @@ SECTIONS = {
         "docs/rendered-drives",
     ],
     "Calibrate": ["docs/calibration"],
-    "Score": ["docs/scoring", "docs/compare", "docs/robustness"],
+    "Score": ["docs/scoring", "docs/compare", "docs/robustness", "docs/trust"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/containers", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
