@@ -54,7 +54,7 @@ WINGS: dict[str, set[str]] = {
     "synth": {"formats"},
     "scores": set(),
     "training": {"synth", "trust"},
-    "trust": {"robustness", "synth"},
+    "trust": {"robustness", "scores", "synth"},
     "uniad": set(),
     "vad": {"formats", "training"},
 }

@@ -73,6 +73,7 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.comparisons": {
         "boxes": "bevcli.workshop.scores.compare:compare",
+        "rigs": "bevcli.workshop.trust.gap_option:gap_of_rigs",
     },
     "bevcli.plots": {
         "comparison": "bevcli.workshop.scores.plots:write_comparison",
