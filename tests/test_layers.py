@@ -54,7 +54,7 @@ WINGS: dict[str, set[str]] = {
     "synth": {"formats"},
     "scores": set(),
     "training": {"synth"},
-    "trust": {"robustness", "synth"},
+    "trust": {"correspondence", "odometry", "robustness", "synth"},
     "uniad": set(),
     "vad": {"formats", "training"},
 }
