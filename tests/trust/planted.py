@@ -1,13 +1,19 @@
-"""Drives with one planted fault each, and the table of which ones `find_faults` finds without labels."""
+"""Drives with one planted fault each, and the table of which ones `find_faults` finds without labels.
 
+python tests/trust/planted.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
+"""
+
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import zip_longest
 
 import numpy as np
 
 from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
+from bevcli.workshop.robustness.conditions import choose_conditions
 
 
 class Planted(DerivedSequence):
@@ -139,3 +145,106 @@ def mirrored_poses(drive: Sequence) -> Sequence:
 def lost_poses(drive: Sequence) -> Sequence:
     """Poses that stand still."""
     return OtherPoses(drive, lambda start, pose: rigid(start))
+
+
+def beside(drive: Sequence, camera: str) -> str:
+    """The next camera in the rig."""
+    names = drive.rig.names
+    return names[(names.index(camera) + 1) % len(names)]
+
+
+# Fault -> how to plant it into a drive with the camera that has it, and the findings of which one names it.
+FAULTS = {
+    "camera black": (black, "camera-dead"),
+    "camera frozen": (frozen, "camera-frozen"),
+    "images of two cameras exchanged": (lambda d, c: exchanged(d, c, beside(d, c)), "images-exchanged"),
+    "images of one camera mirrored": (mirrored, "images-mirrored"),
+    "images of one camera 0.5 s late": (late, "images-late"),
+    "yaw of one camera off by 2°": (yawed, "rotation-off"),
+    "pitch of one camera off by 2°": (pitched, "rotation-off"),
+    "focal length of one camera off by 15 %": (longer_focal, "focal-length"),
+    "poses: km/h taken for m/s": (lambda d, c: scaled_poses(d), "motion-scale"),
+    "poses: y mirrored": (lambda d, c: mirrored_poses(d), "motion-axes"),
+    "poses: all the same": (lambda d, c: lost_poses(d), "motion-stands"),
+    "red and blue exchanged": (lambda d, c: wrong_channels(d), "color-order"),
+}
+MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives
+
+
+def sound_drive(drive: Sequence, number: int) -> Sequence:
+    """Every second sound drive has images in mild fog, snow, bad light and so on."""
+    name = MILD[number // 2 % len(MILD)] if number % 2 else ""
+    if not name:
+        return drive
+    (condition,) = (each for each in choose_conditions("easy", [name]) if each.name == name)
+    return condition.sequences(drive, number, "black")[0]
+
+
+class Standing(DerivedSequence):
+    """A drive whose vehicle stands: every frame shows the first one, at later times, with the noise of a camera."""
+
+    def __init__(self, drive: Sequence) -> None:
+        super().__init__(drive)
+        motion, first = drive.ego_motion, drive.load(0).world_from_ego
+        count = len(motion.timestamps_ns)
+        still = {name: np.zeros((count, 3)) for name in ("accelerations", "angular_rates", "velocities")}
+        still = {name: value for name, value in still.items() if hasattr(motion, name)}
+        poses = {
+            "translations": np.tile(first.translation, (count, 1)),
+            "quaternions": np.tile(first.quaternion, (count, 1)),
+        }
+        self.ego_motion = replace(motion, **poses, **still)
+
+    def load(self, place: int) -> Frame:
+        frame, first = self.sequence.load(place), self.sequence.load(0)
+        random = np.random.default_rng(place)
+        images = {}
+        for name, image in first.images.items():
+            noise = random.normal(0, 2, image.pixels_bgr.shape)
+            noisy = with_pixels(image, np.clip(image.pixels_bgr + noise, 0, 255).astype(np.uint8))
+            images[name] = replace(noisy, timestamp_ns=frame.images[name].timestamp_ns)
+        at = dict.fromkeys(frame.world_from_ego_at, first.world_from_ego)
+        return replace(frame, images=images, world_from_ego=first.world_from_ego, world_from_ego_at=at)
+
+
+def table(folders: list[str], rigs: int, minutes: float) -> None:
+    """Prints a line for each planted fault on some rigs, and one for each sound drive, until the time is over.
+
+    folders: of rendered drives. The faults are planted into the first `rigs` of them.
+    """
+    import time
+
+    import bevcli
+    from bevcli.workshop.trust.faults import color_faults, find_faults, input_faults
+
+    model, end = bevcli.load_model("demo"), time.monotonic() + 60 * minutes
+    drives = {folder: bevcli.open_sequence(folder) for folder in folders}
+    tests = [("sound", folder, number) for number, folder in enumerate(folders)]
+    tests += [("standing", folder, number) for number, folder in enumerate(folders[:4])]
+    planted = [(name, folder, number) for number, folder in enumerate(folders[:rigs]) for name in FAULTS]
+    mixed = [test for both in zip_longest(planted, tests) for test in both if test is not None]
+    for name, folder, number in mixed:
+        if time.monotonic() > end:
+            break
+        start, drive = time.process_time(), drives[folder]
+        if name in FAULTS:
+            camera = drive.rig.names[(number + list(FAULTS).index(name)) % len(drive.rig.cameras)]
+            plant, code = FAULTS[name]
+            faulty = plant(drive, camera)
+            findings = color_faults(model, faulty) if code == "color-order" else input_faults(faulty)
+            verdict = "FOUND" if any(each.code == code for each in findings) else "MISSED"
+        else:
+            camera, verdict = "", "SOUND"
+            sound = Standing(drive) if name == "standing" else sound_drive(drive, number)
+            findings = find_faults(model, sound)
+            if any(each.severity != "info" for each in findings):
+                verdict = "FALSE ALARM"
+            name = f"{name} {'' if name == 'standing' or not number % 2 else MILD[number // 2 % len(MILD)]}".strip()
+        seconds = time.process_time() - start
+        print(f"{verdict:12}{folder[-7:]} {len(drive.rig.cameras)} cameras {name} {camera} {seconds:.1f} s", flush=True)
+        for finding in findings:
+            print(f"    {finding.severity} {finding.code} {finding.line}", flush=True)
+
+
+if __name__ == "__main__":
+    table(sys.argv[3:], int(sys.argv[1]), float(sys.argv[2]))

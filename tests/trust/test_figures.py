@@ -1,16 +1,20 @@
 """Figures of hand-made boxes: a box that moves as its velocity says persists, one that jumps does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.workshop.trust.figures import figures_of
 
-RIG = CameraRig((), Pose.identity().matrix)
+FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # of a camera 1.5 m above the ground
+INTRINSICS = np.array([[250.0, 0, 250], [0, 250, 140], [0, 0, 1]])
+RIG = CameraRig((Camera("CAM_FRONT", 500, 280, INTRINSICS, FORWARD),), Pose.identity().matrix)
 
 
 def cars(*rows: tuple[float, float, float, float], score: float = 0.8) -> Boxes3D:
@@ -56,6 +60,10 @@ def test_a_box_half_a_metre_off_persists_in_part() -> None:
     assert persistence(frame(0, cars((10, 3, 0, 0))), frame(1, cars((10.5, 3, 0, 0)))) == pytest.approx(np.exp(-0.5))
 
 
+def test_a_drive_without_boxes_has_a_persistence_of_0() -> None:
+    assert persistence(frame(0, cars()), frame(1, cars())) == 0
+
+
 def test_another_scene_is_no_next_frame() -> None:
     assert np.isnan(persistence(frame(0, cars((10, 3, 0, 0))), frame(1, cars((30, 3, 0, 0)), scene="b")))
 
@@ -65,3 +73,18 @@ def test_confidence_is_the_mean_of_the_15_best_scores() -> None:
     assert figures_of([frame(0, boxes)], RIG, 51.2).confidence == pytest.approx(0.6)
     assert figures_of([frame(0, boxes[:5])], RIG, 51.2).confidence == pytest.approx(0.2)
     assert figures_of([frame(0, boxes)], RIG, 5.0).confidence == 0
+
+
+def test_a_box_that_grows_by_a_tenth_changes_its_size_by_a_tenth() -> None:
+    box = cars((10, 3, 0, 0))
+    larger = replace(box, sizes_lwh=1.1 * box.sizes_lwh)
+    assert figures_of([frame(0, box), frame(1, larger)], RIG, 51.2).size_change == pytest.approx(np.log(1.1))
+
+
+def test_certainty_does_not_depend_on_the_number_of_objects() -> None:
+    assert figures_of([frame(0, cars((10, 3, 0, 0)))], RIG, 51.2).certainty == pytest.approx(0.8)
+    assert figures_of([frame(0, cars(*[(10, k, 0, 0) for k in range(9)]))], RIG, 51.2).certainty == pytest.approx(0.8)
+
+
+def test_an_image_twice_as_wide_as_the_focal_length_sees_90() -> None:
+    assert figures_of([], RIG, 51.2).fov_deg == pytest.approx(90)

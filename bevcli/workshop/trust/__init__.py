@@ -1,6 +1,9 @@
-"""Trust in a model on a drive that has no labels: a score without ground truth, and faults that show in its boxes.
+"""Does it work on my cameras: a score without labels, faults that show without them, and the gap of a rig.
 
 In the order of the work:
-    figures     numbers of a run's boxes that need no labels
-    estimate    the entry point: runs a model over a drive; the estimated score
+    figures       numbers of a run's boxes that need no labels
+    fit, fits/    how the figures of known weights go with their true NDS
+    estimate      the entry point: the estimated score of a drive, or of the files of a run
+    run_option    the option `score_without_labels` of `bevcli run`
+    rig_differences, rig_gap, rig_gap_picture, gap_option: what a rig costs, for `bevcli project-debug --model`
 """

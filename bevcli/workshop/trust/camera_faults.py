@@ -28,7 +28,7 @@ PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
 LEAST_SHARE, GAIN, LARGE_GAIN = 0.4, 0.1, 0.25  # of points that fit after a mistake is undone, and by how much more
 TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
-LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 25), 0.05  # logarithms of factors of a focal length; a told one
+LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _interval_ns(points: Mapping[str, CameraPoints]) -> int:
 def best_focal(points: CameraPoints, rows: Poses) -> float:
     """How many times the stated focal length the one is with which the points fit best."""
     best = 1.0
-    for lengths in (LENGTHS, LENGTHS / 12):
+    for lengths in (LENGTHS, LENGTHS / 9):
         factors = best * np.exp(lengths)
         best = float(factors[int(np.argmax([share(points.longer(factor), rows) for factor in factors]))])
     return best

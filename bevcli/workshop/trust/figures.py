@@ -1,6 +1,6 @@
 """Figures: numbers of a run's boxes that need no ground truth, and that change where the boxes become worse."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -24,13 +24,20 @@ class Figures:
     Attributes:
         frames: number of frames.
         confidence: mean of the 15 best scores of a frame, 0 to 1; missing boxes count as 0.
+        certainty: mean score of all boxes, each weighted by the square of its score, 0 to 1. It does not depend on how
+            many objects there are.
         persistence: share of boxes that are found again in the next frame where their velocity leads, 0 to 1. A box
-            counts by its score; one that is d metres off counts exp(-d), one beyond 2 m not at all.
+            counts by its score; one that is d metres off counts exp(-d), one beyond 2 m not at all. 0 without boxes.
+        size_change: mean relative change of length, width and height of a box that is found again.
+        fov_deg: mean horizontal field of view of the cameras, degrees; NaN without cameras.
     """
 
     frames: int
     confidence: float
+    certainty: float
     persistence: float
+    size_change: float
+    fov_deg: float
 
 
 def figures_of(frames: Sequence[FrameBoxes], rig: CameraRig, range_m: float) -> Figures:
@@ -39,13 +46,19 @@ def figures_of(frames: Sequence[FrameBoxes], rig: CameraRig, range_m: float) -> 
     frames: in the order of the run, with boxes in the ego frame that have scores. rig: the cameras. range_m: boxes
     beyond this distance from the ego frame's origin are ignored.
     """
-    kept = [within(frame.boxes, range_m) for frame in frames]
-    scores = [np.sort(boxes_scores(boxes))[::-1][:BEST].sum() / BEST for boxes in kept]
-    found = np.array([row for step in pairwise(frames) for row in _found_again(*step, range_m)]).reshape(-1, 2)
+    scores = [scores_of(within(frame.boxes, range_m)) for frame in frames]
+    every = np.concatenate([*scores, np.zeros(0)])
+    best = [np.sort(of_frame)[-BEST:].sum() / BEST for of_frame in scores]
+    steps = [_found_again(*step, range_m) for step in pairwise(frames) if _follows(*step)]
+    score, closeness, change = np.concatenate([*steps, np.zeros((3, 0))], axis=1)
+    fields_of_view = [2 * np.degrees(np.arctan(c.width / 2 / c.intrinsics[0, 0])) for c in rig.cameras]
     return Figures(
         frames=len(frames),
-        confidence=float(np.mean(scores)) if scores else np.nan,
-        persistence=float(found.prod(axis=1).sum() / found[:, 0].sum()) if len(found) else np.nan,
+        confidence=_mean(np.array(best)),
+        certainty=_mean(every, every**2),
+        persistence=0.0 if steps and not len(score) else _mean(closeness, score),
+        size_change=_mean(change[closeness > 0], score[closeness > 0]),
+        fov_deg=_mean(np.array(fields_of_view)),
     )
 
 
@@ -54,21 +67,35 @@ def within(boxes: Boxes3D, range_m: float) -> Boxes3D:
     return boxes[np.linalg.norm(boxes.centers[:, :2], axis=1) < range_m]
 
 
-def boxes_scores(boxes: Boxes3D) -> Array:
+def scores_of(boxes: Boxes3D) -> Array:
     """(N,) scores; 1 where the boxes have none."""
     return np.ones(len(boxes)) if boxes.scores is None else boxes.scores
 
 
-def _found_again(frame: FrameBoxes, following: FrameBoxes, range_m: float) -> Iterator[tuple[float, float]]:
-    """The score of each box that is looked for in the following frame, and how well it is found there, 0 to 1."""
-    if frame.stamp.scene != following.stamp.scene or frame.world_from_ego is None or following.world_from_ego is None:
-        return
+def _mean(values: Array, weights: Array | None = None) -> float:
+    """The weighted mean; NaN without weight."""
+    weights = np.ones(len(values)) if weights is None else weights
+    return float(values @ weights / weights.sum()) if weights.sum() > 0 else np.nan
+
+
+def _follows(frame: FrameBoxes, following: FrameBoxes) -> bool:
+    """Boxes of a frame can be looked for in the one that follows."""
+    is_known = frame.world_from_ego is not None and following.world_from_ego is not None
+    return is_known and frame.stamp.scene == following.stamp.scene
+
+
+def _found_again(frame: FrameBoxes, following: FrameBoxes, range_m: float) -> Array:
+    """(3, N) of each box that is looked for in the following frame: score, closeness 0 to 1, change of its size."""
+    assert frame.world_from_ego is not None
+    assert following.world_from_ego is not None
     seconds = (following.stamp.timestamp_ns - frame.stamp.timestamp_ns) / 1e9
-    boxes = within(frame.boxes, range_m - MARGIN_M).scored(SURE)
-    others = following.boxes.scored(POSSIBLE)
+    boxes, others = within(frame.boxes, range_m - MARGIN_M).scored(SURE), following.boxes.scored(POSSIBLE)
+    if not len(boxes) or not len(others):
+        return np.stack([scores_of(boxes), *np.zeros((2, len(boxes)))])
     moved = boxes.centers + np.c_[np.nan_to_num(boxes.velocities) * seconds, np.zeros(len(boxes))]
     there = apply(inverse(following.world_from_ego.matrix) @ frame.world_from_ego.matrix, moved)  # (N, 3)
-    for center, name, score in zip(there, boxes.classes, boxes_scores(boxes), strict=True):
-        of_class = others.centers[others.classes == name, :2]
-        off_m = np.linalg.norm(of_class - center[:2], axis=1).min(initial=np.inf)
-        yield float(score), float(np.exp(-off_m)) if off_m < NEAR_M else 0.0
+    off_m = np.linalg.norm(there[:, None, :2] - others.centers[:, :2], axis=2)  # (N, M)
+    off_m[boxes.classes[:, None] != others.classes] = np.inf
+    nearest, off_m = off_m.argmin(axis=1), off_m.min(axis=1)
+    change = np.abs(np.log(others.sizes_lwh[nearest] / boxes.sizes_lwh)).mean(axis=1)
+    return np.stack([scores_of(boxes), np.where(off_m < NEAR_M, np.exp(-off_m), 0), change])
