@@ -54,7 +54,7 @@ WINGS: dict[str, set[str]] = {
     "synth": {"formats"},
     "scores": set(),
     "training": {"synth", "trust"},
-    "trust": {"robustness", "scores", "synth"},
+    "trust": {"correspondence", "odometry", "robustness", "scores", "synth"},
     "uniad": set(),
     "vad": {"formats", "training"},
 }
