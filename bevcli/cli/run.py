@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model
 
 PANEL = "Run"
+PHOTOGRAPHS = "photographs"  # the model in the package that learned from randomised images
 
 
 def run(
@@ -122,7 +123,10 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
         notes.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
     notes += model.training_notes(drive.rig)
     if model.bundled and not drive.facts.rendered:
-        notes.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
+        more = "" if model.name == PHOTOGRAPHS else f"; `--model {PHOTOGRAPHS}` finds more on photographs"
+        notes.append(
+            f"these weights were trained on rendered streets, not on the real world{more} (docs/model-card.md)"
+        )
     return notes
 
 

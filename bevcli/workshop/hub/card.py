@@ -23,10 +23,20 @@ PAPERS = {
     "UniAD": "https://arxiv.org/abs/2212.10156",
     "VAD": "https://arxiv.org/abs/2303.12077",
 }
-# Of the weights in the package; docs/model-card.md has the whole table.
-BUNDLED_SCORES = {"mAP": 0.559, "NDS": 0.638}
-BUNDLED_DATA = "40 rendered drives of 20 frames (seeds 1000000 to 1000039)"
-BUNDLED_LIMIT = "The weights were trained on rendered streets (`bevcli render`) and do not work on real images."
+# Of the weights in the package: scores, their data, and a limit. docs/model-card.md has the whole tables.
+RENDERED = "rendered drives of 20 frames (seeds from 1000000 on)"
+BUNDLED: dict[str, tuple[dict[str, float], str, str]] = {
+    "demo": (
+        {"mAP": 0.559, "NDS": 0.638},
+        f"40 {RENDERED}",
+        "The weights were trained on rendered streets (`bevcli render`) and do not work on real images.",
+    ),
+    "photographs": (
+        {"mAP": 0.303, "NDS": 0.424},
+        f"3 {RENDERED}",
+        "The weights were trained on rendered streets (`bevcli render`); of real images they find near cars.",
+    ),
+}
 PUBLISHED_DATA = "nuScenes validation split"
 
 
@@ -69,7 +79,8 @@ def facts_of(name: str, checkpoint: Checkpoint, options: PackOptions) -> CardFac
     known = CardFacts(rigs=rigs)
     named = all_weights().get(name) if options.weights is None else None
     if checkpoint.path == bundled_weights(name):
-        known = CardFacts("Apache-2.0", (), BUNDLED_SCORES, BUNDLED_DATA, "", BUNDLED_LIMIT, rigs)
+        known_scores, data, limit = BUNDLED[name]
+        known = CardFacts("Apache-2.0", (), known_scores, data, "", limit, rigs)
     elif named is not None:
         source, data = named.source, ("nuscenes",) if named.source.published else ()
         where = source.page or source.url
