@@ -169,6 +169,7 @@ FAULTS = {
     "poses: all the same": (lambda d, c: lost_poses(d), "motion-stands"),
     "red and blue exchanged": (lambda d, c: wrong_channels(d), "color-order"),
 }
+MOST_KEPT = 150  # features of images, and motions
 MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives
 
 
@@ -217,6 +218,8 @@ def without_repetition() -> None:
         def kept(*arguments):
             name = key(*arguments)
             if name not in known:
+                if len(known) >= MOST_KEPT:
+                    known.clear()
                 known[name] = function(*arguments)
             return known[name]
 
