@@ -86,5 +86,5 @@ def test_certainty_does_not_depend_on_the_number_of_objects() -> None:
     assert figures_of([frame(0, cars(*[(10, k, 0, 0) for k in range(9)]))], RIG, 51.2).certainty == pytest.approx(0.8)
 
 
-def test_an_image_twice_as_wide_as_the_focal_length_sees_90() -> None:
+def test_a_width_of_two_focal_lengths_is_90_degrees_wide() -> None:
     assert figures_of([], RIG, 51.2).fov_deg == pytest.approx(90)
