@@ -16,7 +16,7 @@ from bevcli.rig import drawings
 from bevcli.rig.rig_checks import mounting_of
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.workshop.synth.rig import nuscenes_like_rig
-from bevcli.workshop.trust import rig_gap
+from bevcli.workshop.trust import gap_option, rig_gap
 from bevcli.workshop.trust.rig_differences import known_rigs, looking, reach_m, rig_differences, taken_back
 
 DEMO, RANGE_M = load_config("demo"), 32.0
@@ -118,7 +118,7 @@ def made_up_boxes(model, shot, after_frame=lambda: None):
 def project_debug(tmp_path, monkeypatch):
     """A function that runs the command with made-up boxes and without the other pictures, and returns its output."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(rig_gap, "boxes_of", made_up_boxes)
+    monkeypatch.setattr(gap_option, "boxes_of", made_up_boxes)
     monkeypatch.setattr(rig_gap, "RESAMPLES", 40)
     for name in ("write_camera_sheet", "write_coverage_map", "write_rig_recording"):
         monkeypatch.setattr(drawings, name, lambda path, *content: path.touch())
