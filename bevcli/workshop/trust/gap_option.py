@@ -73,7 +73,7 @@ def gap_of_rigs(
         rigs[other.name if other.name != check.name else f"{other.name} (second)"] = other.rig
     known, range_m = known_rigs(config), config.bev_grid.nearest_side_m
     found = {name: list(rig_differences(rig, known, range_m)) for name, rig in rigs.items()}
-    found[check.name] += _of_drive(open_drive, config)
+    found[check.name] += of_drive(open_drive, config)
     if bundled_weights(model) is None:
         for name, rig in rigs.items():
             found[name] += size_differences(rig, config) if not config.training_rigs.known else ()
@@ -81,7 +81,8 @@ def gap_of_rigs(
     return _measured(model, rigs, found, known)
 
 
-def _of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterator[RigDifference]:
+def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterator[RigDifference]:
+    """The differences of a drive's images from rendered ones: rate and light; none of a calibration alone."""
     try:
         drive = open_drive(ego_motion="optional")
     except InputError:  # a calibration alone
