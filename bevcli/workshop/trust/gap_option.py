@@ -170,7 +170,7 @@ class MeasuredGap:
             rows += [_row(f"  {cost.label}", cost.shown) for cost in rig.costs if cost.shown is not None]
         rows += [self._differences(a, b) for a, b in self.pairs]
         lines = [
-            f"Rig gap: {self.model} on {where}, {len(one.places)} objects within {self.range_m:g} m",
+            f"Rig gap: {self.model} on {where}",
             "",
             aligned(rows),
         ]
@@ -238,14 +238,15 @@ def _measured(
 ) -> MeasuredGap:
     from bevcli.cli.progress import Progress
 
-    for rig in rigs.values():
-        rig_for_rendering(rig, None)  # names the camera whose lens cannot be rendered
+    for cameras in rigs.values():
+        rig_for_rendering(cameras, None)  # names the camera whose lens cannot be rendered
     model, training = load_model(name), nuscenes_like_rig()
     range_m, classes = model.config.bev_grid.nearest_side_m, model.config.object_classes
     kinds: dict[tuple[str, Kind], list[RigDifference]] = defaultdict(list)
-    for rig, each in ((rig, each) for rig, differences in found.items() for each in differences):
-        kinds[rig, each.kind].append(each)
-    trials = {key: trial(rigs[key[0]], differences, known, range_m) for key, differences in kinds.items()}
+    for rig, differences in found.items():
+        for each in differences:
+            kinds[rig, each.kind].append(each)
+    trials = {key: trial(rigs[key[0]], of_kind, known, range_m) for key, of_kind in kinds.items()}
     plain = [Shot(cameras) for cameras in (training, *rigs.values())]
     shots = {shot.path(model): shot for shot in (*plain, *(shot for pair in trials.values() for shot in pair))}
     with Progress(sum(shot.count for shot in shots.values()), "frames of rendered streets") as progress:

@@ -184,7 +184,7 @@ def blind_sectors_deg(rig: CameraRig, range_m: float) -> list[Range]:
 
 def _blind_sectors(rig: CameraRig, range_m: float) -> Iterator[RigDifference]:
     for first, end in blind_sectors_deg(rig, range_m):
-        text = f"no camera sees {end - first:.0f}° {_side((first + end) / 2)}: nothing is found there"
+        text = f"no camera sees {end - first:.0f}° {_side((first + end) / 2)}: most objects there are missed"
         yield RigDifference("blind sector", (), text)
 
 
