@@ -3,16 +3,21 @@
 python tests/trust/planted.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
 """
 
+import copy
+import hashlib
 import sys
 from collections.abc import Callable
-from dataclasses import replace
-from itertools import zip_longest
+from dataclasses import fields, replace
 
 import numpy as np
 
+from bevcli.config import load_config
 from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
+from bevcli.inference.load import Model
+from bevcli.inference.options import TORCH
+from bevcli.workshop.odometry import check_motion, frames
 from bevcli.workshop.robustness.conditions import choose_conditions
 
 
@@ -168,6 +173,41 @@ FAULTS = {
     "poses: all the same": (lambda d, c: lost_poses(d), "motion-stands"),
     "red and blue exchanged": (lambda d, c: wrong_channels(d), "color-order"),
 }
+
+
+def without(part: str, model: Model) -> Model:
+    """The model with zeros for the weights of a part."""
+    network = copy.deepcopy(model.network)
+    network.load_state_dict({key: 0 * value if part in key else value for key, value in network.state_dict().items()})
+    return replace(model, network=network)
+
+
+class BrokenEngine(Model):
+    """A model whose engine has lost the class head; the plain network has it."""
+
+    def in_engine(self, rig, drive=None, **asked) -> Model:
+        return replace(without("class_branches", self), engine=TORCH, precision="fp32") if self.needs_export else self
+
+
+def with_broken_engine(model: Model) -> Model:
+    return BrokenEngine(**{each.name: getattr(model, each.name) for each in fields(model)} | ENGINE)
+
+
+def of_another_model(model: Model) -> Model:
+    """The model file of other weights: those of `base` expect BGR without scale."""
+    network, image = copy.copy(model.network), load_config("base").image
+    other = {"color_order": image.color_order, "mean": image.mean, "std": image.std}
+    network.config = replace(model.config, image=replace(model.config.image, **other))
+    return replace(model, network=network)
+
+
+ENGINE = {"engine": "openvino", "precision": "int8"}
+# Fault -> how to plant it into a model, and the findings of which one names it.
+MODEL_FAULTS = {
+    "INT8 engine without its class head": (with_broken_engine, "engine-broken"),
+    "weights with the image settings of another model": (of_another_model, "weights-broken"),
+}
+MOST_KEPT = 150  # features of images, and motions
 MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives
 
 
@@ -207,6 +247,32 @@ class Standing(DerivedSequence):
         return replace(frame, images=images, world_from_ego=first.world_from_ego, world_from_ego_at=at)
 
 
+def without_repetition() -> None:
+    """Features of an image, and the motion that images show, are computed once for all drives that share the images."""
+
+    def once(function, key):
+        known = {}
+
+        def kept(*arguments):
+            name = key(*arguments)
+            if name not in known:
+                if len(known) >= MOST_KEPT:
+                    known.clear()
+                known[name] = function(*arguments)
+            return known[name]
+
+        return kept
+
+    def images_of(drive: Sequence, *_) -> bytes:
+        frames = [drive.load(place) for place in range(len(drive.stamps))]
+        pixels = b"".join(image.pixels_bgr.tobytes() for frame in frames for image in frame.images.values())
+        rig = [(one.intrinsics.tolist(), one.ego_from_camera.tolist()) for one in drive.rig.cameras]
+        return hashlib.sha256(pixels + repr(rig).encode()).digest()
+
+    frames.features = once(frames.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
+    check_motion.measure_motion = once(check_motion.measure_motion, images_of)
+
+
 def table(folders: list[str], rigs: int, minutes: float) -> None:
     """Prints a line for each planted fault on some rigs, and one for each sound drive, until the time is over.
 
@@ -215,15 +281,17 @@ def table(folders: list[str], rigs: int, minutes: float) -> None:
     import time
 
     import bevcli
-    from bevcli.workshop.trust.faults import color_faults, find_faults, input_faults
+    from bevcli.workshop.trust.faults import find_faults, input_faults, model_faults
 
+    without_repetition()
     model, end = bevcli.load_model("demo"), time.monotonic() + 60 * minutes
     drives = {folder: bevcli.open_sequence(folder) for folder in folders}
     tests = [("sound", folder, number) for number, folder in enumerate(folders)]
     tests += [("standing", folder, number) for number, folder in enumerate(folders[:4])]
     planted = [(name, folder, number) for number, folder in enumerate(folders[:rigs]) for name in FAULTS]
-    mixed = [test for both in zip_longest(planted, tests) for test in both if test is not None]
-    for name, folder, number in mixed:
+    planted += [(name, folder, number) for number, folder in enumerate(folders[:rigs]) for name in MODEL_FAULTS]
+    alike = {folder: [each for each in planted if each[1] == folder] for folder in folders}
+    for name, folder, number in (each for test in tests for each in (test, *(alike.pop(test[1], ())))):
         if time.monotonic() > end:
             break
         start, drive = time.process_time(), drives[folder]
@@ -231,7 +299,11 @@ def table(folders: list[str], rigs: int, minutes: float) -> None:
             camera = drive.rig.names[(number + list(FAULTS).index(name)) % len(drive.rig.cameras)]
             plant, code = FAULTS[name]
             faulty = plant(drive, camera)
-            findings = color_faults(model, faulty) if code == "color-order" else input_faults(faulty)
+            findings = model_faults(model, faulty) if code == "color-order" else input_faults(faulty)
+            verdict = "FOUND" if any(each.code == code for each in findings) else "MISSED"
+        elif name in MODEL_FAULTS:
+            change, code = MODEL_FAULTS[name]
+            camera, findings = "", model_faults(change(model), drive)
             verdict = "FOUND" if any(each.code == code for each in findings) else "MISSED"
         else:
             camera, verdict = "", "SOUND"

@@ -3,16 +3,28 @@
 from dataclasses import replace
 
 import numpy as np
+import planted
 import pytest
 from scipy.spatial.transform import Rotation
 
 from bevcli.findings import Finding
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+from bevcli.inference.load import load_model
 from bevcli.workshop.odometry.stated import Poses
+from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import CameraPoints, camera_findings, share
-from bevcli.workshop.trust.faults import image_findings, one_cause
+from bevcli.workshop.trust.faults import (
+    ReversedColors,
+    agreement,
+    find_faults,
+    image_findings,
+    input_faults,
+    model_faults,
+    one_cause,
+)
 
 RIG: CameraRig = nuscenes_like_rig(512, 288)
 SECOND = 1_000_000_000
@@ -132,3 +144,61 @@ def test_few_cameras_that_are_off_do_not_make_poses_wrong():
     assert one_cause((poses,), (camera,) * 3, 6) == (poses,)
     assert one_cause((poses,), (), 6) == (poses,)
     assert one_cause((info,), (camera,), 6) == (info, camera)
+
+
+def boxes(xs: list[float], names: list[str], scores: list[float] | None = None) -> Boxes3D:
+    count = len(xs)
+    centers, sizes = np.column_stack([xs, np.zeros((count, 2))]), np.ones((count, 3))
+    columns = {"yaws": np.zeros(count), "velocities": np.zeros((count, 2)), "classes": np.array(names)}
+    return Boxes3D(centers, sizes, **columns, scores=None if scores is None else np.array(scores))
+
+
+def test_boxes_agree_that_have_one_class_and_place():
+    wanted = boxes([0, 10, 20, 30], ["car"] * 4, [0.9, 0.9, 0.9, 0.1])  # the last one is not counted
+    given = boxes([1, 10, 23], ["car", "bus", "car"], [0.9, 0.9, 0.9])  # another class, and 3 m away
+    assert agreement([wanted], [given]) == (3, 1 / 3)
+
+
+class OneFrame(planted.DerivedSequence):
+    """A drive of one frame with one image."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels, self.name, self.rig, self.stamps, self.has_ego_motion = pixels, "one", RIG, (), False
+
+    def load(self, place: int) -> planted.Frame:
+        image = planted.CameraImage(0, self.pixels)
+        return planted.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
+
+
+def test_colors_that_are_reversed_twice_are_the_same():
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    once = ReversedColors(OneFrame(pixels))
+    assert once.load(0).images["CAM_FRONT"].pixels_bgr[0, 0].tolist() == [2, 1, 0]
+    assert np.array_equal(ReversedColors(once).load(0).images["CAM_FRONT"].pixels_bgr, pixels)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> planted.Sequence:
+    cache, config = tmp_path_factory.mktemp("streets"), load_model("demo").config
+    return RenderedDrives([1_000_000], cache, config).open(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", planted.FAULTS)
+def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted.Sequence, fault: str):
+    plant, code = planted.FAULTS[fault]
+    faulty = plant(street, "CAM_FRONT")
+    findings = find_faults(load_model("demo"), faulty) if code == "color-order" else input_faults(faulty)
+    assert code in {finding.code for finding in findings}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", planted.MODEL_FAULTS)
+def test_a_planted_fault_of_a_model_is_named(street: planted.Sequence, fault: str):
+    change, code = planted.MODEL_FAULTS[fault]
+    assert [finding.code for finding in model_faults(change(load_model("demo")), street)] == [code]
+
+
+@pytest.mark.slow
+def test_a_sound_rendered_drive_has_no_fault(street: planted.Sequence):
+    assert not [each for each in find_faults(load_model("demo"), street) if each.severity != "info"]

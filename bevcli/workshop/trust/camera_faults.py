@@ -49,14 +49,15 @@ class CameraPoints:
 
     def seen_by(self, camera: Camera) -> "CameraPoints":
         """The points as if another camera had taken the images."""
-        rays = (camera.rays(self.camera.project(each)[0]) for each in (self.rays_a, self.rays_b))
-        return CameraPoints(camera, *rays, self.times_ns)
+        rays_a, rays_b = (camera.rays(self.camera.project(each)[0]) for each in (self.rays_a, self.rays_b))
+        return CameraPoints(camera, rays_a, rays_b, self.times_ns)
 
     def mirrored(self) -> "CameraPoints":
         """The points of mirrored images."""
         edge = np.array([self.camera.width - 1, 0])
         pixels = (self.camera.project(each)[0] for each in (self.rays_a, self.rays_b))
-        return CameraPoints(self.camera, *(self.camera.rays(edge + each * (-1, 1)) for each in pixels), self.times_ns)
+        rays_a, rays_b = (self.camera.rays(edge + each * (-1, 1)) for each in pixels)
+        return CameraPoints(self.camera, rays_a, rays_b, self.times_ns)
 
     def turned(self, turn: Array) -> "CameraPoints":
         """The points if the camera is turned by a rotation vector (3,) about its right, down and forward axes."""

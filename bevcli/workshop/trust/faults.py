@@ -1,7 +1,8 @@
 """`find_faults`: mistakes in the input, and broken weights or engines, that show without labels. One line each.
 
 In this order: cameras that are dead or frozen, by their pixels; single cameras and poses, by how points move in the
-images; the order of colours, by the model's scores with the order reversed.
+images; the order of colours, by the model's scores with the order reversed; an engine, by the boxes of PyTorch; weights
+that find little, by rendered streets.
 """
 
 from collections.abc import Iterable, Sequence as Items
@@ -14,16 +15,21 @@ from numpy.typing import NDArray
 
 from bevcli.findings import Finding, rig_error
 from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.inference.load import Model
+from bevcli.inference.options import TORCH
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.open import select
 from bevcli.workshop.odometry.check_motion import SomeFrames, chosen_places, stated_motion_findings
 from bevcli.workshop.odometry.frames import Viewer
 from bevcli.workshop.odometry.stated import Poses
+from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
 from bevcli.workshop.trust.figures import figures_of
+from bevcli.workshop.trust.rig_gap import Shot, boxes_of
 
 STEPS = 6  # between frames whose images are compared
 POSE_STEPS = 4  # between frames whose motion is measured
@@ -31,6 +37,10 @@ TRIED = 3  # frames that the model sees with another order of colours
 SMALL = (64, 36)  # pixels of the images whose grey levels are compared
 FLAT = 2.0  # grey levels: standard deviation of an image that shows something
 STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
+SURE, REPEATED_M, NEAR_M = 0.3, 2.0, 20.0  # boxes that are looked for: score, error, distance of a true one
+LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
+LEAST_FOUND = 0.6  # share of near objects of rendered streets that sound weights find; demo finds 0.92
+LEAST_CONFIDENCE, LEAST_PERSISTENCE = 0.35, 0.2  # figures of weights that need no check
 BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
 
 
@@ -58,7 +68,7 @@ def find_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
 
     Raises InputError where a frame cannot be read.
     """
-    return (*input_faults(drive), *color_faults(model, drive))
+    return (*input_faults(drive), *model_faults(model, drive))
 
 
 def input_faults(drive: Sequence) -> tuple[Finding, ...]:
@@ -116,11 +126,28 @@ def image_findings(names: Iterable[str], frames: Items[dict[str, Array]]) -> tup
     return tuple(findings)
 
 
-def color_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
-    """The finding about images whose colour channels are in the wrong order."""
-    places = np.unique(np.linspace(0, len(drive.stamps) - 1, TRIED + 2)[1:-1].round().astype(int)).tolist()
-    some = select(drive, places)
-    stated, undone = (confidence(model, each) for each in (some, ReversedColors(some)))
+def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
+    """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
+    first = max(0, (len(drive.stamps) - TRIED) // 2)
+    some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
+    boxes = boxes_without_history(model, some)
+    broken = engine_findings(model, some, boxes) or weights_findings(model, boxes, drive.rig)
+    return (*color_findings(model, some, boxes), *broken)
+
+
+def boxes_without_history(model: Model, drive: Sequence) -> list[FrameBoxes]:
+    """The boxes of each frame alone, in the ego frame."""
+    return [
+        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
+        for frame, prediction in run(model, drive, temporal=False, track=False)
+    ]
+
+
+def color_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+    """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
+    range_m = model.config.bev_grid.nearest_side_m
+    reversed_boxes = boxes_without_history(model, ReversedColors(drive))
+    stated, undone = (figures_of(each, drive.rig, range_m).confidence for each in (boxes, reversed_boxes))
     if not undone - stated >= BETTER:
         return ()
     found = f"mean of the 15 best scores {stated:.2f} as they are, {undone:.2f} with red and blue exchanged"
@@ -128,10 +155,47 @@ def color_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
     return (rig_error("color-order", message, found, "", advice),)
 
 
-def confidence(model: Model, drive: Sequence) -> float:
-    """`Figures.confidence` of a drive without history."""
-    frames = [
-        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
-        for frame, prediction in run(model, drive, temporal=False, track=False)
-    ]
-    return figures_of(frames, drive.rig, model.config.bev_grid.nearest_side_m).confidence
+def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+    """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine."""
+    if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
+        return ()
+    plain = boxes_without_history(replace(model, engine=TORCH, precision="fp32"), drive)
+    count, same = agreement([each.boxes for each in plain], [each.boxes for each in boxes])
+    if count == 0 or same >= LEAST_SAME:
+        return ()
+    message = f"{model.engine} with {model.precision} does not give the boxes of PyTorch"
+    advice = "export the model again, or use another precision or engine"
+    return (rig_error("engine-broken", message, f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more", advice),)
+
+
+def weights_findings(model: Model, boxes: Items[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
+    """The finding about weights that find little, here and on rendered streets of the rig that they know."""
+    figures = figures_of(boxes, rig, model.config.bev_grid.nearest_side_m)
+    is_low = figures.confidence < LEAST_CONFIDENCE or figures.persistence < LEAST_PERSISTENCE
+    if not (is_low and model.config.training_rigs.known):  # else it is not known what they were trained on
+        return ()
+    known = nuscenes_like_rig(*model.config.image.size)
+    pairs = boxes_of(model.in_engine(known), Shot(known, frames=1))
+    near = [true[np.linalg.norm(true.centers[:, :2], axis=1) < NEAR_M] for _, true in pairs]
+    count, same = agreement(near, [predicted for predicted, _ in pairs])
+    if same >= LEAST_FOUND:
+        return ()
+    message = "the model finds little in rendered streets too, so that the drive is not to blame"
+    found, expected = f"{same:.0%} of {count} near objects", f"{LEAST_FOUND:.0%} or more"
+    advice = "take weights and model file of one training, and check the engine"
+    return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
+
+
+def agreement(wanted: Items[Boxes3D], given: Items[Boxes3D]) -> tuple[int, float]:
+    """Number of boxes with a score of 0.3 or more, or without one, and the share of them that others repeat.
+
+    A box is repeated by one of its class that is at most 2 m away and has a score of 0.15 or more.
+    """
+    count = same = 0
+    for frame, others in zip(wanted, given, strict=True):
+        boxes, candidates = frame.scored(SURE), others.scored(SURE / 2)
+        for center, name in zip(boxes.centers, boxes.classes, strict=True):
+            places = candidates.centers[candidates.classes == name]
+            same += bool(np.linalg.norm(places[:, :2] - center[:2], axis=1).min(initial=np.inf) < REPEATED_M)
+        count += len(boxes)
+    return count, same / max(count, 1)
