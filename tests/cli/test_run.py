@@ -153,5 +153,6 @@ def test_the_note_on_rendered_streets_is_for_other_drives_only(mini_model):
     drive = MemorySequence(1)
     notes = "\n".join(_run_notes(bundled, drive))
     assert "these weights were trained on rendered streets" in notes
+    assert "`--model photographs` finds more" in notes
     drive.facts = replace(drive.facts, rendered=True)
     assert "trained on rendered streets" not in "\n".join(_run_notes(bundled, drive))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,15 @@ def test_the_demo_model_is_as_small_as_the_model_card_states() -> None:
         model = BEVFormer(load_config("demo"))
     assert sum(parameter.numel() for parameter in model.parameters()) == pytest.approx(2.5e6, abs=0.05e6)
     assert bundled_weights("demo").stat().st_size == pytest.approx(5.1e6, abs=0.05e6)
+
+
+def test_photographs_is_demo_with_another_backbone_in_the_package() -> None:
+    demo, photographs = load_config("demo"), load_config("photographs")
+    image = replace(photographs.image, mean=demo.image.mean, std=demo.image.std)
+    same = {"name": "demo", "backbone": demo.backbone, "image": image, "training_rigs": demo.training_rigs}
+    assert replace(photographs, **same) == demo
+    assert bundled_weights("photographs").stat().st_size < 8e6
+    assert load_model("photographs", device="cpu").bundled
 
 
 def test_the_demo_model_has_every_part() -> None:
