@@ -187,11 +187,11 @@ class MeasuredGap:
     def _differences(self, a: MeasuredRig, b: MeasuredRig) -> tuple[str, ...]:
         cells = [_cell(difference(a.scored, b.scored, column)) for column in a.scored.values]
         before, after = a.scored.found, b.scored.found
-        clear = is_clear(int((after & ~before).sum()), int((before & ~after).sum()))
-        return f"{b.name} - {a.name}", *cells, f"{after.mean() - before.mean():+.0%}" if clear else "within noise"
+        share = f"{after.mean() - before.mean():+.0%}" if is_clear(a.scored, b.scored) else "within noise"
+        return f"{b.name} - {a.name}", *cells, share
 
     def _sides(self, a: MeasuredRig, b: MeasuredRig) -> Iterator[str]:
-        clear = sorted(sides(a.scored.places, a.scored.found, b.scored.found), key=lambda row: row[3] - row[2])
+        clear = sorted(sides(a.scored, b.scored), key=lambda row: row[3] - row[2])
         if clear:
             yield from ("", f"found with {b.name}, and with {a.name}, where the difference is beyond noise")
         for side, count, before, after in clear:
