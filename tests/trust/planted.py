@@ -3,16 +3,20 @@
 python tests/trust/planted.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
 """
 
+import copy
 import hashlib
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from bevcli.config import load_config
 from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
+from bevcli.inference.load import Model
+from bevcli.inference.options import TORCH
 from bevcli.workshop.odometry import check_motion, frames
 from bevcli.workshop.robustness.conditions import choose_conditions
 
@@ -169,6 +173,40 @@ FAULTS = {
     "poses: all the same": (lambda d, c: lost_poses(d), "motion-stands"),
     "red and blue exchanged": (lambda d, c: wrong_channels(d), "color-order"),
 }
+
+
+def without(part: str, model: Model) -> Model:
+    """The model with zeros for the weights of a part."""
+    network = copy.deepcopy(model.network)
+    network.load_state_dict({key: 0 * value if part in key else value for key, value in network.state_dict().items()})
+    return replace(model, network=network)
+
+
+class BrokenEngine(Model):
+    """A model whose engine has lost the class head; the plain network has it."""
+
+    def in_engine(self, rig, drive=None, **asked) -> Model:
+        return replace(without("class_branches", self), engine=TORCH, precision="fp32") if self.needs_export else self
+
+
+def with_broken_engine(model: Model) -> Model:
+    return BrokenEngine(**{each.name: getattr(model, each.name) for each in fields(model)} | ENGINE)
+
+
+def of_another_model(model: Model) -> Model:
+    """The model file of other weights: those of `base` expect BGR without scale."""
+    network, image = copy.copy(model.network), load_config("base").image
+    other = {"color_order": image.color_order, "mean": image.mean, "std": image.std}
+    network.config = replace(model.config, image=replace(model.config.image, **other))
+    return replace(model, network=network)
+
+
+ENGINE = {"engine": "openvino", "precision": "int8"}
+# Fault -> how to plant it into a model, and the findings of which one names it.
+MODEL_FAULTS = {
+    "INT8 engine without its class head": (with_broken_engine, "engine-broken"),
+    "weights with the image settings of another model": (of_another_model, "weights-broken"),
+}
 MOST_KEPT = 150  # features of images, and motions
 MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives
 
@@ -251,6 +289,7 @@ def table(folders: list[str], rigs: int, minutes: float) -> None:
     tests = [("sound", folder, number) for number, folder in enumerate(folders)]
     tests += [("standing", folder, number) for number, folder in enumerate(folders[:4])]
     planted = [(name, folder, number) for number, folder in enumerate(folders[:rigs]) for name in FAULTS]
+    planted += [(name, folder, number) for number, folder in enumerate(folders[:rigs]) for name in MODEL_FAULTS]
     alike = {folder: [each for each in planted if each[1] == folder] for folder in folders}
     for name, folder, number in (each for test in tests for each in (test, *(alike.pop(test[1], ())))):
         if time.monotonic() > end:
@@ -261,6 +300,10 @@ def table(folders: list[str], rigs: int, minutes: float) -> None:
             plant, code = FAULTS[name]
             faulty = plant(drive, camera)
             findings = model_faults(model, faulty) if code == "color-order" else input_faults(faulty)
+            verdict = "FOUND" if any(each.code == code for each in findings) else "MISSED"
+        elif name in MODEL_FAULTS:
+            change, code = MODEL_FAULTS[name]
+            camera, findings = "", model_faults(change(model), drive)
             verdict = "FOUND" if any(each.code == code for each in findings) else "MISSED"
         else:
             camera, verdict = "", "SOUND"

@@ -16,7 +16,15 @@ from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import CameraPoints, camera_findings, share
-from bevcli.workshop.trust.faults import ReversedColors, agreement, find_faults, image_findings, input_faults, one_cause
+from bevcli.workshop.trust.faults import (
+    ReversedColors,
+    agreement,
+    find_faults,
+    image_findings,
+    input_faults,
+    model_faults,
+    one_cause,
+)
 
 RIG: CameraRig = nuscenes_like_rig(512, 288)
 SECOND = 1_000_000_000
@@ -182,6 +190,13 @@ def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted.Sequence, 
     faulty = plant(street, "CAM_FRONT")
     findings = find_faults(load_model("demo"), faulty) if code == "color-order" else input_faults(faulty)
     assert code in {finding.code for finding in findings}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", planted.MODEL_FAULTS)
+def test_a_planted_fault_of_a_model_is_named(street: planted.Sequence, fault: str):
+    change, code = planted.MODEL_FAULTS[fault]
+    assert [finding.code for finding in model_faults(change(load_model("demo")), street)] == [code]
 
 
 @pytest.mark.slow

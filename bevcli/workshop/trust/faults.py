@@ -38,7 +38,8 @@ SMALL = (64, 36)  # pixels of the images whose grey levels are compared
 FLAT = 2.0  # grey levels: standard deviation of an image that shows something
 STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
 SURE, REPEATED_M, NEAR_M = 0.3, 2.0, 20.0  # boxes that are looked for: score, error, distance of a true one
-LEAST_SAME = 0.4  # share of such boxes that a sound engine gives, and of near objects that sound weights find
+LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
+LEAST_FOUND = 0.6  # share of near objects of rendered streets that sound weights find; demo finds 0.92
 LEAST_CONFIDENCE, LEAST_PERSISTENCE = 0.35, 0.2  # figures of weights that need no check
 BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
 
@@ -130,11 +131,8 @@ def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
     first = max(0, (len(drive.stamps) - TRIED) // 2)
     some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
     boxes = boxes_without_history(model, some)
-    return (
-        *color_findings(model, some, boxes),
-        *engine_findings(model, some, boxes),
-        *weights_findings(model, boxes, drive.rig),
-    )
+    broken = engine_findings(model, some, boxes) or weights_findings(model, boxes, drive.rig)
+    return (*color_findings(model, some, boxes), *broken)
 
 
 def boxes_without_history(model: Model, drive: Sequence) -> list[FrameBoxes]:
@@ -173,22 +171,18 @@ def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> 
 def weights_findings(model: Model, boxes: Items[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
     """The finding about weights that find little, here and on rendered streets of the rig that they know."""
     figures = figures_of(boxes, rig, model.config.bev_grid.nearest_side_m)
-    if figures.confidence >= LEAST_CONFIDENCE and not figures.persistence < LEAST_PERSISTENCE:
+    is_low = figures.confidence < LEAST_CONFIDENCE or figures.persistence < LEAST_PERSISTENCE
+    if not (is_low and model.config.training_rigs.known):  # else it is not known what they were trained on
         return ()
     known = nuscenes_like_rig(*model.config.image.size)
     pairs = boxes_of(model.in_engine(known), Shot(known, frames=1))
     near = [true[np.linalg.norm(true.centers[:, :2], axis=1) < NEAR_M] for _, true in pairs]
     count, same = agreement(near, [predicted for predicted, _ in pairs])
-    if same >= LEAST_SAME:
+    if same >= LEAST_FOUND:
         return ()
-    message = (
-        "the model finds little in rendered streets too: weights, model file or engine are to blame, not the drive"
-    )
-    found, expected = (
-        f"{same:.0%} of {count} objects",
-        f"{LEAST_SAME:.0%} or more, where the weights know rendered streets",
-    )
-    advice = "take the weights and the model file of one training"
+    message = "the model finds little in rendered streets too, so that the drive is not to blame"
+    found, expected = f"{same:.0%} of {count} near objects", f"{LEAST_FOUND:.0%} or more"
+    advice = "take weights and model file of one training, and check the engine"
     return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
 
 
