@@ -221,7 +221,7 @@ def test_without_a_model_nothing_is_measured(project_debug, tmp_path):
 def test_rendered_streets_are_measured_and_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(rig_gap, "STREETS", rig_gap.STREETS[:1])
-    write_calibration(tmp_path / "a.json", tilted("CAM_FRONT_LEFT", -40.0))
+    write_calibration(tmp_path / "a.json", tilted("CAM_FRONT_LEFT", -28.0))
     command = ["project-debug", str(tmp_path / "a.json"), "--model", "demo", "--out", str(tmp_path / "out")]
     first = CliRunner().invoke(app, command)
     assert "12/12 frames of rendered streets" in first.stderr
