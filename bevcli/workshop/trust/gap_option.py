@@ -95,7 +95,7 @@ def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterat
     places = sorted({0, len(times) // 2, len(times) - 1}) if len(times) else []
     greys = [image.pixels_bgr.mean() for place in places for image in drive.load(place).images.values()]
     if greys and (grey := float(np.mean(greys))) < DARK_GREY:
-        yield RigDifference("light", (), f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117)", grey)
+        yield RigDifference("light", (), f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117); measured with noise", grey)
 
 
 @dataclass(frozen=True)
