@@ -95,7 +95,8 @@ def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterat
     places = sorted({0, len(times) // 2, len(times) - 1}) if len(times) else []
     greys = [image.pixels_bgr.mean() for place in places for image in drive.load(place).images.values()]
     if greys and (grey := float(np.mean(greys))) < DARK_GREY:
-        yield RigDifference("light", (), f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117); measured with noise", grey)
+        text = f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117); measured with noise"
+        yield RigDifference("light", (), text, grey)
 
 
 @dataclass(frozen=True)

@@ -294,7 +294,8 @@ class Cost:
     def label(self) -> str:
         """The row of `shown`: a rig has its differences, a drive's are added to it."""
         kind = self.differences[0].kind
-        return f"with its {kind}" if kind in OF_DRIVE else f"without its {kind}"
+        other = ", of other frames" * (kind == "rate")
+        return f"with its {kind}{other}" if kind in OF_DRIVE else f"without its {kind}"
 
     @property
     def shown(self) -> Scored | None:
