@@ -26,8 +26,8 @@ LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
 PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
-LEAST_SHARE, GAIN, LARGE_GAIN = 0.4, 0.1, 0.25  # of points that fit after a mistake is undone, and by how much more
-COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that a rotation gains; those of sound cameras gain up to 5
+LEAST_SHARE, EXCHANGED = 0.4, 0.25  # of points that fit after a mistake is undone; by how much more, if exchanged
+COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
 TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
 LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
 
@@ -136,9 +136,9 @@ def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: Camera
             left = {name: each for name, each in left.items() if name not in (first, second)}
     for name, each in left.items():
         before = cost(each, rows)
-        told = [one for one in _undone(each, rows, _interval_ns(points)) if one.is_told(rows, stated[name], before)]
+        told = [one for one in _undone(each, rows, _interval_ns(points)) if one.is_told(rows, before)]
         if told:
-            likeliest = max(told, key=lambda one: share(one.points, rows))
+            likeliest = min(told, key=lambda one: cost(one.points, rows))
             undone = share(likeliest.points, rows)
             findings.append(_finding(likeliest.code, name, likeliest.message, stated[name], undone, likeliest.advice))
     return tuple(findings)
@@ -166,7 +166,7 @@ def _exchanges(
         gained = [(share(first.seen_by(there), rows), stated[name])]
         if other.name in points:
             gained.append((share(points[other.name].seen_by(first.camera), rows), stated[other.name]))
-        if all(undone >= LEAST_SHARE and undone - before >= LARGE_GAIN for undone, before in gained):
+        if all(undone >= LEAST_SHARE and undone - before >= EXCHANGED for undone, before in gained):
             yield min(undone for undone, _ in gained), name, other.name
 
 
@@ -179,13 +179,10 @@ class _Undone:
     message: str
     advice: str
 
-    def is_told(self, rows: Poses, share_before: float, cost_before: float) -> bool:
-        """Whether the points fit now, and much better than before; of a rotation, surely better."""
-        after = share(self.points, rows)
-        if self.code != "rotation-off":
-            return after >= LEAST_SHARE and after - share_before >= GAIN
+    def is_told(self, rows: Poses, cost_before: float) -> bool:
+        """Whether the points fit now, and surely better than before."""
         gain = cost_before - cost(self.points, rows)
-        return after >= LEAST_SHARE and gain >= max(COST_GAIN, COST_SHARE * cost_before)
+        return share(self.points, rows) >= LEAST_SHARE and gain >= max(COST_GAIN, COST_SHARE * cost_before)
 
 
 def _undone(points: CameraPoints, rows: Poses, interval_ns: int) -> Iterator[_Undone]:
