@@ -254,7 +254,11 @@ def project_debug(
         notes = [
             textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
             for note in training_rig_notes(check.rig, load_config(model))
-        ] + ([f"{gap.text()}\n"] if gap else [])
+        ]
+        if gap is not None:
+            notes.append(f"{gap.text()}\n")
+        elif options.model is not None or options.against is not None:
+            notes.append("Rig gap: not measured, because of the errors above.\n")
         say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

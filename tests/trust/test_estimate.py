@@ -34,13 +34,18 @@ def test_the_estimate_rises_with_scores_and_persistence(model: bevcli.Model) -> 
 
 
 def test_the_interval_is_that_of_the_file(model: bevcli.Model) -> None:
-    found, fit = standing(model, 0.6), fits()[model.weights_hash]
+    found, fit = standing(model, 0.4), fits()[model.weights_hash]
     assert None not in (found.low, found.nd_score, found.high)
     assert found.high - found.nd_score == pytest.approx(found.nd_score - found.low) == pytest.approx(fit.half_width)
 
 
 def test_figures_that_no_fitted_drive_had_are_named(model: bevcli.Model) -> None:
-    assert any(note.startswith("confidence is 0.0667, outside") for note in standing(model, 0.1).notes)
+    assert any(note.startswith("certainty is 0.1, outside") for note in standing(model, 0.1).notes)
+
+
+def test_a_drive_without_boxes_gets_a_low_score(model: bevcli.Model) -> None:
+    found = estimate_of_boxes(model, [frame(index, cars()) for index in range(12)], RIG)
+    assert found.nd_score == 0
 
 
 def test_weights_without_a_fit_get_no_score(model: bevcli.Model, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,5 +86,18 @@ def test_certainty_does_not_depend_on_the_number_of_objects() -> None:
     assert figures_of([frame(0, cars(*[(10, k, 0, 0) for k in range(9)]))], RIG, 51.2).certainty == pytest.approx(0.8)
 
 
-def test_a_width_of_two_focal_lengths_is_90_degrees_wide() -> None:
-    assert figures_of([], RIG, 51.2).fov_deg == pytest.approx(90)
+def test_rare_classes_count_less_in_class_certainty() -> None:
+    many, one = cars(*[(10, k, 0, 0) for k in range(9)]), cars((5, 0, 0, 0), score=0.3)
+    boxes = Boxes3D.concatenate([many, replace(one, classes=np.array(["bus"]))])
+    weights = np.array([7.2 / 7.4, 0.3 / 0.5])
+    expected = weights @ [0.8, 0.3] / weights.sum()
+    assert figures_of([frame(0, boxes)], RIG, 51.2).class_certainty == pytest.approx(expected)
+
+
+def test_at_half_the_rate_a_box_may_be_twice_as_far_off() -> None:
+    later = replace(frame(1, cars((10.4, 3, 0, 0))), stamp=FrameStamp(1, "", 1_000_000_000))
+    assert persistence(frame(0, cars((10, 3, 0, 0))), later) == pytest.approx(np.exp(-0.2))
+
+
+def test_a_box_behind_the_only_camera_is_unseen() -> None:
+    assert figures_of([frame(0, cars((10, 0, 0, 0), (-10, 0, 0, 0)))], RIG, 51.2).unseen == pytest.approx(0.5)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.rig import drawings
-from bevcli.rig.rig_checks import mounting_of
+from bevcli.rig.rig_checks import mounting_of, seen_fov_deg
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.workshop.synth.rig import nuscenes_like_rig
-from bevcli.workshop.trust import rig_gap
+from bevcli.workshop.trust import gap_option, rig_gap
 from bevcli.workshop.trust.rig_differences import known_rigs, looking, reach_m, rig_differences, taken_back
 
 DEMO, RANGE_M = load_config("demo"), 32.0
@@ -74,17 +76,47 @@ def test_a_blind_sector_is_named_and_gets_a_camera():
     assert taken_back(rig, "blind sector", KNOWN, RANGE_M).names[5:] == ("ADDED_CAM_BACK",)
 
 
-def test_heights_and_views_go_to_the_nearest_known_ones():
+def test_heights_go_to_the_nearest_known_one():
     rig = nuscenes_like_rig()
-    poses = [one.ego_from_camera + np.diag([0, 0, 0, 0.0]) for one in rig.cameras]
-    for pose in poses:
-        pose[2, 3] += 2.4
-    lifted = [replace(one, ego_from_camera=pose) for one, pose in zip(rig.cameras, poses, strict=True)]
-    rig = replace(rig, cameras=tuple(one.scaled(1) for one in lifted))
+    up = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2.4], [0, 0, 0, 0]])
+    rig = replace(rig, cameras=tuple(replace(one, ego_from_camera=one.ego_from_camera + up) for one in rig.cameras))
     (found,) = rig_differences(rig, KNOWN, RANGE_M)
     assert found.text.startswith("all 6 cameras are up to 1.2 m higher than any training camera (4.0 m")
     heights = [one.ego_from_camera[2, 3] for one in taken_back(rig, "height", KNOWN, RANGE_M).cameras]
     assert heights == pytest.approx([2.8] * 6)
+
+
+@pytest.mark.parametrize("lens", [None, Distortion("kannala_brandt", (0.0, 0.0, 0.0, 0.0))])
+def test_wide_views_go_to_the_widest_known_one(lens):
+    rig = nuscenes_like_rig()
+    back = rig["CAM_BACK"]
+    intrinsics = back.intrinsics * [[0.35], [0.35], [1]] + [[0, 0, 520], [0, 0, 292.5], [0, 0, 0]]  # about its centre
+    wide = replace(back, intrinsics=intrinsics, distortion=lens)
+    before = seen_fov_deg(wide)[0]
+    after = taken_back(replace(rig, cameras=(wide,)), "field of view", KNOWN, RANGE_M).cameras[0]
+    assert before > 140
+    assert seen_fov_deg(after)[0] == pytest.approx(132, abs=0.5)
+
+
+def test_a_slow_and_dark_drive_is_told():
+    image = SimpleNamespace(pixels_bgr=np.full((9, 16, 3), 20, np.uint8))
+    drive = SimpleNamespace(
+        stamps=[FrameStamp(k, "", k * 10**9) for k in range(5)], load=lambda place: SimpleNamespace(images={"A": image})
+    )
+    rate, light = gap_option.of_drive(lambda **how: drive, DEMO)
+    assert (rate.text, rate.amount) == ("1 images a second of each camera (theirs 2)", 2)
+    assert light.text.startswith("dark images: mean grey 20")
+    thin, even = rig_gap.trial(nuscenes_like_rig(), [rate], KNOWN, RANGE_M)
+    assert (thin.every, even.every, thin.frames, even.frames) == (2, 1, 7, 7)
+    assert rig_gap.trial(nuscenes_like_rig(), [light], KNOWN, RANGE_M)[0].darkness == 3
+
+
+def test_frames_of_a_lower_rate_meet_those_of_the_same_time():
+    thin, even = (rig_gap.Shot(nuscenes_like_rig(), 7, every) for every in (2, 1))
+    seeds = range(len(rig_gap.STREETS))
+    boxes = [tuple((seed, index) for seed in seeds for index in range(0, 7, shot.every)) for shot in (thin, even)]
+    both = rig_gap.comparable((thin, boxes[0]), (even, boxes[1]))
+    assert both[0] == both[1] == tuple((seed, index) for seed in seeds for index in (2, 4, 6))
 
 
 def test_the_polar_map_counts_boxes_where_they_are():
@@ -118,7 +150,7 @@ def made_up_boxes(model, shot, after_frame=lambda: None):
 def project_debug(tmp_path, monkeypatch):
     """A function that runs the command with made-up boxes and without the other pictures, and returns its output."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(rig_gap, "boxes_of", made_up_boxes)
+    monkeypatch.setattr(gap_option, "boxes_of", made_up_boxes)
     monkeypatch.setattr(rig_gap, "RESAMPLES", 40)
     for name in ("write_camera_sheet", "write_coverage_map", "write_rig_recording"):
         monkeypatch.setattr(drawings, name, lambda path, *content: path.touch())

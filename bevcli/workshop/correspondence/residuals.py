@@ -36,9 +36,13 @@ class Residuals(ABC):
     rays_a: Array  # (N, 3) unit directions in the camera frame of the first image
     rays_b: Array  # (N, 3) of the same points in that of the second one
 
-    def where(self, kept: NDArray[np.bool_]) -> Self:
-        """Some of the points, by a mask (N,)."""
+    def where(self, kept: NDArray[np.bool_] | Indices) -> Self:
+        """Some of the points, by a mask (N,) or by indices."""
         return type(self)(*(getattr(self, field.name)[kept] for field in fields(self)))
+
+    def sorted(self) -> Self:
+        """The points by group, as the solver needs them."""
+        return self.where(np.argsort(self.group, kind="stable"))
 
     @abstractmethod
     def of(self, geometry: GroupGeometry) -> Array:
@@ -112,18 +116,23 @@ class RoadResiduals(Residuals):
 
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 2) pixels."""
-        ahead = rays_of_road_points(geometry, self.group, self.rays_a)
+        ahead = rays_of_road_points(geometry, geometry.ego_from_camera_a, self.group, self.rays_a)
         return np.einsum("nij,nj->ni", self.weights, ahead - self.rays_b)
 
 
-def rays_of_road_points(geometry: GroupGeometry, group: Indices, rays_a: Array) -> Array:
-    """Unit directions (N, 3) in the second image of the points of the road that rays (N, 3) of the first one hit."""
-    pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
+def rays_of_road_points(geometry: GroupGeometry, ego_from_second: Array, group: Indices, rays_a: Array) -> Array:
+    """Unit directions (N, 3) in the second image of the points of the road that rays (N, 3) of the first one hit.
+
+    ego_from_second: (G, 4, 4) the cameras of the second images.
+    """
+    pose, motion, second = (
+        each[group] for each in (geometry.ego_from_camera_a, geometry.ego_b_from_ego_a, ego_from_second)
+    )
     start, direction = pose[:, :3, 3], np.einsum("nij,nj->ni", pose[:, :3, :3], rays_a)
     normal = np.array([-geometry.slopes[0], -geometry.slopes[1], 1.0])
     down = direction @ normal
     depth = -(start @ normal) / np.where(down < -SHORTEST, down, -SHORTEST)
     points = start + depth[:, None] * direction
-    points = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - start
-    points = np.einsum("nji,nj->ni", pose[:, :3, :3], points)
+    points = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - second[:, :3, 3]
+    points = np.einsum("nji,nj->ni", second[:, :3, :3], points)
     return points / np.linalg.norm(points, axis=-1, keepdims=True)

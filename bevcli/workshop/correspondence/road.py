@@ -130,7 +130,8 @@ def warp(camera: Camera, geometry: GroupGeometry, group: int) -> tuple[NDArray[n
     points = points_of_road(pose, rays)
     away = np.linalg.norm((points - pose[:3, 3])[:, :2], axis=-1)
     road = (away > NEAREST * pose[2, 3]) & (away < FARTHEST * pose[2, 3]) & (beside_way(points, motion) < WIDEST_M)
-    ahead = rays_of_road_points(geometry, np.full(len(rays), group), np.nan_to_num(rays, nan=-1.0))
+    cameras, groups = geometry.ego_from_camera_a, np.full(len(rays), group)
+    ahead = rays_of_road_points(geometry, cameras, groups, np.nan_to_num(rays, nan=-1.0))
     target, in_front = camera.project(ahead)
     road &= camera.contains(target, in_front)
     shape = pixels.shape[:2]

@@ -3,8 +3,7 @@
 In the order of the work:
     frames               what is kept of a frame: its images, their features, the road seen from above
     above                how far the vehicle drove between two views of the road from above; points of it
-    point_votes          how far the vehicle drove, by matched points that lie on the road
-    unmoved              whether the vehicle stands, by matched points that stay in the image
+    point_votes          how far the vehicle drove, by matched points that lie on the road; whether it stands
     unknowns, ground     what is estimated of a step, and the residuals of points of the road
     steps                the motions that a step may have: those that fit matched points and points of the road
     chain                the choice among them by the steps before and after

@@ -6,7 +6,7 @@ import numpy as np
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.correspondence.residuals import GroupGeometry, Residuals
+from bevcli.workshop.correspondence.residuals import GroupGeometry, Residuals, rays_of_road_points
 from bevcli.workshop.odometry.above import RoadFlow
 
 PIXEL = 0.5  # standard deviation of a direction, pixels
@@ -24,14 +24,7 @@ class GroundResiduals(Residuals):
 
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 2)."""
-        a, b = (pose[self.group] for pose in (geometry.ego_from_camera_a, geometry.ego_from_camera_b))
-        motion, normal = geometry.ego_b_from_ego_a[self.group], np.array([*-geometry.slopes, 1.0])
-        direction = np.einsum("nij,nj->ni", a[:, :3, :3], self.rays_a)
-        depth = -(a[:, :3, 3] @ normal) / np.minimum(direction @ normal, -1e-6)
-        points = a[:, :3, 3] + depth[:, None] * direction
-        points = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - b[:, :3, 3]
-        points = np.einsum("nji,nj->ni", b[:, :3, :3], points)
-        ahead = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        ahead = rays_of_road_points(geometry, geometry.ego_from_camera_b, self.group, self.rays_a)
         return np.einsum("nij,nj->ni", self.weights, ahead - self.rays_b)
 
 

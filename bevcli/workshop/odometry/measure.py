@@ -16,8 +16,7 @@ from bevcli.workshop.odometry.chain import Chain, leaps
 from bevcli.workshop.odometry.frames import FrameView, Viewer
 from bevcli.workshop.odometry.seen_points import SeenPoints
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, StepViews, candidates, is_measured, reason_of
-from bevcli.workshop.odometry.twist import exponential, logarithm
-from bevcli.workshop.odometry.unknowns import SLOPES, motion_of, next_slopes
+from bevcli.workshop.odometry.unknowns import SLOPES, exponential, logarithm, motion_of, next_slopes
 
 LEAPS = "its length contradicts the steps before and after, and few points of the road match"
 SUBSTEP_NS = 25_000_000  # between the poses of `MeasuredMotion.ego_motion`

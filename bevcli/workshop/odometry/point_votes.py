@@ -1,4 +1,4 @@
-"""How far the vehicle drove, by matched points: each tells the way with which it lies on the road.
+"""How far the vehicle drove, by matched points: each tells the way with which it lies on the road, or it stays.
 
 Points of the road agree. Higher ones tell a longer way, and vehicles ahead a shorter one. Drops on a lens tell nothing:
 they have no matches that move. So these votes hold where the road from above shows drops, or a bonnet.
@@ -16,6 +16,21 @@ FEWEST, FEWEST_FOR_ALL = 15, 30  # points that vote for a way, and that tell whi
 WIDTH = 0.12  # deviation of the logarithm of a point's way
 CHANCE = 0.15  # of the votes that a distance has without such a point
 UNDER = 0.7  # of the way of most points
+STILL_PX, STILL_SHARE = 0.35, 0.85  # of matched points of a vehicle that stands
+NEAR_DOWN, FEWEST_NEAR = 0.08, 8  # sine of the angle below the horizon of near points, and how many tell something
+FEWEST_STILL = 30  # matched points that tell whether a vehicle stands
+
+
+def stands(points: EpipolarResiduals, ego_from_camera: Array) -> bool:
+    """True where most matched points of single cameras stay in the image, and half of those near the vehicle.
+
+    Far points stay also where the vehicle creeps. ego_from_camera: (N, 4, 4) of each point.
+    """
+    moved_px = np.linalg.norm(points.rays_a - points.rays_b, axis=-1) * points.focal
+    near = -np.einsum("nj,nj->n", ego_from_camera[:, 2, :3], points.rays_a) > NEAR_DOWN
+    if len(moved_px) < FEWEST_STILL or (moved_px < STILL_PX).mean() < STILL_SHARE:
+        return False
+    return bool(near.sum() < FEWEST_NEAR or np.median(moved_px[near]) < STILL_PX)
 
 
 def ways_of_points(points: EpipolarResiduals, geometry: GroupGeometry, length: float) -> Array:

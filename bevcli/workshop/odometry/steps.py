@@ -1,7 +1,6 @@
 """The motion between two frames: matched points, starts, and the motion that fits points and road best."""
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve
 from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
 from bevcli.workshop.odometry.frames import FrameView
 from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
-from bevcli.workshop.odometry.point_votes import point_votes, under_the_road, ways_of_points
+from bevcli.workshop.odometry.point_votes import point_votes, stands, under_the_road, ways_of_points
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (
     CHANGE_RAD,
@@ -27,7 +26,6 @@ from bevcli.workshop.odometry.unknowns import (
     deviations_at,
     next_slopes,
 )
-from bevcli.workshop.odometry.unmoved import stands
 
 YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
@@ -56,10 +54,7 @@ STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same 
 SURE_OF_ROAD, UNSURE = 15, 2.0  # points of the road, and the factor of all deviations where there are fewer
 MANY = 3  # cameras, whose agreement tells the deviations too
 PARTS = 6  # of a pair of images, whose agreement tells the deviations
-
-
 NO_POINTS = RoadPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0))
-Some = TypeVar("Some", bound=Residuals)
 
 
 @dataclass(frozen=True)
@@ -145,13 +140,7 @@ def match_points(step: StepViews) -> EpipolarResiduals:
         b.append(rays_b)
         focal.append(np.full(len(rays_a), step.first.cameras[i].intrinsics[0, 0]))
     columns = np.concatenate(group), np.concatenate(a), np.concatenate(b), np.concatenate(focal)
-    return _sorted(EpipolarResiduals(*columns))
-
-
-def _sorted(residuals: Some) -> Some:
-    """By group, as the solver needs it."""
-    order = np.argsort(residuals.group, kind="stable")
-    return type(residuals)(*(getattr(residuals, field.name)[order] for field in fields(residuals)))
+    return EpipolarResiduals(*columns).sorted()
 
 
 def along_arc(distance: float, yaw: float, slopes: Array) -> Array:
@@ -353,7 +342,7 @@ def _road(
     flow = road_flow(*roads, yaw, motion[3:5], most_m)
     rays_a, rays_b, weights = rays_and_weights(flow, (step.first.cameras, step.second.cameras), yaw)
     group = step.group(flow.cameras[:, 0], flow.cameras[:, 1], rays_a)
-    return _sorted(GroundResiduals(group, rays_a, rays_b, weights))
+    return GroundResiduals(group, rays_a, rays_b, weights).sorted()
 
 
 def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: float) -> RoadResiduals:
@@ -367,7 +356,7 @@ def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: 
             parts.append(road_points(camera, (a.pixels, b.pixels), geometry, group, most_px, grey=True))
             groups.append(step.group(index, index, parts[-1].rays_a))
     columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
-    road = _sorted(RoadResiduals(np.concatenate(groups), *columns))
+    road = RoadResiduals(np.concatenate(groups), *columns).sorted()
     near = road.beside_m < WAY_M
     return road.where(near) if near.sum() >= FEWEST_OF_ROAD else road  # farther aside may be a pavement: it is higher
 

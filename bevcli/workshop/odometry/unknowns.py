@@ -1,4 +1,7 @@
-"""The unknowns of a step: the motion of the vehicle, the slope of the road, and the height of the cameras over it."""
+"""The unknowns of a step: the motion of the vehicle, the slope of the road, and the height of the cameras over it.
+
+The motion along a part of a step is the exponential of that part of its twist.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,18 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.workshop.correspondence.residuals import GroupGeometry, Indices
-from bevcli.workshop.odometry.twist import exponential, logarithm
 
 TURN, PLACE, SLOPES, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 8), 8  # the indices of the unknowns
 COUNT = 9
 STATE = slice(0, 8)  # those that a start has
-SUSPENSION_RAD, SUSPENSION_M = (
-    np.radians(0.7),
-    (0.01, 0.01),
-)  # of pitch and roll, and of the height (and as a share of the way), between two frames
+# Of pitch and roll, and of the height (and as a share of the way), between two frames.
+SUSPENSION_RAD, SUSPENSION_M = np.radians(0.7), (0.01, 0.01)
 YAW_RAD, ALONG = np.radians(3.0), 0.3  # by which the start may be wrong, the second as a share of the distance
 SHORTEST_M = 0.5  # distance for that share
 SLOPE_RAD, CHANGE_RAD = np.radians(0.5), np.radians(0.2)  # of the road under the vehicle, and its change in a step
+SMALLEST_RAD = 1e-7  # radians; below it an arc is a line
 
 
 @dataclass(frozen=True)
@@ -94,3 +95,29 @@ def deviations_at(start: Array, height_m: float, slope_rad: float, *, known_dist
     over = SUSPENSION_M[0] + SUSPENSION_M[1] * float(np.hypot(*start[3:5]))
     along = 1e-3 if known_distance else wide
     return np.array([SUSPENSION_RAD, SUSPENSION_RAD, YAW_RAD, along, wide, over, slope_rad, slope_rad, height_m])
+
+
+def _along(turn: Array) -> Array:
+    """(..., 3, 3) from the velocity of a unit of time to the translation of an arc with a turn (..., 3)."""
+    angle = np.linalg.norm(turn, axis=-1)[..., None, None]
+    skew = np.cross(turn[..., None, :], np.eye(3)).swapaxes(-1, -2)  # (..., 3, 3) of the cross product
+    safe = np.maximum(angle, SMALLEST_RAD)
+    first = np.where(angle < SMALLEST_RAD, 0.5, (1 - np.cos(safe)) / safe**2)
+    second = np.where(angle < SMALLEST_RAD, 0.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + first * skew + second * skew @ skew)
+
+
+def exponential(twist: Array) -> Array:
+    """(..., 4, 4) the motions of twists (..., 6): rotation vector (radians) and velocity (metres) of a unit of time."""
+    motion = np.zeros((*twist.shape[:-1], 4, 4))
+    turns = Rotation.from_rotvec(twist[..., :3].reshape(-1, 3))
+    motion[..., :3, :3] = turns.as_matrix().reshape(*twist.shape[:-1], 3, 3)
+    motion[..., :3, 3] = (_along(twist[..., :3]) @ twist[..., 3:, None])[..., 0]
+    motion[..., 3, 3] = 1
+    return motion
+
+
+def logarithm(motion: Array) -> Array:
+    """(6,) the twist of a motion (4, 4): its inverse."""
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    return np.concatenate([turn, np.linalg.solve(_along(turn), motion[:3, 3])])

@@ -24,6 +24,7 @@ from bevcli.inference.run import run
 from bevcli.parsing.documents import parse_toml
 from bevcli.printing import aligned
 from bevcli.sequences.files.boxes_file import FrameBoxes, read_boxes
+from bevcli.workshop.trust.faults import find_faults
 from bevcli.workshop.trust.figures import Figures, figures_of, scores_of, within
 from bevcli.workshop.trust.fit import Fit
 
@@ -105,7 +106,7 @@ class EstimatedScore:
 def estimate_score(
     model: Model, drive: Sequence, *, temporal: bool = True, after_frame: Callable[[], None] = lambda: None
 ) -> EstimatedScore:
-    """The score that a model is likely to have on a drive, which needs no ground truth.
+    """The score that a model is likely to have on a drive, which needs no ground truth, and faults that show.
 
         estimated = bevcli.estimate_score(model, bevcli.open_sequence("my_drive"))
         print(estimated.nd_score, estimated.low, estimated.high)
@@ -122,7 +123,7 @@ def estimate_score(
     for frame, prediction in run(model, drive, temporal=temporal, track=False):
         frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego))
         after_frame()
-    return estimate_of_boxes(model, frames, drive.rig)
+    return replace(estimate_of_boxes(model, frames, drive.rig), findings=find_faults(model, drive))
 
 
 def as_document(scores: Items[tuple[str, EstimatedScore]], reference: EstimatedScore | None) -> dict[str, Any]:
@@ -135,14 +136,14 @@ def as_document(scores: Items[tuple[str, EstimatedScore]], reference: EstimatedS
 
 
 def estimate_of_run(model: Model, folder: Path, rig: CameraRig) -> EstimatedScore:
-    """The same from the predictions.json in the folder of a run. Raises InputError where it cannot be read."""
+    """The score from the predictions.json in the folder of a run. Raises InputError where it cannot be read."""
     file = read_boxes(folder / "predictions.json")
     frames = [replace(frame, boxes=file.in_ego(frame)) for frame in file.frames]
     return estimate_of_boxes(model, frames, rig)
 
 
 def estimate_of_boxes(model: Model, frames: Items[FrameBoxes], rig: CameraRig) -> EstimatedScore:
-    """The same from the boxes of a run, all of them, in the ego frame. rig: of the drive."""
+    """The score from the boxes of a run, all of them, in the ego frame. rig: of the drive."""
     range_m = model.config.bev_grid.nearest_side_m
     figures, fit = figures_of(frames, rig, range_m), fits().get(model.weights_hash)
     nd_score = None if fit is None else fit.nd_score(figures)

@@ -14,6 +14,7 @@ from bevcli.sequences.files.boxes_file import FrameBoxes
 BEST = 15  # boxes of a frame whose scores `confidence` averages
 SURE, POSSIBLE = 0.2, 0.1  # scores: of a box that is looked for in the next frame, and of one that may be it
 NEAR_M = 2.0  # a box is found again within this distance of where its velocity leads
+FEW = 0.2  # sum of the scores of a class in a frame with which it counts half in `class_certainty`
 MARGIN_M = 4.0  # boxes this near the end of the range may leave it before the next frame
 
 
@@ -26,18 +27,21 @@ class Figures:
         confidence: mean of the 15 best scores of a frame, 0 to 1; missing boxes count as 0.
         certainty: mean score of all boxes, each weighted by the square of its score, 0 to 1. It does not depend on how
             many objects there are.
+        class_certainty: certainty of the boxes of each class, the mean over classes. A class counts fully where many
+            boxes have a score of 0.2 or more, and less the fewer there are. 0 without such boxes.
         persistence: share of boxes that are found again in the next frame where their velocity leads, 0 to 1. A box
-            counts by its score; one that is d metres off counts exp(-d), one beyond 2 m not at all. 0 without boxes.
+            counts by its score; one that drifts v m/s counts exp(-v / 2), one beyond 2 m not at all. 0 without boxes.
         size_change: mean relative change of length, width and height of a box that is found again.
-        fov_deg: mean horizontal field of view of the cameras, degrees; NaN without cameras.
+        unseen: share of the boxes with a score of 0.2 or more whose centre no camera sees, 0 to 1.
     """
 
     frames: int
     confidence: float
     certainty: float
+    class_certainty: float
     persistence: float
     size_change: float
-    fov_deg: float
+    unseen: float
 
 
 def figures_of(frames: Sequence[FrameBoxes], rig: CameraRig, range_m: float) -> Figures:
@@ -46,20 +50,34 @@ def figures_of(frames: Sequence[FrameBoxes], rig: CameraRig, range_m: float) -> 
     frames: in the order of the run, with boxes in the ego frame that have scores. rig: the cameras. range_m: boxes
     beyond this distance from the ego frame's origin are ignored.
     """
-    scores = [scores_of(within(frame.boxes, range_m)) for frame in frames]
-    every = np.concatenate([*scores, np.zeros(0)])
-    best = [np.sort(of_frame)[-BEST:].sum() / BEST for of_frame in scores]
+    kept = [within(frame.boxes, range_m) for frame in frames]
+    every = Boxes3D.concatenate(kept)
+    best = [np.sort(scores_of(boxes))[-BEST:].sum() / BEST for boxes in kept]
+    sure = every.scored(SURE).centers
+    seen = np.any([np.zeros(len(sure), dtype=bool), *(camera.sees(sure) for camera in rig.cameras)], axis=0)
     steps = [_found_again(*step, range_m) for step in pairwise(frames) if _follows(*step)]
     score, closeness, change = np.concatenate([*steps, np.zeros((3, 0))], axis=1)
-    fields_of_view = [2 * np.degrees(np.arctan(c.width / 2 / c.intrinsics[0, 0])) for c in rig.cameras]
     return Figures(
         frames=len(frames),
         confidence=_mean(np.array(best)),
-        certainty=_mean(every, every**2),
+        certainty=_certainty(scores_of(every)),
+        class_certainty=_class_certainty(every, len(frames)),
         persistence=0.0 if steps and not len(score) else _mean(closeness, score),
         size_change=_mean(change[closeness > 0], score[closeness > 0]),
-        fov_deg=_mean(np.array(fields_of_view)),
+        unseen=_mean(~seen * 1.0),
     )
+
+
+def _certainty(scores: Array) -> float:
+    return _mean(scores, scores**2) if len(scores) else 0.0
+
+
+def _class_certainty(boxes: Boxes3D, frames: int) -> float:
+    scores = scores_of(boxes)
+    of_classes = [scores[boxes.classes == name] for name in np.unique(boxes.classes)]
+    amounts = np.array([each[each >= SURE].sum() / frames for each in of_classes])
+    weights = amounts / (amounts + FEW)
+    return _mean(np.array([_certainty(each) for each in of_classes]), weights) if weights.any() else 0.0
 
 
 def within(boxes: Boxes3D, range_m: float) -> Boxes3D:
@@ -98,4 +116,4 @@ def _found_again(frame: FrameBoxes, following: FrameBoxes, range_m: float) -> Ar
     off_m[boxes.classes[:, None] != others.classes] = np.inf
     nearest, off_m = off_m.argmin(axis=1), off_m.min(axis=1)
     change = np.abs(np.log(others.sizes_lwh[nearest] / boxes.sizes_lwh)).mean(axis=1)
-    return np.stack([scores_of(boxes), np.where(off_m < NEAR_M, np.exp(-off_m), 0), change])
+    return np.stack([scores_of(boxes), np.where(off_m < NEAR_M, np.exp(-off_m / seconds / 2), 0), change])

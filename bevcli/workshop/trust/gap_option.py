@@ -4,6 +4,7 @@ Measured where the weights were trained on rendered streets, which are those of 
 """
 
 import textwrap
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,23 +18,41 @@ from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import finite
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
+from bevcli.inference.load import load_model
 from bevcli.model.config import ModelConfig
 from bevcli.printing import aligned, counted
 from bevcli.rig.check_calibration import CalibrationCheck, check_calibration
 from bevcli.rig.rig_report import WIDTH
 from bevcli.workshop.scores.compare import Difference
-from bevcli.workshop.synth.rig import nuscenes_like_rig
+from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.trust.rig_differences import (
+    Kind,
     KnownRigs,
     RigDifference,
     known_rigs,
     rig_differences,
     size_differences,
 )
+from bevcli.workshop.trust.rig_gap import (
+    FRAMES,
+    STREETS,
+    Cost,
+    MeasuredRig,
+    Scored,
+    Shot,
+    boxes_of,
+    comparable,
+    difference,
+    is_clear,
+    polar_map,
+    scored,
+    seen_objects,
+    sides,
+    trial,
+)
 
 DARK_GREY = 45  # mean of an image, 0 to 255; those of the rendered streets have 95 to 117
 SLOWER = 1.5  # an image rate that is lower by this factor than the model's is a difference
-OBJECTS_TEXT = "AP of all boxes, with a 95 % interval over the frames"
 
 
 def gap_of_rigs(
@@ -54,7 +73,7 @@ def gap_of_rigs(
         rigs[other.name if other.name != check.name else f"{other.name} (second)"] = other.rig
     known, range_m = known_rigs(config), config.bev_grid.nearest_side_m
     found = {name: list(rig_differences(rig, known, range_m)) for name, rig in rigs.items()}
-    found[check.name] += _of_drive(open_drive, config)
+    found[check.name] += of_drive(open_drive, config)
     if bundled_weights(model) is None:
         for name, rig in rigs.items():
             found[name] += size_differences(rig, config) if not config.training_rigs.known else ()
@@ -62,7 +81,8 @@ def gap_of_rigs(
     return _measured(model, rigs, found, known)
 
 
-def _of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterator[RigDifference]:
+def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterator[RigDifference]:
+    """The differences of a drive's images from rendered ones: rate and light; none of a calibration alone."""
     try:
         drive = open_drive(ego_motion="optional")
     except InputError:  # a calibration alone
@@ -118,39 +138,6 @@ def _item(head: str, text: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Cost:
-    """What differences of one kind cost.
-
-    Attributes:
-        differences: of a rig.
-        gain: AP of all boxes with the differences, and with them taken back; None where this cannot be rendered.
-    """
-
-    differences: tuple[RigDifference, ...]
-    gain: Difference | None
-
-    @property
-    def text(self) -> str:
-        """The AP that is lost, or that it is within noise."""
-        if self.gain is None:
-            return "not measured"
-        low, high = self.gain.interval
-        if not self.gain.better:
-            return "within noise"
-        return f"{self.gain.difference:.2f} ({low:.2f} to {high:.2f})"
-
-
-@dataclass(frozen=True)
-class MeasuredRig:
-    """A rig on the rendered streets. scored: of `rig_gap`."""
-
-    name: str
-    rig: CameraRig
-    scored: Any
-    costs: tuple[Cost, ...] = ()
-
-
-@dataclass(frozen=True)
 class MeasuredGap:
     """The gap of one or two rigs.
 
@@ -173,85 +160,72 @@ class MeasuredGap:
         return pairs + ([self.rigs] if len(self.rigs) == 2 else [])
 
     def text(self) -> str:
-        from bevcli.workshop.trust.rig_gap import STREETS, difference, is_clear
-
         one = self.known.scored
-        where = (
-            f"{len(STREETS)} rendered streets, {one.frames} frames, {len(one.places)} objects within {self.range_m:g} m"
-        )
+        where = f"{len(STREETS)} rendered streets, {one.frames} frames"
+        where += f", {len(one.places)} objects within {self.range_m:g} m"
         heads = (f"AP {name} ({one.counts[name]})" if name in one.counts else name for name in one.values)
-        rows: list[tuple[str, ...]] = [("", *heads, "found")]
-        for each in (self.known, *self.rigs):
-            values = [f"{value:.2f}" for value in each.scored.values.values()]
-            rows.append((each.name, *values, f"{each.scored.found.mean():.0%}"))
-        for a, b in self.pairs:
-            cells = [_cell(difference(a.scored, b.scored, column)) for column in one.values]
-            mine, theirs = b.scored.found, a.scored.found
-            clear = is_clear(int((mine & ~theirs).sum()), int((theirs & ~mine).sum()))
-            share = f"{mine.mean() - theirs.mean():+.0%}" if clear else "within noise"
-            rows.append((f"{b.name} - {a.name}", *cells, share))
-        lines = [f"Rig gap: {self.model} on {where}", "", aligned(rows)]
+        rows: list[tuple[str, ...]] = [("", *heads, "found"), _row(self.known.name, one)]
+        for rig in self.rigs:
+            rows.append(_row(rig.name, rig.scored))
+            rows += [_row(f"  {cost.label}", cost.shown) for cost in rig.costs if cost.shown is not None]
+        rows += [self._differences(a, b) for a, b in self.pairs]
+        lines = [
+            f"Rig gap: {self.model} on {where}",
+            "",
+            aligned(rows),
+        ]
         for a, b in self.pairs:
             lines += self._sides(a, b)
         for rig in self.rigs:
-            head = f"what differs, and what it costs ({OBJECTS_TEXT})" if rig.costs else "nothing differs"
-            lines += ["", f"{rig.name}: {head}"]
+            head = "what differs, and what it costs (AP of all boxes, with a 95 % interval over the frames)"
+            lines += ["", f"{rig.name}: {head if rig.costs else 'nothing differs'}"]
             for cost in rig.costs:
                 texts = [each.text for each in cost.differences]
                 lines += [line for n, text in enumerate(texts) for line in _item("" if n else cost.text, text)]
         return "\n".join(lines)
 
-    def _sides(self, a: MeasuredRig, b: MeasuredRig) -> Iterator[str]:
-        from bevcli.workshop.trust.rig_gap import sides
+    def _differences(self, a: MeasuredRig, b: MeasuredRig) -> tuple[str, ...]:
+        cells = [_cell(difference(a.scored, b.scored, column)) for column in a.scored.values]
+        before, after = a.scored.found, b.scored.found
+        clear = is_clear(int((after & ~before).sum()), int((before & ~after).sum()))
+        return f"{b.name} - {a.name}", *cells, f"{after.mean() - before.mean():+.0%}" if clear else "within noise"
 
+    def _sides(self, a: MeasuredRig, b: MeasuredRig) -> Iterator[str]:
         clear = sorted(sides(a.scored.places, a.scored.found, b.scored.found), key=lambda row: row[3] - row[2])
         if clear:
-            yield ""
-            yield f"found by {b.name}, and by {a.name}, where the difference is beyond noise"
+            yield from ("", f"found with {b.name}, and with {a.name}, where the difference is beyond noise")
         for side, count, before, after in clear:
             yield from _item(side, f"{after:.0%} instead of {before:.0%} of {counted(count, 'objects')}")
 
     def to_dict(self) -> dict[str, Any]:
-        from bevcli.workshop.trust.rig_gap import FRAMES, STREETS, difference, polar_map
-
-        rigs = {}
-        for each in (self.known, *self.rigs):
-            of_map = polar_map(each.scored.places, each.scored.found, self.range_m)
-            costs = [
-                {"differences": [vars(one) for one in cost.differences], "gain": cost.gain and cost.gain.to_dict()}
-                for cost in each.costs
-            ]
-            rigs[each.name] = {
-                "average_precision": each.scored.values,
-                "found": float(each.scored.found.mean()),
-                "found_by_sector_and_ring": of_map.found.tolist(),
-                "costs": costs,
-            }
-        objects = polar_map(self.known.scored.places, self.known.scored.found, self.range_m).counts
-        return finite(
-            {
-                "model": self.model,
-                "method": "measured",
-                "streets": list(STREETS),
-                "frames_per_street": FRAMES,
-                "objects": len(self.known.scored.places),
-                "objects_by_sector_and_ring": objects.tolist(),
-                "rigs": rigs,
-                "differences": [
-                    {"of": b.name, "against": a.name}
-                    | {column: difference(a.scored, b.scored, column).to_dict() for column in a.scored.values}
-                    for a, b in self.pairs
-                ],
-            }
-        )
+        differences = [
+            {"of": b.name, "against": a.name}
+            | {column: difference(a.scored, b.scored, column).to_dict() for column in a.scored.values}
+            for a, b in self.pairs
+        ]
+        one = self.known.scored
+        content = {
+            "model": self.model,
+            "method": "measured",
+            "streets": list(STREETS),
+            "frames_per_street": FRAMES,
+            "objects": len(one.places),
+            "objects_by_sector_and_ring": polar_map(one.places, one.found, self.range_m).counts.tolist(),
+            "rigs": {each.name: each.to_dict(self.range_m) for each in (self.known, *self.rigs)},
+            "differences": differences,
+        }
+        return {key: finite(value) for key, value in content.items()}
 
     def write(self, folder: Path) -> list[Path]:
         from bevcli.workshop.trust.rig_gap_picture import write_picture
 
         path = folder / "rig_gap.png"
-        a, b = self.pairs[-1]
-        write_picture(path, (a.name, b.name), (a.rig, b.rig), (a.scored, b.scored), self.range_m)
+        write_picture(path, *self.pairs[-1], self.range_m)
         return [path]
+
+
+def _row(name: str, one: Scored) -> tuple[str, ...]:
+    return name, *(f"{value:.2f}" for value in one.values.values()), f"{one.found.mean():.0%}"
 
 
 def _cell(each: Difference) -> str:
@@ -263,35 +237,33 @@ def _measured(
     name: str, rigs: dict[str, CameraRig], found: dict[str, list[RigDifference]], known: KnownRigs
 ) -> MeasuredGap:
     from bevcli.cli.progress import Progress
-    from bevcli.inference.load import load_model
-    from bevcli.workshop.trust import rig_gap
 
+    for cameras in rigs.values():
+        rig_for_rendering(cameras, None)  # names the camera whose lens cannot be rendered
     model, training = load_model(name), nuscenes_like_rig()
     range_m, classes = model.config.bev_grid.nearest_side_m, model.config.object_classes
-    trials = {
-        (rig, kind): rig_gap.trial(rigs[rig], [each for each in differences if each.kind == kind], known, range_m)
-        for rig, differences in found.items()
-        for kind in dict.fromkeys(each.kind for each in differences)
-    }
-    plain = [rig_gap.Shot(rig) for rig in (training, *rigs.values())]
+    kinds: dict[tuple[str, Kind], list[RigDifference]] = defaultdict(list)
+    for rig, differences in found.items():
+        for each in differences:
+            kinds[rig, each.kind].append(each)
+    trials = {key: trial(rigs[key[0]], of_kind, known, range_m) for key, of_kind in kinds.items()}
+    plain = [Shot(cameras) for cameras in (training, *rigs.values())]
     shots = {shot.path(model): shot for shot in (*plain, *(shot for pair in trials.values() for shot in pair))}
-    kept = sum(shot.count for path, shot in shots.items() if path.exists())
     with Progress(sum(shot.count for shot in shots.values()), "frames of rendered streets") as progress:
-        if kept:
+        if kept := sum(shot.count for path, shot in shots.items() if path.exists()):
             progress.skip(kept)
-        boxes = {path: rig_gap.boxes_of(model, shot, progress.advance) for path, shot in shots.items()}
-    of_rigs = [boxes[shot.path(model)] for shot in plain]
-    seen = rig_gap.seen_objects(*of_rigs)
-    scores = [rig_gap.scored(each, seen, classes, range_m) for each in of_rigs]
+        boxes = {path: boxes_of(model, shot, progress.advance) for path, shot in shots.items()}
+    seen = seen_objects(*(boxes[shot.path(model)] for shot in plain))
+    same_frames = [path for path, shot in shots.items() if shot.frames == FRAMES]
+    scores = {path: scored(boxes[path], seen, classes, range_m) for path in same_frames}
     costs: dict[str, list[Cost]] = {rig: [] for rig in rigs}
     for (rig, kind), pair in trials.items():
-        gain = None
-        if pair:
-            sides = rig_gap.comparable(*((shot, boxes[shot.path(model)]) for shot in pair))
-            seen_here = seen if len(sides[0]) == len(seen) else rig_gap.seen_objects(*sides)
-            with_it, without = (rig_gap.scored(each, seen_here, classes, range_m) for each in sides)
-            gain = rig_gap.difference(with_it, without)
-        costs[rig].append(Cost(tuple(each for each in found[rig] if each.kind == kind), gain))
-    measured = zip(rigs.items(), scores[1:], strict=True)
-    own = tuple(MeasuredRig(rig, cameras, each, tuple(costs[rig])) for (rig, cameras), each in measured)
-    return MeasuredGap(name, range_m, MeasuredRig("training rig", training, scores[0]), own)
+        both = [scores[shot.path(model)] for shot in pair if kind != "rate"]
+        if kind == "rate":
+            thinned = comparable(*((shot, boxes[shot.path(model)]) for shot in pair))
+            both = [scored(each, seen_objects(*thinned), classes, range_m) for each in thinned]
+        costs[rig].append(Cost(tuple(kinds[rig, kind]), *both))
+    first, *own = (scores[shot.path(model)] for shot in plain)
+    measured = zip(rigs.items(), own, strict=True)
+    of_rigs = tuple(MeasuredRig(rig, cameras, each, tuple(costs[rig])) for (rig, cameras), each in measured)
+    return MeasuredGap(name, range_m, MeasuredRig("training rig", training, first), of_rigs)

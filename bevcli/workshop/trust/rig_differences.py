@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import Camera, CameraRig, distort
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.inference.preprocess import image_for_rig, network_scale
 from bevcli.model.config import ModelConfig
@@ -184,7 +184,7 @@ def blind_sectors_deg(rig: CameraRig, range_m: float) -> list[Range]:
 
 def _blind_sectors(rig: CameraRig, range_m: float) -> Iterator[RigDifference]:
     for first, end in blind_sectors_deg(rig, range_m):
-        text = f"no camera sees {end - first:.0f}° {_side((first + end) / 2)}: nothing is found there"
+        text = f"no camera sees {end - first:.0f}° {_side((first + end) / 2)}: most objects there are missed"
         yield RigDifference("blind sector", (), text)
 
 
@@ -221,8 +221,13 @@ def taken_back(rig: CameraRig, kind: Kind, known: KnownRigs, range_m: float) -> 
 def _nearest(camera: Camera, kind: Kind, ends: Range) -> Camera:
     mounting, position = mounting_of(camera.ego_from_camera), camera.ego_from_camera[:3, 3].copy()
     if kind == "field of view":
-        fov, intrinsics = min(seen_fov_deg(camera)[0], 179.0), camera.intrinsics.copy()
-        intrinsics[[0, 1], [0, 1]] *= np.tan(np.radians(fov) / 2) / np.tan(np.radians(np.clip(fov, *ends)) / 2)
+        fov, intrinsics = seen_fov_deg(camera)[0], camera.intrinsics.copy()
+        aim = float(np.clip(fov, *ends))
+        edge = np.array([np.tan(np.radians(aim) / 2), 0.0])  # of the image, in normalised coordinates
+        if camera.distortion is not None:
+            edge = distort(edge, camera.distortion)
+        if fov != aim:
+            intrinsics[[0, 1], [0, 1]] *= camera.width / 2 / edge[0] / intrinsics[0, 0]
         return replace(camera, intrinsics=intrinsics)
     if kind == "height":
         position[2] = np.clip(position[2], *ends)

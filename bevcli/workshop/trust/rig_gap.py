@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.detection import DetectionScores, evaluate_detections
 from bevcli.evaluation.matching import DetectionConfig
@@ -43,6 +44,7 @@ RESAMPLES = 400
 FORMAT = "rig-gap/1"  # of what is kept
 MOST_EVERY = 4  # frames of the model's rate from one to the next, at a lower image rate
 GREY_OF_LEVEL = {0: 37, 1: 31, 2: 25, 3: 19, 4: 14}  # mean grey of rendered streets at the levels of `low_light`
+OF_DRIVE = ("rate", "light")  # kinds of differences that no rig has
 ANY = "object"  # the class of all boxes together
 RigBoxes = tuple[tuple[Boxes3D, Boxes3D], ...]  # predicted and true boxes of each frame, ego frame
 
@@ -73,7 +75,7 @@ class Shot:
         rig = [(c.width, c.height, c.intrinsics, c.ego_from_camera, c.distortion) for c in self.rig.cameras]
         how = (FORMAT, STREETS, self.frames, self.every, self.darkness)
         facts = (model.weights_hash, model.config_hash, model.precision, how, rig, self.rig.ego_from_bev)
-        return user_cache() / "rig-gap" / f"{digest(facts)[:24]}.safetensors"
+        return user_cache() / "rig-gap" / f"{__version__}-{digest(facts)[:24]}.safetensors"
 
 
 def boxes_of(model: Model, shot: Shot, after_frame: Callable[[], None] = lambda: None) -> RigBoxes:
@@ -251,6 +253,70 @@ def difference(a: Scored, b: Scored, column: str = "all boxes") -> Difference:
     """The difference b - a of a column, with its 95 % interval over resamples of the frames."""
     low, high = np.nanpercentile(b.resampled[column] - a.resampled[column], [2.5, 97.5])
     return Difference((a.values[column], b.values[column]), (float(low), float(high)))
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What differences of one kind cost.
+
+    Attributes:
+        differences: of a rig.
+        with_it: the scores with the differences; None where they cannot be rendered.
+        without: the scores with them taken back.
+    """
+
+    differences: tuple[RigDifference, ...]
+    with_it: Scored | None = None
+    without: Scored | None = None
+
+    @cached_property
+    def gain(self) -> Difference | None:
+        """AP of all boxes without the differences less that with them."""
+        return difference(self.with_it, self.without) if self.with_it and self.without else None
+
+    @property
+    def text(self) -> str:
+        """The AP that is lost, or that it is within noise."""
+        if self.gain is None:
+            return "not measured"
+        low, high = self.gain.interval
+        return f"{self.gain.difference:.2f} ({low:.2f} to {high:.2f})" if self.gain.better else "within noise"
+
+    @property
+    def label(self) -> str:
+        """The row of `shown`: a rig has its differences, a drive's are added to it."""
+        kind = self.differences[0].kind
+        return f"with its {kind}" if kind in OF_DRIVE else f"without its {kind}"
+
+    @property
+    def shown(self) -> Scored | None:
+        """The scores that a rig does not have as it is."""
+        return self.with_it if self.differences[0].kind in OF_DRIVE else self.without
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        values = {name: each and each.values for name, each in (("with", self.with_it), ("without", self.without))}
+        differences = [vars(each) for each in self.differences]
+        return {"differences": differences, "average_precision": values, "gain": self.gain and self.gain.to_dict()}
+
+
+@dataclass(frozen=True)
+class MeasuredRig:
+    """A rig on the rendered streets, and what its differences cost."""
+
+    name: str
+    rig: CameraRig
+    scored: Scored
+    costs: tuple[Cost, ...] = ()
+
+    def to_dict(self, range_m: float) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "average_precision": self.scored.values,
+            "found": float(self.scored.found.mean()),
+            "found_by_sector_and_ring": polar_map(self.scored.places, self.scored.found, range_m).found.tolist(),
+            "costs": [cost.to_dict() for cost in self.costs],
+        }
 
 
 @dataclass(frozen=True)

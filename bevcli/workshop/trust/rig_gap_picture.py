@@ -16,7 +16,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.rig.drawings import AXLE_TO_TAIL_M, CAR_LENGTH_M, CAR_WIDTH_M, FAINT, INK, PAPER, save
 from bevcli.rig.rig_checks import seen_range_deg
-from bevcli.workshop.trust.rig_gap import RING_M, SECTORS, SHOWN_SCORE, Scored, is_clear, polar_map
+from bevcli.workshop.trust.rig_gap import RING_M, SECTORS, SHOWN_SCORE, MeasuredRig, is_clear, polar_map
 
 EMPTY, NOISE = "#1b2027", "#39414c"
 FOUND = LinearSegmentedColormap.from_list("found", ["#8c2438", "#d9833b", "#f0e28a", "#63b77c", "#1f7a6d"])
@@ -26,17 +26,12 @@ FEWEST = 2.0  # objects of a cell, with those that count half
 LEGEND = f"share of objects found: a box of the class within 2 m, score {SHOWN_SCORE:g} or more; below it, the objects"
 
 
-def write_picture(
-    path: Path,
-    names: tuple[str, str],
-    rigs: tuple[CameraRig, CameraRig],
-    of_rigs: tuple[Scored, Scored],
-    range_m: float,
-) -> None:
+def write_picture(path: Path, first: MeasuredRig, second: MeasuredRig, range_m: float) -> None:
     """Write the PNG: both rigs, and the second less the first. Raises OutputError."""
+    rigs = (first, second)
+    a, b = (each.scored for each in rigs)
     figure = Figure(figsize=(17.4, 7.0), dpi=100, facecolor=PAPER)
-    a, b = of_rigs
-    maps = [polar_map(each.places, each.found, range_m) for each in of_rigs]
+    maps = [polar_map(each.places, each.found, range_m) for each in (a, b)]
     counts = smoothed(maps[0].counts)
     with np.errstate(invalid="ignore", divide="ignore"):
         enough = (counts >= FEWEST) & (maps[0].counts > 0)
@@ -47,8 +42,10 @@ def write_picture(
         axes: Any = figure.add_axes((0.015 + 0.33 * place, 0.16, 0.305, 0.69), projection="polar")
         colors = CHANGE(CHANGES(values)) if place == 2 else FOUND(SHARES(values))
         _draw_cells(axes, values, colors, "" if place == 2 else maps[0].counts)
-        _draw_rig(axes, rigs[min(place, 1)], values.shape[1] * RING_M)
-        name = f"{names[1]} - {names[0]}" if place == 2 else f"{names[place]}: {of_rigs[place].found.mean():.0%} found"
+        _draw_rig(axes, rigs[min(place, 1)].rig, values.shape[1] * RING_M)
+        name = f"{second.name} - {first.name}"
+        if place < 2:
+            name = f"{rigs[place].name}: {rigs[place].scored.found.mean():.0%} found"
         axes.set_title(name, color=INK, fontsize=14, pad=30)
     _draw_bar(figure, (0.10, 0.45), FOUND, SHARES, "{:.0%}", f"{LEGEND}; dark: too few")
     _draw_bar(figure, (0.715, 0.23), CHANGE, CHANGES, "{:+.0%}", "change of that share; without a number: within noise")
