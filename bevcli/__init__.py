@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
+    from bevcli.workshop.trust.estimate import estimate_score as estimate_score
 
 # The public names by the modules that define them.
 _NAMES = {
@@ -83,6 +84,7 @@ _NAMES = {
     "bevcli.workshop.scores.compare": "compare",
     "bevcli.workshop.synth.drive": "render",
     "bevcli.workshop.training.train": "train validate",
+    "bevcli.workshop.trust.estimate": "estimate_score",
     "bevcli.viewer.export": "export",
     "bevcli.viewer.recording_file": "show",
     "bevcli.viewer.views": "screenshot video",

@@ -41,7 +41,7 @@ LAYERS = (
 )
 # The wings of the workshop, and which others each may import; all may import the core.
 WINGS: dict[str, set[str]] = {
-    "batch": set(),
+    "batch": {"trust"},
     "benchmark": {"engines"},
     "calibration": {"correspondence", "odometry"},
     "checks": {"benchmark"},
@@ -53,7 +53,8 @@ WINGS: dict[str, set[str]] = {
     "robustness": {"calibration", "synth"},
     "synth": {"formats"},
     "scores": set(),
-    "training": {"synth"},
+    "training": {"synth", "trust"},
+    "trust": {"correspondence", "odometry", "robustness", "scores", "synth"},
     "uniad": set(),
     "vad": {"formats", "training"},
 }

@@ -71,7 +71,8 @@ class Extension:
     Attributes:
         options: the dataclass of the options.
         apply: called with the options, and an argument of the command. That of `run` is the drive, and it returns the
-            drive to use. That of `project-debug` is a function that opens the drive, and it returns findings.
+            drive to use; that of `run-done`, after the run, is a tuple of the model, the drive and the run's folder.
+            That of `project-debug` is a function that opens the drive, and it returns findings.
     """
 
     options: type[Any]
@@ -83,7 +84,10 @@ Steps = tuple[Callable[[Any], Any], ...]  # a parameter with the steps of all ex
 
 @dataclass(frozen=True)
 class ExtensionsOf:
-    """The command whose extensions a parameter gets, in an annotation: `Annotated[Steps, ExtensionsOf("run")]`."""
+    """The command whose extensions a parameter gets, in an annotation: `Annotated[Steps, ExtensionsOf("run")]`.
+
+    "run-done" for those that `run` calls when it is done.
+    """
 
     command: str
 

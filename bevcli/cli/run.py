@@ -29,6 +29,7 @@ def run(
     recording: RecordingOptions,
     source: SequenceOptions,
     first: Annotated[Steps, ExtensionsOf("run")],
+    last: Annotated[Steps, ExtensionsOf("run-done")],
     output: OutputOptions,
     format_options: FormatValues,
 ) -> None:
@@ -96,6 +97,8 @@ def run(
             should_stop=signals.received,
         )
     say(as_flags(summary.table()))
+    for step in last:
+        step((loaded, drive, out))
     if signals.received() and not summary.is_complete:
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)

@@ -16,17 +16,23 @@ from bevcli.options import option, options
 
 @options()
 class CheckOptions:
-    """The sequence that belongs to a calibration, the model that its rig is compared with, and the output."""
+    """The sequence that belongs to a calibration, the model and rig that it is compared with, and the output."""
 
     sequence: Path | None = option(
         reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
     )
     frame: int = option(default=0, help="Index of the frame whose images are drawn on.", minimum=0)
     out: Path | None = option(default=None, help="The output folder. Default: runs/NAME-project-debug.")
-    model: str = option(
+    model: str | None = option(
         reads="path or name",
-        default="demo",
-        help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml.",
+        default=None,
+        help="Compare the rig with those that this model's weights were trained on, and measure what each difference "
+        "costs: a model name or a FILE.toml. Default: demo, without the measurement.",
         metavar="NAME|FILE",
         complete=complete_model,
+    )
+    against: Path | None = option(
+        reads="path",
+        default=None,
+        help="A second calibration or drive: measure both rigs with the model, and what the second one gains or loses.",
     )

@@ -6,7 +6,7 @@ The times of the images are checked here.
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,14 @@ class CalibrationCheck:
         rig: the cameras that could be read.
         report: the findings, the coverage of the BEV grid, and the comparison with nuScenes.
         images: by camera, (H, W, 3) uint8 BGR, of the chosen frame; empty without a sequence.
+        further: results of other parts, by their key in findings.json.
     """
 
     name: str
     rig: CameraRig
     report: RigReport
     images: Mapping[str, NDArray[np.uint8]]
+    further: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -69,7 +71,7 @@ class CalibrationCheck:
     def to_json(self) -> str:
         """The findings and the coverage as one JSON object, the content of findings.json."""
         findings = [asdict(finding) for finding in self.findings]
-        content = {"findings": findings, "coverage": _coverage_to_json(self.report.coverage)}
+        content = {"findings": findings, "coverage": _coverage_to_json(self.report.coverage), **self.further}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:

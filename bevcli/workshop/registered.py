@@ -73,6 +73,7 @@ OWN: dict[Group, dict[str, str]] = {
     },
     "bevcli.comparisons": {
         "boxes": "bevcli.workshop.scores.compare:compare",
+        "rigs": "bevcli.workshop.trust.gap_option:gap_of_rigs",
     },
     "bevcli.plots": {
         "comparison": "bevcli.workshop.scores.plots:write_comparison",
@@ -108,5 +109,6 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.extensions": {
         "project-debug.motion": "bevcli.workshop.calibration.commands:CHECK_MOTION",
         "run.calibrate": "bevcli.workshop.calibration.run_option:CALIBRATE_FIRST",
+        "run-done.score": "bevcli.workshop.trust.run_option:SCORE_WITHOUT_LABELS",
     },
 }

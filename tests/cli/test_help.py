@@ -56,4 +56,8 @@ def test_help_of_a_command_imports_no_other_wing():
         "    print(name, *sorted(wings - {'registered'}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == ["viz formats", "run calibration formats", "bench benchmark calibration formats"]
+    assert done.stdout.splitlines() == [
+        "viz formats",
+        "run calibration formats trust",
+        "bench benchmark calibration formats trust",
+    ]

@@ -40,6 +40,7 @@ from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage
 from bevcli.workshop.batch.job import SCORE_BINS, Drive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
+from bevcli.workshop.trust.estimate import estimate_of_run, fits
 
 _SCRATCH = "bevcli-batch-"
 
@@ -131,6 +132,7 @@ class Worker:
                 "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
+                **self._estimated(sequence, aside),
                 "input_errors": "; ".join(summary.input_errors),
             }
             _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")
@@ -158,6 +160,14 @@ class Worker:
         matches = DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
         save_state(aside / MATCHES, matches)
         return scores, ""
+
+    def _estimated(self, sequence: CheckedDrive, aside: Path) -> Record:
+        """The columns of the score that is estimated without ground truth; empty for weights without a fit."""
+        if self._model.weights_hash not in fits():
+            return {}
+        estimated = estimate_of_run(self._model, aside, sequence.rig)
+        values = {"nd_score": estimated.nd_score, "low": estimated.low, "high": estimated.high}
+        return {f"estimated_{name}": None if value is None else round(value, 4) for name, value in values.items()}
 
     @contextlib.contextmanager
     def _scratch(self, result: str) -> Iterator[tuple[Path, Path]]:

@@ -46,11 +46,11 @@ class SomeFrames(DerivedSequence):
         return EgoMotion(*rows, *derive_kinematics(*rows), velocities_are_stated=False)
 
 
-def stated_motion_findings(drive: Sequence) -> tuple[Finding, ...]:
+def stated_motion_findings(drive: Sequence, steps: int = STEPS) -> tuple[Finding, ...]:
     """Findings about the stated poses of a drive, from a few measured steps; none for a drive without poses."""
     if not drive.has_ego_motion:
         return ()
-    part = SomeFrames(drive, chosen_places(drive))
+    part = SomeFrames(drive, chosen_places(drive, steps))
     try:
         measured = measure_motion(part)
     except InputError as error:
@@ -58,22 +58,22 @@ def stated_motion_findings(drive: Sequence) -> tuple[Finding, ...]:
     return compare(part.stated, measured, [stamp.index for stamp in part.stamps])
 
 
-def chosen_places(drive: Sequence) -> list[int]:
-    """The places of at most STEPS + 1 frames of the longest scene, those between which the poses turn most."""
+def chosen_places(drive: Sequence, steps: int = STEPS) -> list[int]:
+    """The places of at most steps + 1 frames of the longest scene, those between which the poses turn most."""
     scenes = [list(places) for _, places in groupby(range(len(drive.stamps)), lambda place: drive.stamps[place].scene)]
     places: list[int] = []
     for place in max(scenes, key=len, default=[]):
         if not places or drive.stamps[place].timestamp_ns - drive.stamps[places[-1]].timestamp_ns >= LEAST_NS:
             places.append(place)
-    starts = len(places) - STEPS
+    starts = len(places) - steps
     if starts <= 1:
         return places
     worth = np.zeros(len(places) - 1)
     if drive.ego_motion is not None:
         worth = _worth(drive.ego_motion, np.array([drive.stamps[place].timestamp_ns for place in places]))
-    sums = np.convolve(worth, np.ones(STEPS), mode="valid")
+    sums = np.convolve(worth, np.ones(steps), mode="valid")
     start = int(sums.argmax()) if np.ptp(sums) > 0 else starts // 2
-    return places[start : start + STEPS + 1]
+    return places[start : start + steps + 1]
 
 
 def _worth(motion: EgoMotion, times_ns: NDArray[np.int64]) -> Array:

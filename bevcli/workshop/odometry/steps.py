@@ -145,7 +145,8 @@ def match_points(step: StepViews) -> EpipolarResiduals:
         a.append(rays_a)
         b.append(rays_b)
         focal.append(np.full(len(rays_a), step.first.cameras[i].intrinsics[0, 0]))
-    return EpipolarResiduals(*map(np.concatenate, (group, a, b, focal))).sorted()
+    columns = np.concatenate(group), np.concatenate(a), np.concatenate(b), np.concatenate(focal)
+    return EpipolarResiduals(*columns).sorted()
 
 
 def along_arc(distance: float, yaw: float, slopes: Array) -> Array:

@@ -40,7 +40,7 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), results, {})
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), (), results, {})
     if options.view:
         show(options.out / "results/recording.rrd", ViewOptions())
 

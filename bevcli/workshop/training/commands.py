@@ -14,6 +14,8 @@ from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.options import ModelFileOptions, TrainOptions, ValidationOptions
 
 if TYPE_CHECKING:
+    from bevcli.inference.load import Model
+    from bevcli.workshop.synth.drives import Drives
     from bevcli.workshop.training.trainer import Trainer
 
 
@@ -118,21 +120,50 @@ def validate(
     options: ValidationOptions,
     as_json: Json = False,
 ) -> None:
-    """Score a model on drives with ground truth, all drives together.
+    """Score a model on drives with ground truth, all drives together; estimate the score of drives without.
 
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
+    Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
     """
     from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.inference.load import load_model
     from bevcli.workshop.synth.drives import count_frames
-    from bevcli.workshop.training.train import drives_to_score, score_drives
+    from bevcli.workshop.training.train import drives_to_score, has_ground_truth, score_drives
 
     loaded = load_model(model, options=model_options)
     with odometry_bar() as show_steps:
         name = model or loaded.name
         drives, notes, loaded = drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
         frames = count_frames(drives)
+    if not has_ground_truth(drives):
+        _estimate(loaded, drives, options, as_json=as_json, temporal=run_options.temporal)
+        return
+    if options.reference is not None:
+        raise InputError("`reference` is for drives without ground truth: remove it")
     with Progress(frames, "frames", notes) as progress:
         scores = score_drives(loaded, drives, options, temporal=run_options.temporal, after_frame=progress.advance)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
+
+
+def _estimate(model: "Model", drives: "Drives", options: ValidationOptions, *, as_json: bool, temporal: bool) -> None:
+    """Print the estimated score of each drive; none of them has ground truth."""
+    from bevcli.cli.progress import Progress
+    from bevcli.workshop.synth.drives import FolderDrives, count_frames
+    from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
+
+    for name, given in (("max_range", options.max_range is not None), ("tracking", options.tracking)):
+        if given:
+            raise InputError(f"`{name}`: needs ground truth, which no drive has: remove it")
+    beside = FolderDrives(() if options.reference is None else (options.reference,), model.config)
+    scores: list[tuple[str, EstimatedScore]] = []
+    notes = ("no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",)
+    with Progress(count_frames(drives) + count_frames(beside), "frames", notes) as progress:
+        for drive in (each.open(index) for each in (drives, beside) for index in range(len(each))):
+            score = estimate_score(model, drive, temporal=temporal, after_frame=progress.advance)
+            scores.append((drive.name, score))
+    reference = scores.pop()[1] if len(beside) else None
+    if as_json:
+        say(json.dumps(as_document(scores, reference), indent=1))
+        return
+    say("\n\n".join(f"drive  {name}\n{score.table(reference)}" for name, score in scores))

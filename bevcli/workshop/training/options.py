@@ -99,3 +99,10 @@ class ValidationOptions:
     odometry: bool = option(
         default=False, help="Run with the motion that `bevcli odometry` measures of each drive, not with stated poses."
     )
+    reference: Path | None = option(
+        reads="path",
+        default=None,
+        help="Where no drive has ground truth: a drive on which the weights are known to work. Its figures are printed "
+        "beside those of each drive.",
+        metavar="DIR",
+    )

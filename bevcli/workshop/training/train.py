@@ -136,3 +136,12 @@ def score_drives(
     """Run a model over drives and score them."""
     runner = model.runner(track=options.tracking, temporal=temporal)
     return validate_runner(runner, drives, options.max_range, after_frame=after_frame, each_drive=options.each)
+
+
+def has_ground_truth(drives: Drives) -> bool:
+    """Whether a frame of one of the drives has ground truth."""
+    return any(
+        drive.ground_truth_frame(place).ground_truth is not None
+        for drive in map(drives.open, range(len(drives)))
+        for place in range(len(drive.stamps))
+    )

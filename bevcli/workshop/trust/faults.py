@@ -1,0 +1,201 @@
+"""`find_faults`: mistakes in the input, and broken weights or engines, that show without labels. One line each.
+
+In this order: cameras that are dead or frozen, by their pixels; single cameras and poses, by how points move in the
+images; the order of colours, by the model's scores with the order reversed; an engine, by the boxes of PyTorch; weights
+that find little, by rendered streets.
+"""
+
+from collections.abc import Iterable, Sequence as Items
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.findings import Finding, rig_error
+from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import Array
+from bevcli.inference.load import Model
+from bevcli.inference.options import TORCH
+from bevcli.inference.run import run
+from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.sequences.open import select
+from bevcli.workshop.odometry.check_motion import SomeFrames, chosen_places, stated_motion_findings
+from bevcli.workshop.odometry.frames import Viewer
+from bevcli.workshop.odometry.stated import Poses
+from bevcli.workshop.synth.rig import nuscenes_like_rig
+from bevcli.workshop.trust.camera_faults import camera_findings, points_of
+from bevcli.workshop.trust.figures import figures_of
+from bevcli.workshop.trust.rig_gap import Shot, boxes_of
+
+STEPS = 6  # between frames whose images are compared
+POSE_STEPS = 4  # between frames whose motion is measured
+TRIED = 3  # frames that the model sees with another order of colours
+SMALL = (64, 36)  # pixels of the images whose grey levels are compared
+FLAT = 2.0  # grey levels: standard deviation of an image that shows something
+STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
+SURE, REPEATED_M, NEAR_M = 0.3, 2.0, 20.0  # boxes that are looked for: score, error, distance of a true one
+LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
+LEAST_FOUND = 0.6  # share of near objects of rendered streets that sound weights find; demo finds 0.92
+LEAST_CONFIDENCE, LEAST_PERSISTENCE = 0.35, 0.2  # figures of weights that need no check
+BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
+
+
+class ReversedColors(DerivedSequence):
+    """A drive whose images have their colour channels in reverse order."""
+
+    def load(self, place: int) -> Frame:
+        frame = self.sequence.load(place)
+        return replace(frame, images={name: _reversed(image) for name, image in frame.images.items()})
+
+
+def _reversed(image: CameraImage) -> CameraImage:
+    pixels = np.ascontiguousarray(image.pixels_bgr[..., ::-1])
+    return replace(image, pixels_bgr=pixels, encoded=None, media_type=None)
+
+
+def find_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
+    """The faults of a drive that show without labels; none where all is sound.
+
+    Findings of severity "info" say what could not be checked. A six-camera drive takes about ten seconds on one core.
+
+    Args:
+        model: of `load_model`.
+        drive: of `open_sequence`.
+
+    Raises InputError where a frame cannot be read.
+    """
+    return (*input_faults(drive), *model_faults(model, drive))
+
+
+def input_faults(drive: Sequence) -> tuple[Finding, ...]:
+    """Faults of cameras and poses, which need no model."""
+    part, viewer = SomeFrames(drive, chosen_places(drive, STEPS)), Viewer()
+    views, small = [], list[dict[str, Array]]()
+    for place in range(len(part.stamps)):
+        frame = part.load(place)
+        views.append(viewer.view(frame))
+        small.append({name: small_grey(image.pixels_bgr) for name, image in frame.images.items()})
+    findings = image_findings(drive.rig.names, small)
+    if not drive.has_ego_motion or len(views) < 2:
+        return findings
+    broken = {finding.camera for finding in findings}
+    rows = Poses.of(part.stated)
+    points = {name: each for name, each in points_of(views, rows).items() if name not in broken}
+    motion = stated_motion_findings(drive, POSE_STEPS)
+    return (*findings, *one_cause(motion, camera_findings(points, rows, drive.rig), len(points)))
+
+
+def one_cause(motion: tuple[Finding, ...], cameras: tuple[Finding, ...], measured: int) -> tuple[Finding, ...]:
+    """The findings about poses or those about single cameras: few cameras that are off do not make poses wrong."""
+    if all(finding.severity == "info" for finding in motion):
+        return (*motion, *cameras)
+    return cameras if 0 < len(cameras) < measured / 2 else motion
+
+
+def small_grey(pixels_bgr: NDArray[np.uint8]) -> Array:
+    """(h, w) grey levels of an image (H, W, 3), reduced to SMALL."""
+    return cv2.cvtColor(cv2.resize(pixels_bgr, SMALL, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY).astype(float)
+
+
+def image_findings(names: Iterable[str], frames: Items[dict[str, Array]]) -> tuple[Finding, ...]:
+    """Cameras that show nothing, and those that stand still while the others move.
+
+    frames: grey images (h, w) by camera, of successive frames.
+    """
+    findings, changes = list[Finding](), dict[str, float]()
+    for name in names:
+        shown = [frame[name] for frame in frames if name in frame]
+        if shown and max(image.std() for image in shown) < FLAT:
+            message, found = (
+                "its images show nothing",
+                f"grey levels {min(map(np.min, shown)):.0f} to {max(map(np.max, shown)):.0f}",
+            )
+            findings.append(Finding("camera-dead", "error", name, message, found, "", "check the camera and its files"))
+        elif len(shown) > 1:
+            changes[name] = max(float(np.abs(b - a).mean()) for a, b in pairwise(shown))
+    usual = float(np.median(list(changes.values()) or [0.0]))
+    for name, change in changes.items():
+        if usual >= MOVING and change < STILL * usual:
+            found = f"grey levels change by {change:.2f} between frames, those of the other cameras by {usual:.1f}"
+            message, advice = "its images are all the same", "check the camera and its files"
+            findings.append(Finding("camera-frozen", "error", name, message, found, "", advice))
+    return tuple(findings)
+
+
+def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
+    """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
+    first = max(0, (len(drive.stamps) - TRIED) // 2)
+    some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
+    boxes = boxes_without_history(model, some)
+    broken = engine_findings(model, some, boxes) or weights_findings(model, boxes, drive.rig)
+    return (*color_findings(model, some, boxes), *broken)
+
+
+def boxes_without_history(model: Model, drive: Sequence) -> list[FrameBoxes]:
+    """The boxes of each frame alone, in the ego frame."""
+    return [
+        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
+        for frame, prediction in run(model, drive, temporal=False, track=False)
+    ]
+
+
+def color_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+    """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
+    range_m = model.config.bev_grid.nearest_side_m
+    reversed_boxes = boxes_without_history(model, ReversedColors(drive))
+    stated, undone = (figures_of(each, drive.rig, range_m).confidence for each in (boxes, reversed_boxes))
+    if not undone - stated >= BETTER:
+        return ()
+    found = f"mean of the 15 best scores {stated:.2f} as they are, {undone:.2f} with red and blue exchanged"
+    message, advice = "red and blue are exchanged in the images", "state the order of the channels, or exchange them"
+    return (rig_error("color-order", message, found, "", advice),)
+
+
+def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+    """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine."""
+    if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
+        return ()
+    plain = boxes_without_history(replace(model, engine=TORCH, precision="fp32"), drive)
+    count, same = agreement([each.boxes for each in plain], [each.boxes for each in boxes])
+    if count == 0 or same >= LEAST_SAME:
+        return ()
+    message = f"{model.engine} with {model.precision} does not give the boxes of PyTorch"
+    advice = "export the model again, or use another precision or engine"
+    return (rig_error("engine-broken", message, f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more", advice),)
+
+
+def weights_findings(model: Model, boxes: Items[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
+    """The finding about weights that find little, here and on rendered streets of the rig that they know."""
+    figures = figures_of(boxes, rig, model.config.bev_grid.nearest_side_m)
+    is_low = figures.confidence < LEAST_CONFIDENCE or figures.persistence < LEAST_PERSISTENCE
+    if not (is_low and model.config.training_rigs.known):  # else it is not known what they were trained on
+        return ()
+    known = nuscenes_like_rig(*model.config.image.size)
+    pairs = boxes_of(model.in_engine(known), Shot(known, frames=1))
+    near = [true[np.linalg.norm(true.centers[:, :2], axis=1) < NEAR_M] for _, true in pairs]
+    count, same = agreement(near, [predicted for predicted, _ in pairs])
+    if same >= LEAST_FOUND:
+        return ()
+    message = "the model finds little in rendered streets too, so that the drive is not to blame"
+    found, expected = f"{same:.0%} of {count} near objects", f"{LEAST_FOUND:.0%} or more"
+    advice = "take weights and model file of one training, and check the engine"
+    return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
+
+
+def agreement(wanted: Items[Boxes3D], given: Items[Boxes3D]) -> tuple[int, float]:
+    """Number of boxes with a score of 0.3 or more, or without one, and the share of them that others repeat.
+
+    A box is repeated by one of its class that is at most 2 m away and has a score of 0.15 or more.
+    """
+    count = same = 0
+    for frame, others in zip(wanted, given, strict=True):
+        boxes, candidates = frame.scored(SURE), others.scored(SURE / 2)
+        for center, name in zip(boxes.centers, boxes.classes, strict=True):
+            places = candidates.centers[candidates.classes == name]
+            same += bool(np.linalg.norm(places[:, :2] - center[:2], axis=1).min(initial=np.inf) < REPEATED_M)
+        count += len(boxes)
+    return count, same / max(count, 1)
