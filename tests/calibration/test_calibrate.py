@@ -175,10 +175,7 @@ def test_the_command_writes_a_calibration(tmp_path):
     done = typed(str(STREET), "--out", str(tmp_path / "rig"))
     assert done.exit_code == 0, done.output
     assert "CAM_FRONT_RIGHT" in done.output
-    assert {path.name for path in (tmp_path / "rig").iterdir()} == {
-        "calibration.json",
-        "report.json",
-    }
+    assert {path.name for path in (tmp_path / "rig").iterdir()} == {"calibration.json", "report.json"}
 
 
 def test_the_command_refuses_to_write_into_the_drive():
