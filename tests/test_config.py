@@ -89,14 +89,8 @@ def test_values_are_converted_to_the_types_of_the_dataclass(tmp_path: Path) -> N
         (MINIMAL.format("seats = 2.5"), 'car.toml: "training.seats" must be an integer, but is 2.5'),
         (MINIMAL.format("seats = true"), 'car.toml: "training.seats" must be an integer, but is True'),
         (MINIMAL.format("electric = 1"), 'car.toml: "training.electric" must be true or false, but is 1'),
-        (
-            MINIMAL.format("size = [1.0]"),
-            '"training.size" must be a list of 2, each element a number, but is [1.0]',
-        ),
-        (
-            MINIMAL.format("size = [1, nan]"),
-            "each element a number, but is [1, nan]",
-        ),
+        (MINIMAL.format("size = [1.0]"), '"training.size" must be a list of 2, each element a number, but is [1.0]'),
+        (MINIMAL.format("size = [1, nan]"), "each element a number, but is [1, nan]"),
         (MINIMAL.format('doors = ["x"]'), "\"training.doors\" must be a list, each element an integer, but is ['x']"),
         (MINIMAL.format('roof = "shut"'), '"training.roof" must be "open" or a list of 2, each element a number'),
         (MINIMAL.format("wheel2 = 1"), 'unknown key "training.wheel2"; did you mean "wheel"?'),
@@ -197,10 +191,7 @@ def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
     assert isinstance(config, BEVFormerV2Config)
     assert (config.frames, config.image.padded_size, config.encoder_levels) == ((-1, 0), (1600, 640), 4)
     for wrong, message in [
-        (
-            ('"BEVFormerV2"', '"BEVFormerV3"'),
-            '"BEVFormerV2" or "UniAD" or "VAD", but is \'BEVFormerV3\'',
-        ),
+        (('"BEVFormerV2"', '"BEVFormerV3"'), '"BEVFormerV2" or "UniAD" or "VAD", but is \'BEVFormerV3\''),
         (("frames = [-1, 0]", ""), '"frames" is missing; expected a list, each element'),
         (("frames = [-1, 0]", "frames = [-2, -1]"), "frames must be ascending, and hold 0, the current frame"),
         (("can_bus = false", "can_bus = true"), "ego_motion: can_bus, shift and rotation must be false"),

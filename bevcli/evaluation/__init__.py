@@ -38,11 +38,7 @@ class EvaluationOptions:
         help="Write plots: precision and recall, errors by range, missed objects and false positives from above.",
         metavar="DIR",
     )
-    max_range: float | None = option(
-        default=None,
-        help=MAX_RANGE_HELP,
-        metavar="METRES",
-    )
+    max_range: float | None = option(default=None, help=MAX_RANGE_HELP, metavar="METRES")
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
 
 

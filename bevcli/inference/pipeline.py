@@ -224,11 +224,7 @@ class StageClock(ExitStack):
     """
 
     def __init__(
-        self,
-        model: nn.Module,
-        device: torch.device,
-        stages: Mapping[str, str],
-        starts: Mapping[str, str] | None = None,
+        self, model: nn.Module, device: torch.device, stages: Mapping[str, str], starts: Mapping[str, str] | None = None
     ) -> None:
         """A clock that is not running.
 

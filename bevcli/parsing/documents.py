@@ -1,8 +1,7 @@
-"""JSON, TOML, YAML, XML and CSV with limits on nesting and on the size of numbers.
+"""JSON, TOML and CSV with limits on nesting and on the size of numbers.
 
 Parsers refuse a broken text, but many well-formed texts break the code behind them: lists nested a thousand levels
-deep, integers that no array can hold, YAML objects that contain themselves. They are refused here, for all
-readers.
+deep, integers that no array can hold. They are refused here, for all readers.
 """
 
 import csv
@@ -17,11 +16,8 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
-import yaml
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_bytes, read_text
@@ -29,27 +25,17 @@ from bevcli.printing import reason_of
 
 DEEPEST = 64  # levels of nested lists and objects
 LARGEST_INTEGER = 2**62  # the difference of two such integers still fits 64 bits
-JSON_BYTES, TOML_BYTES, YAML_BYTES = 64 * MIB, MIB, MIB // 4
+JSON_BYTES, TOML_BYTES = 64 * MIB, MIB
 MOST_VALUES = 200_000  # of a TOML or YAML file
 _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
 _STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
-_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CSV_BYTES = 256 << 20
 NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
 UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
-
-
-class _YamlLoader(_SafeLoader):
-    """The safe loader, which makes no Python objects, and reads OpenCV's matrices as mappings."""
-
-
-_YamlLoader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-)
 
 
 def read_json(
@@ -97,26 +83,6 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
         raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
 
 
-def parse_xml(text: bytes, path: Path) -> ElementTree.Element:
-    """The root of an XML document without entities of its own. Raises InputError, which names `path`.
-
-    A few short entities can stand for gigabytes of text. None is read from another file.
-    """
-
-    def refuse(name: str, *declaration: object) -> None:
-        raise InputError(f"{path}: declares the entity {name:.40} (expected XML without entities)")
-
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, refuse
-    parser.buffer_text = True
-    try:
-        parser.Parse(text, True)
-        return builder.close()
-    except (expat.ExpatError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: broken XML: {reason_of(error)[:200]}") from None
-
-
 def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputError) -> dict[str, Any]:
     """Parses TOML. Raises `error`, which names `path`."""
     try:
@@ -126,24 +92,6 @@ def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputErro
     except (ValueError, RecursionError, OverflowError) as failure:  # impossible dates, thousands of digits or brackets
         raise error(f"{path}: cannot be read as TOML ({reason_of(failure)[:200]})") from None
     check_values(document, path, error)
-    return document
-
-
-def read_yaml(path: Path) -> Any:
-    """The contents of a YAML file with plain values. Raises InputError."""
-    text = re.sub(r"\A%YAML:.*", "", read_text(path, YAML_BYTES))  # OpenCV's header, which is not YAML
-    try:
-        depth = 0
-        for event in yaml.parse(text, _YamlLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST:
-                raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
-        document = yaml.load(text, _YamlLoader)
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({reason_of(error)[:200]})") from None
-    check_values(document, path)
     return document
 
 

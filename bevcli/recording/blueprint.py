@@ -168,10 +168,7 @@ def _scene(recorded: Recorded, titled: str, hidden_layers: tuple[str, ...]) -> r
         background=list(entities.BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0, 0, 1)),
-        overrides={
-            entities.TRAJECTORY: [FROM_START],
-            **{entity: [HIDDEN] for entity in hidden},
-        },
+        overrides={entities.TRAJECTORY: [FROM_START], **{entity: [HIDDEN] for entity in hidden}},
     )
 
 

@@ -404,11 +404,7 @@ def legend_entries(recorded: Recorded) -> list[tuple[str, Color]]:
     of_classes = [(name.replace("_", " "), color) for name, color in recorded.classes.items()]
     if recorded.files and not recorded.files.names:
         return [*of_classes, *maps]
-    states = [
-        truth,
-        ("missed, false", entities.MISSED_COLOR),
-        ("duplicate", entities.DUPLICATE_COLOR),
-    ]
+    states = [truth, ("missed, false", entities.MISSED_COLOR), ("duplicate", entities.DUPLICATE_COLOR)]
     return [*of_classes, *states, *maps, *line_entries(recorded.config)]
 
 

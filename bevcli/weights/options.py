@@ -34,8 +34,7 @@ class PackOptions:
         panel="Model",
     )
     licence: str = option(
-        default="",
-        help="Licence of the weights, such as Apache-2.0 or other. Default: that of `bevcli weights list`.",
+        default="", help="Licence of the weights, such as Apache-2.0 or other. Default: that of `bevcli weights list`."
     )
     datasets: tuple[str, ...] = option(
         default=(),
@@ -51,8 +50,6 @@ class PackOptions:
         metavar="FILE.json",
     )
     scored_on: str = option(
-        default="",
-        help="The data of the scores, such as 'validation drives of 2026'.",
-        metavar="TEXT",
+        default="", help="The data of the scores, such as 'validation drives of 2026'.", metavar="TEXT"
     )
     force: bool = option(default=False, help="Overwrite the files if they exist.")

@@ -11,17 +11,6 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion
 from bevcli.geometry.transforms import rigid
 
 
-class WrongRig(DerivedSequence):
-    """A drive that states another rig."""
-
-    def __init__(self, sequence: Sequence, rig: CameraRig) -> None:
-        super().__init__(sequence)
-        self.rig = rig
-
-    def load(self, place: int) -> Frame:
-        return replace(self.sequence.load(place), rig=self.rig)
-
-
 class ThroughLens(DerivedSequence):
     """A drive of cameras without distortion, as lenses would have shown it; `zoom` keeps their images filled."""
 

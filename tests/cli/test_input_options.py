@@ -16,8 +16,7 @@ from bevcli.sequences.options import SequenceOptions, parse_frames, parse_rate
 
 
 @pytest.mark.parametrize(
-    ("text", "frames"),
-    [("1:3", [1, 2]), (":2", [0, 1]), ("3:99", [3, 4]), ("4:", [4]), (":", [0, 1, 2, 3, 4])],
+    ("text", "frames"), [("1:3", [1, 2]), (":2", [0, 1]), ("3:99", [3, 4]), ("4:", [4]), (":", [0, 1, 2, 3, 4])]
 )
 def test_frames_range_excludes_its_end(text, frames):
     assert [0, 1, 2, 3, 4][parse_frames(text)] == frames

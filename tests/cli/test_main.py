@@ -164,8 +164,7 @@ def test_the_program_is_the_one_that_handles_interrupts():
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [("run", "--help"), pytest.param(("weights", "inspect", "--model", "demo"), marks=pytest.mark.slow)],
+    "arguments", [("run", "--help"), pytest.param(("weights", "inspect", "--model", "demo"), marks=pytest.mark.slow)]
 )
 def test_a_terminal_of_ascii_gets_every_text(arguments):
     environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

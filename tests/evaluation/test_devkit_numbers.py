@@ -48,10 +48,7 @@ def test_every_number_equals_the_devkits() -> None:
     expected = GOLDEN["expected"]
     for name, found in scores.overall.classes.items():
         for distance, ap in found.aps.items():
-            assert ap == pytest.approx(expected["label_aps"][name][f"{distance:.1f}"], abs=TOLERANCE), (
-                name,
-                distance,
-            )
+            assert ap == pytest.approx(expected["label_aps"][name][f"{distance:.1f}"], abs=TOLERANCE), (name, distance)
         for error, value in found.errors.items():
             number = expected["label_tp_errors"][name][error]
             assert value == pytest.approx(np.nan if number is None else number, abs=TOLERANCE, nan_ok=True), (

@@ -62,8 +62,7 @@ def test_drives_without_boxes_on_one_side_count_too():
     drives = [(truth, predictions), (empty, predictions), (truth, unseen)]
     joint = score_jointly([matches_of(*drive) for drive in drives], CONFIG)
     assert_same(
-        joint.detection,
-        evaluate_detections([*predictions, *predictions, *unseen], [*truth, *empty, *truth], CONFIG),
+        joint.detection, evaluate_detections([*predictions, *predictions, *unseen], [*truth, *empty, *truth], CONFIG)
     )
 
 

@@ -31,11 +31,7 @@ def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> 
     bev = Pose.from_matrix(default_ego_from_bev())
     rows = []
     for place, boxes in enumerate(frames):
-        from_ego = {
-            "ego": np.eye(4),
-            "world": POSES[place].matrix,
-            "bev": inverse(default_ego_from_bev()),
-        }[reference]
+        from_ego = {"ego": np.eye(4), "world": POSES[place].matrix, "bev": inverse(default_ego_from_bev())}[reference]
         stamp = FrameStamp(
             stamps.get("first", 0) + place, stamps.get("scene", "a"), stamps.get("start_ns", 0) + 500_000_000 * place
         )

@@ -91,6 +91,17 @@ def step_of_file(exported: ExportedModel, inputs: ModelInputs, history: Tensor |
     return outputs
 
 
+def check_file(exported: ExportedModel, model: BEVFormer) -> None:
+    """A file equals its model, with and without history."""
+    history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
+    for previous in (None, history):
+        with torch.inference_mode():
+            expected, found = model(small_inputs(), previous), step_of_file(exported, small_inputs(), previous)
+        torch.testing.assert_close(found.bev, expected.bev, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(found.class_logits[-1], expected.class_logits[-1], rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
+
+
 def _image_from_bev(direction: float) -> np.ndarray:
     """A camera at the origin of the bev frame that looks along +y (1) or -y (-1), field of view 90 degrees."""
     image_from_camera = np.array([[WIDTH / 2, 0, WIDTH / 2, 0], [0, WIDTH / 2, HEIGHT / 2, 0], [0, 0, 1, 0]])

@@ -40,8 +40,7 @@ def test_without_queries_the_result_has_no_rows() -> None:
 def test_samples_far_outside_the_map_are_zero() -> None:
     locations = torch.full((1, 1, 1, 1, 2), 6.7e6)
     assert torch.equal(
-        sample(torch.ones(1, 24, 1, 4), SHAPES[:1], locations, torch.ones(1, 1, 1, 1), [1]),
-        torch.zeros(1, 4),
+        sample(torch.ones(1, 24, 1, 4), SHAPES[:1], locations, torch.ones(1, 1, 1, 1), [1]), torch.zeros(1, 4)
     )
 
 

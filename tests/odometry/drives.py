@@ -21,13 +21,7 @@ from bevcli.printing import say
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.corruptions import blur_kernel, low_light, to_uint8
 from bevcli.workshop.synth.drive import FIRST_TIMESTAMP_NS, RenderedDrive, RenderedFrame, export_drive
-from bevcli.workshop.synth.rig import (
-    EGO_AXES_FROM_CAMERA,
-    DrawnRig,
-    RigDistribution,
-    draw_rig,
-    nuscenes_like_rig,
-)
+from bevcli.workshop.synth.rig import EGO_AXES_FROM_CAMERA, DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 
 FRAMES, RATE_HZ = 12, 2.0
 SIMULATED = 40  # frames; a drive is a part of them

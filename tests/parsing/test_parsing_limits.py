@@ -6,8 +6,9 @@ import time
 import pytest
 
 from bevcli.errors import ConfigError, InputError
-from bevcli.parsing.documents import parse_json, parse_toml, read_csv, read_json, read_yaml
+from bevcli.parsing.documents import parse_json, parse_toml, read_csv, read_json
 from bevcli.parsing.files import read_bytes
+from bevcli.workshop.formats.markup import read_yaml
 
 
 def refused(function, *arguments, error=InputError, **options):

@@ -39,11 +39,7 @@ def rows(made):
             {"positions": POINTS_2D, "labels": ["ä", "", "car", "a", "b"], "colors": (1, 2, 3), "show_labels": True},
             rr.Points2D(POINTS_2D, labels=["ä", "", "car", "a", "b"], colors=(1, 2, 3), show_labels=True),
         ),
-        (
-            rr.Points2D,
-            {"positions": POINTS_2D, "colors": packed(COLORS)},
-            rr.Points2D(POINTS_2D, colors=COLORS),
-        ),
+        (rr.Points2D, {"positions": POINTS_2D, "colors": packed(COLORS)}, rr.Points2D(POINTS_2D, colors=COLORS)),
         (
             rr.Boxes3D,
             {
@@ -66,11 +62,7 @@ def rows(made):
             {"vectors": POINTS_3D, "origins": POINTS_3D, "colors": None},
             rr.Arrows3D(vectors=POINTS_3D, origins=POINTS_3D),
         ),
-        (
-            rr.Transform3D,
-            {"translation": POSE[0], "mat3x3": POSE.T},
-            rr.Transform3D(translation=POSE[0], mat3x3=POSE),
-        ),
+        (rr.Transform3D, {"translation": POSE[0], "mat3x3": POSE.T}, rr.Transform3D(translation=POSE[0], mat3x3=POSE)),
         (rr.Scalars, {"scalars": np.array([1, 2])}, rr.Scalars([1, 2])),
         (
             rr.Image,

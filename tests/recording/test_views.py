@@ -25,13 +25,7 @@ from bevcli.recording.entities import (
     class_colors,
     map_colors,
 )
-from bevcli.recording.log_static import (
-    FROM_RENDERED,
-    UNTRAINED,
-    Recorded,
-    legend_entries,
-    ring_distances_m,
-)
+from bevcli.recording.log_static import FROM_RENDERED, UNTRAINED, Recorded, legend_entries, ring_distances_m
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader

@@ -134,11 +134,7 @@ def write_tables(folder: Path, size: Size = Size(), *, annotated: bool = True) -
     tables = {
         "scene": [{"token": token(1, s), "name": scene_name(s), "log_token": token(9, s)} for s in range(size.scenes)],
         "sample": [
-            {
-                "token": token(2, s * size.samples + k),
-                "scene_token": token(1, s),
-                "timestamp": sample_time(s, k),
-            }
+            {"token": token(2, s * size.samples + k), "scene_token": token(1, s), "timestamp": sample_time(s, k)}
             for s in range(size.scenes)
             for k in range(size.samples)
         ],

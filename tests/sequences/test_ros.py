@@ -400,10 +400,7 @@ def test_a_calibration_with_cameras_not_found_names_the_option(
     path = write_mcap(tmp_path / "bag.mcap", renamed(messages_of(native, motion), AUTOWARE))
     with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*`topics=\{'CAM_FRONT': '/TOPIC'\}`"):
         open_sequence(path, calibration=drive / "calibration.json")
-    topics = {
-        "CAM_FRONT": AUTOWARE["/CAM_FRONT/image/compressed"],
-        "CAM_BACK": AUTOWARE["/CAM_BACK/image/compressed"],
-    }
+    topics = {"CAM_FRONT": AUTOWARE["/CAM_FRONT/image/compressed"], "CAM_BACK": AUTOWARE["/CAM_BACK/image/compressed"]}
     sequence = open_sequence(path, calibration=drive / "calibration.json", topics=topics)
     assert sequence.rig.names == native.rig.names
 

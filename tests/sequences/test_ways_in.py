@@ -103,11 +103,7 @@ def test_converted_sequence_gives_the_same_frames(real_drive, nuscenes_root, tmp
 
 
 def test_scene_split_and_version_select_the_scene(nuscenes_root):
-    for options in (
-        {"scene": "scene-0103"},
-        {"split": "mini_val"},
-        {"version": "v1.0-mini"},
-    ):
+    for options in ({"scene": "scene-0103"}, {"split": "mini_val"}, {"version": "v1.0-mini"}):
         assert len(open_sequence(nuscenes_root, **options).stamps) == 4
 
 

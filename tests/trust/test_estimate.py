@@ -89,7 +89,7 @@ def test_validate_estimates_where_there_is_no_ground_truth(unlabelled: Path) -> 
 @pytest.mark.slow
 def test_run_prints_the_same_estimate_from_its_files(unlabelled: Path, tmp_path: Path) -> None:
     model = bevcli.load_model("demo", device="cpu")
-    expected = bevcli.estimate_score(model, bevcli.open_sequence(unlabelled, rate=2))
+    expected = bevcli.estimate_score(model, bevcli.open_sequence(unlabelled))
     command = ["run", str(unlabelled), "--score-without-labels", "--out", str(tmp_path / "out")]
     printed = CliRunner().invoke(app, command)
     assert printed.exit_code == 0, printed.output

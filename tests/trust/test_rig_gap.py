@@ -128,6 +128,14 @@ def test_the_polar_map_counts_boxes_where_they_are():
     assert (cells.counts.sum(), cells.found.sum()) == (5, 3)
 
 
+def test_one_object_of_many_frames_is_within_noise():
+    before = SimpleNamespace(objects=np.repeat(0, 12), found=np.ones(12, bool))
+    assert not rig_gap.is_clear(before, SimpleNamespace(found=np.zeros(12, bool)))
+    before.objects = np.arange(12)
+    assert rig_gap.is_clear(before, SimpleNamespace(found=np.zeros(12, bool)))
+    assert not rig_gap.is_clear(before, before)
+
+
 def made_up_boxes(model, shot, after_frame=lambda: None):
     """16 frames of the same objects all around. A camera that looks far down finds none of those on the left."""
     pitches = [mounting_of(camera.ego_from_camera).pitch_deg for camera in shot.rig.cameras]
@@ -213,7 +221,7 @@ def test_without_a_model_nothing_is_measured(project_debug, tmp_path):
 def test_rendered_streets_are_measured_and_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(rig_gap, "STREETS", rig_gap.STREETS[:1])
-    write_calibration(tmp_path / "a.json", tilted("CAM_FRONT_LEFT", -40.0))
+    write_calibration(tmp_path / "a.json", tilted("CAM_FRONT_LEFT", -28.0))
     command = ["project-debug", str(tmp_path / "a.json"), "--model", "demo", "--out", str(tmp_path / "out")]
     first = CliRunner().invoke(app, command)
     assert "12/12 frames of rendered streets" in first.stderr

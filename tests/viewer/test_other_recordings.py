@@ -88,12 +88,7 @@ def column(values, kind=None):
         (entities.BOXES, "score", None, "expected 2 values of 1 numbers, found 0"),
         (entities.BOXES, "velocity_x", column([np.inf, 0.0]), "expected finite numbers"),
         (entities.BOXES, "Boxes3D:centers", column([[np.nan, 0.0, 0.0]] * 2), "expected finite numbers"),
-        (
-            entities.BOXES,
-            "Boxes3D:centers",
-            column([[0.0] * 2] * 3, POINT),
-            "expected 3 numbers in",
-        ),
+        (entities.BOXES, "Boxes3D:centers", column([[0.0] * 2] * 3, POINT), "expected 3 numbers in"),
         (entities.BOXES, "Boxes3D:half_sizes", column([[1.0] * 3]), "expected 2 values of 3 numbers"),
         (entities.BOXES, "Boxes3D:half_sizes", column([[1.0, -1.0, 1.0]] * 2), "expected sizes above 0"),
         (entities.BOXES, "Boxes3D:quaternions", None, "expected 2 values of 4 numbers, found 0"),

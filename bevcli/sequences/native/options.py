@@ -19,8 +19,7 @@ class FolderOptions(RigOptions):
     """The rig, and the times of images that no frames.csv lists."""
 
     times: TimeKind | None = option(
-        default=None,
-        help="What the numbers in image names are, without frames.csv. Default: found from the numbers.",
+        default=None, help="What the numbers in image names are, without frames.csv. Default: found from the numbers."
     )
     image_rate_hz: float | None = option(
         default=None,

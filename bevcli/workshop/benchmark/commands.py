@@ -29,18 +29,13 @@ class BenchOptions:
         complete=complete_model,
     )
     frames: int = option(
-        default=5,
-        help="Number of timed frames, after the warm-up.",
-        metavar="N",
-        flag="--count",
-        minimum=1,
+        default=5, help="Number of timed frames, after the warm-up.", metavar="N", flag="--count", minimum=1
     )
     against: Literal["plain"] | None = option(
         default=None, help="Also run the plain version; compare times and results."
     )
     engines: bool = option(
-        default=False,
-        help="Time PyTorch and all installed engines side by side, alternating, and compare their boxes.",
+        default=False, help="Time PyTorch and all installed engines side by side, alternating, and compare their boxes."
     )
     profile: Path | None = option(
         default=None, help="Write PyTorch's profile of one frame (open it at chrome://tracing).", metavar="OUT"

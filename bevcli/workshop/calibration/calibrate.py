@@ -247,13 +247,6 @@ class DriveWithRig(DerivedSequence):
         return replace(self.sequence.load(index), rig=self.rig)
 
 
-class CorrectedDrive(DriveWithRig):
-    """The calibrated drive, with the corrected rig in every frame."""
-
-    def __init__(self, sequence: Sequence, result: CalibrationResult) -> None:
-        super().__init__(sequence, result.rig)
-
-
 def calibrate(
     drive: Sequence,
     options: CalibrateOptions | None = None,

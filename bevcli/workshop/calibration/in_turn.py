@@ -45,7 +45,8 @@ def calibrate_in_turn(
 
     Raises InputError as `calibrate` does, and where the motion cannot be measured.
     """
-    chosen, rig, measured = gather(CalibrateOptions, options, changes), drive.rig, with_motion or _with_motion
+    chosen, rig = gather(CalibrateOptions, options, changes), drive.rig
+    measured = with_motion or (lambda drive, after_step: with_measured_motion(drive, drive, after_step))
     rounds, still = 0, False
     while rounds < MOST_ROUNDS and not still:
         moving = measured(DriveWithRig(drive, rig), _in_parts(after_step))
@@ -76,10 +77,6 @@ def beside_x_deg(poses: Array) -> tuple[float, float]:
     scatter = float(np.sum((directions - columns @ found) ** 2)) / (len(steps) - rank)
     deviation = np.sqrt(scatter * np.linalg.pinv(columns.T @ columns)[0, 0])
     return float(np.degrees(found[0])), float(np.degrees(deviation))
-
-
-def _with_motion(drive: Sequence, after_step: AfterStep) -> Sequence:
-    return with_measured_motion(drive, drive, after_step)
 
 
 def _in_parts(after_step: Callable[[], None]) -> AfterStep:

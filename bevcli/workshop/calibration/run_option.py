@@ -33,7 +33,7 @@ def _corrected(options: CalibrateFirstOptions, drive: "Sequence") -> "Sequence":
     for camera in result.cameras:
         reason = change_text(camera) if camera.verdict is Verdict.CORRECTED else camera.reason
         say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return calibration.CorrectedDrive(drive, result)
+    return calibration.DriveWithRig(drive, result.rig)
 
 
 CALIBRATE_FIRST = Extension(CalibrateFirstOptions, _corrected)

@@ -36,8 +36,7 @@ class Argoverse2Options(FormatOptions):
 
     stereo: bool = option(default=False, help="Argoverse 2: also use the two stereo cameras.")
     distorted: bool = option(
-        default=False,
-        help="Argoverse 2: the images have the lens distortion k1 to k3. The published images have none.",
+        default=False, help="Argoverse 2: the images have the lens distortion k1 to k3. The published images have none."
     )
     axle_height_m: float = option(
         default=AXLE_HEIGHT_M, help="Argoverse 2: height of the rear axle above the ground, metres.", metavar="M"

@@ -15,12 +15,10 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.parsing.documents import YAML_BYTES
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
 from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
-from bevcli.sequences.native.first_images import first_images, size_of_first
 from bevcli.workshop.formats.camera_poses import (
     Cameras,
     Direction,
@@ -31,6 +29,8 @@ from bevcli.workshop.formats.camera_poses import (
     guessed_pose,
     raised,
 )
+from bevcli.workshop.formats.first_images import first_images, size_of_first
+from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
 from bevcli.workshop.formats.other_calibrations import (
     KITTI_FILES,

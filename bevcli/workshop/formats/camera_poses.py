@@ -38,11 +38,7 @@ AXES_TEXT = {
 
 
 ORIGIN = "if the origin is not on the ground, pass `height=1.5`, the mean height of the cameras above it"
-ADVICE = {
-    "below": ORIGIN,
-    "height": ORIGIN,
-    "unit": "convert the translations to metres",
-}
+ADVICE = {"below": ORIGIN, "height": ORIGIN, "unit": "convert the translations to metres"}
 
 
 @dataclass(frozen=True)

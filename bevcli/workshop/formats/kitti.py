@@ -19,13 +19,13 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, wrap_angle
-from bevcli.parsing.documents import parse_xml
 from bevcli.parsing.files import MIB, read_bytes, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.workshop.formats import LabelOptions
 from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels, Moment
+from bevcli.workshop.formats.markup import parse_xml
 from bevcli.writing import write_whole
 
 LARGEST_BYTES = 256 * MIB

@@ -22,12 +22,7 @@ from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.parsing.documents import read_json
 from bevcli.recording.entities import map_colors
-from bevcli.sequences.files.incremental_json import (
-    IncrementalJson,
-    read_frames,
-    stamp_from_json,
-    stamp_to_json,
-)
+from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.sequences.nuscenes.tables import read_rows
 

@@ -16,11 +16,12 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
-from bevcli.parsing.documents import YAML_BYTES, parse_xml, read_json, read_yaml
+from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
+from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.

@@ -60,12 +60,7 @@ def pack_model(
     known = Known(hashlib.sha256(weights).hexdigest(), len(weights))
     facts = facts_of(name, checkpoint, chosen)
     packed = PackedConfig(
-        library_name="bevcli",
-        bevcli_version=__version__,
-        format=FORMAT,
-        weights=known,
-        model=table,
-        limit=facts.limit,
+        library_name="bevcli", bevcli_version=__version__, format=FORMAT, weights=known, model=table, limit=facts.limit
     )
     texts = [
         json.dumps(msgspec.to_builtins(packed), indent=1, ensure_ascii=False) + "\n",

@@ -2,9 +2,9 @@
 
 In the order of the work:
     frames               what is kept of a frame: its images, their features, the road seen from above
-    above                how far the vehicle drove between two views of the road from above; points of it
+    above                how far the vehicle drove between two views of the road from above; points, and their residuals
     point_votes          how far the vehicle drove, by matched points that lie on the road; whether it stands
-    unknowns, ground     what is estimated of a step, and the residuals of points of the road
+    unknowns             what is estimated of a step
     steps                the motions that a step may have: those that fit matched points and points of the road
     chain                the choice among them by the steps before and after
     measure              the entry point: reads a drive frame by frame; the measured motion, and the drive with it

@@ -1,4 +1,4 @@
-"""The road of a frame seen from above, and how the vehicle drove between two such pictures.
+"""The road of a frame seen from above, how the vehicle drove between two such pictures, and residuals of its points.
 
 Tiles of the first picture are compared with the second one at all distances along the way; those that look alike vote.
 Near the motion that they tell, optical flow gives points of the road.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.cameras import OUTSIDE, Camera
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.correspondence.images import GreyImage, texture
-from bevcli.workshop.correspondence.residuals import Indices
+from bevcli.workshop.correspondence.residuals import GroupGeometry, Indices, Residuals, rays_of_road_points
 from bevcli.workshop.correspondence.road import contrast, flow_at, sampled
 
 CELL_M = 0.08
@@ -27,6 +27,8 @@ LEAST_SEEN, LEAST_CONTRAST = 0.8, 8.0  # of a tile: share, and grey levels of st
 NOTHING, MOST = 0.15, 2.0  # of the vote of a tile, less of which is chance, and which is the largest
 SPACING, WINDOW = 8, 21  # cells: between points of the flow, and the side of what is compared
 WAY_M = 5.0  # tiles farther beside the vehicle count less: they are less often road
+PIXEL = 0.5  # standard deviation of a direction, pixels
+FLOW_M = 0.01  # of the flow
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ def distance_votes(
     heading: direction of the way in the first ego frame. yaw: by which the vehicle turned. cells: least and largest
     distance, a negative one is driven backwards.
     """
-    a, b = _turned(first, heading), _turned(second, heading - yaw)
+    turns = (first, heading), (second, heading - yaw)
+    a, b = (moved_picture(picture, angle, np.zeros(2)) for picture, angle in turns)  # the way is along x
     shifts = np.arange(cells[0], cells[1] + 1)
     distances = np.asarray(CELL_M * shifts, dtype=np.float64)
     correlations, weights = [], []
@@ -135,11 +138,6 @@ def _summed(correlations: Array, weights: Array) -> Array:
     usual = np.array([np.median(vote[mask]) if mask.any() else 0.0 for vote, mask in zip(votes, seen, strict=True)])
     votes = np.where(seen, np.clip(votes - usual[:, None] - NOTHING, 0, MOST), 0)
     return np.asarray((weights[:, None] * votes).sum(0) / np.sqrt(1 + (weights[:, None] * seen).sum(0)))
-
-
-def _turned(picture: RoadPicture, angle: float) -> RoadPicture:
-    """The picture in a frame that is turned about the origin of the ego frame."""
-    return moved_picture(picture, angle, np.zeros(2))
 
 
 def moved_picture(picture: RoadPicture, yaw: float, shift: Array) -> RoadPicture:
@@ -184,3 +182,54 @@ def road_flow(first: RoadPicture, second: RoadPicture, yaw: float, shift: Array,
     told = contrast(first.texture, at)
     points, there = (np.column_stack([each, each @ of.slopes]) for each, of in ((points, first), (there, second)))
     return RoadFlow(points[seen], there[seen], told[seen], np.stack(cameras, -1)[seen].astype(np.int64))
+
+
+@dataclass(frozen=True)
+class GroundResiduals(Residuals):
+    """The distance of road points from where they would be on a plane road, in standard deviations.
+
+    The weights turn an error of a ray in the second image into metres on the road, divided by their deviation.
+    """
+
+    weights: Array  # (N, 2, 3)
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 2)."""
+        ahead = rays_of_road_points(geometry, geometry.ego_from_camera_b, self.group, self.rays_a)
+        return np.einsum("nij,nj->ni", self.weights, ahead - self.rays_b)
+
+
+def rays_and_weights(
+    flow: RoadFlow, cameras: tuple[tuple[Camera, ...], tuple[Camera, ...]], yaw: float
+) -> tuple[Array, Array, Array]:
+    """Rays (n, 3) of the points in the first and in the second images, and the weights (n, 2, 3).
+
+    cameras: of the first and of the second frame. yaw: by which the vehicle turned.
+    """
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    (rays_a, spread_a, _), (rays_b, spread_b, to_road) = (
+        _seen(points, np.array([camera.ego_from_camera for camera in of])[index],
+              np.array([camera.intrinsics[0, 0] for camera in of])[index])
+        for points, of, index in zip((flow.first, flow.second), cameras, flow.cameras.T, strict=True)
+    )  # fmt: skip
+    covariance = spread_a + turn @ spread_b @ turn.T + FLOW_M**2 * np.eye(2)
+    size, axes = np.linalg.eigh(covariance)
+    whitening = np.einsum("nij,nj,nkj->nik", axes, size**-0.5, axes)
+    return rays_a, rays_b, flow.contrast @ whitening @ turn @ to_road
+
+
+def _seen(points: Array, pose: Array, focal: Array) -> tuple[Array, Array, Array]:
+    """How cameras with poses (n, 4, 4) and focal lengths (n,) see points (n, 3) of the road.
+
+    Returns rays (n, 3) in the camera frame, the covariance (n, 2, 2) of a point by the error of a pixel, metres², and
+    the derivative (n, 2, 3) of the point by the ray.
+    """
+    away = points - pose[:, :3, 3]
+    length = np.linalg.norm(away, axis=-1, keepdims=True)
+    direction = away / length
+    slope = np.zeros((len(points), 2, 3))
+    slope[:, 0, 0] = slope[:, 1, 1] = 1
+    slope[:, :, 2] = -direction[:, :2] / direction[:, 2:]
+    slope *= length[:, :, None]
+    covariance = (PIXEL / focal)[:, None, None] ** 2 * slope @ slope.swapaxes(1, 2)
+    return np.einsum("nji,nj->ni", pose[:, :3, :3], direction), covariance, slope @ pose[:, :3, :3]

@@ -1,16 +1,16 @@
 """The check of `bevcli project-debug`: the stated poses of a drive against some measured steps of it."""
 
 from itertools import groupby
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import Frame, Sequence
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.sequences.open import Selection
 from bevcli.workshop.odometry.compare import compare, not_compared
 from bevcli.workshop.odometry.measure import measure_motion
 from bevcli.workshop.odometry.stated import Poses, steps_between
@@ -20,19 +20,15 @@ LEAST_NS = 400_000_000  # between two frames
 MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to this, radians; and that it moves
 
 
-class SomeFrames(DerivedSequence):
+class SomeFrames(Selection):
     """Some frames of a drive. It keeps the poses of those that were loaded, by their times."""
 
     def __init__(self, drive: Sequence, places: list[int]) -> None:
-        super().__init__(drive)
-        self.places, self.stamps = places, tuple(drive.stamps[place] for place in places)
+        super().__init__(drive, places)
         self.poses: dict[int, Pose] = {}
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self.sequence.image_files(self.places[place])
-
     def load(self, place: int) -> Frame:
-        frame = self.sequence.load(self.places[place])
+        frame = super().load(place)
         self.poses[frame.stamp.timestamp_ns] = frame.world_from_ego
         return frame
 

@@ -181,9 +181,7 @@ class MotionMeter:
 
 
 def measure_motion(
-    drive: Sequence,
-    options: OdometryOptions | None = None,
-    after_step: Callable[[], None] = lambda: None,
+    drive: Sequence, options: OdometryOptions | None = None, after_step: Callable[[], None] = lambda: None
 ) -> MeasuredMotion:
     """Measure the motion of a drive from its images and its calibration.
 

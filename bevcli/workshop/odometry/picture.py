@@ -8,7 +8,6 @@ from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -186,17 +185,9 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
     of_stated = None if others is None else yaw_rates_deg(others)[0]
     _draw_curve(yaw_rate, motion, yaw_rates_deg(motion), of_stated, "yaw rate, °/s")
     yaw_rate.set_xlabel("seconds")
-    kmh = speed.secondary_yaxis("right", functions=(_times_kmh, _by_kmh))
+    kmh = speed.secondary_yaxis("right", functions=(lambda speed: KMH * speed, lambda speed: speed / KMH))
     kmh.set_ylabel("km/h")
     return figure
-
-
-def _times_kmh(speed: Any) -> Any:
-    return KMH * speed
-
-
-def _by_kmh(speed: Any) -> Any:
-    return speed / KMH
 
 
 def _motion_of(motion: MeasuredMotion, stated: Items[Array]) -> MeasuredMotion:

@@ -13,7 +13,7 @@ from bevcli.geometry.transforms import Array, inverse
 from bevcli.recording import entities
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
 from bevcli.workshop.odometry.measure import MeasuredMotion
-from bevcli.workshop.odometry.picture import SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
+from bevcli.workshop.odometry.picture import JPEG, SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
 from bevcli.workshop.odometry.seen_points import SeenPoints
 
@@ -23,7 +23,6 @@ COLOR, PALE, STATED_COLOR, GUESSED_COLOR = (255, 140, 26), (255, 140, 26, 110), 
 SERIES = (("measured", "measured", COLOR, 2.0), ("low", "- σ", PALE, 1.0), ("high", "+ σ", PALE, 1.0))
 ROAD_COLOR = (70, 150, 255)
 RESIDUALS_PX, RESIDUAL_COLORS = (0.5, 1.5), ((70, 220, 120), (245, 222, 90), (255, 45, 85))  # of matched points
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
 def write_recording(

@@ -112,13 +112,7 @@ class StatedDifference:
 
     def to_dict(self) -> dict[str, Any]:
         """For the report."""
-        return {
-            "end_m": self.end_m,
-            "end_deg": self.end_deg,
-            "length_m": self.length_m,
-            "steps_m": self.steps_m.tolist(),
-            "steps_deg": self.steps_deg.tolist(),
-        }
+        return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
 
 def against_stated(motion: MeasuredMotion, stated: Items[Array]) -> StatedDifference | None:

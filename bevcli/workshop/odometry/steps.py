@@ -9,9 +9,15 @@ from bevcli.workshop.correspondence.points import matched, neighbours
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, Residuals, RoadResiduals
 from bevcli.workshop.correspondence.road import RoadPoints, road_points
 from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve, spread, values
-from bevcli.workshop.odometry.above import CELL_M, RoadPicture, distance_votes, road_flow
+from bevcli.workshop.odometry.above import (
+    CELL_M,
+    GroundResiduals,
+    RoadPicture,
+    distance_votes,
+    rays_and_weights,
+    road_flow,
+)
 from bevcli.workshop.odometry.frames import FrameView
-from bevcli.workshop.odometry.ground import GroundResiduals, rays_and_weights
 from bevcli.workshop.odometry.point_votes import point_votes, stands, under_the_road, ways_of_points
 from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
 from bevcli.workshop.odometry.unknowns import (

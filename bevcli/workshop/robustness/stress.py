@@ -24,7 +24,7 @@ from bevcli.printing import aligned
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
 from bevcli.sequences.open import scenes_of, select
-from bevcli.workshop.calibration.calibrate import CorrectedDrive, calibrate
+from bevcli.workshop.calibration.calibrate import DriveWithRig, calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
@@ -299,7 +299,7 @@ class _StressRun:
 def _calibrated(sequence: Sequence) -> Sequence:
     """The sequence with the rig that it shows; itself where it shows none."""
     try:
-        return CorrectedDrive(sequence, calibrate(sequence))
+        return DriveWithRig(sequence, calibrate(sequence).rig)
     except InputError:
         return sequence
 

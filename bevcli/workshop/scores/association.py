@@ -45,11 +45,7 @@ class TrackedBoxes:
 
 
 def scored_tracks(
-    frames: Sequence[Boxes3D],
-    stamps: Sequence[FrameStamp],
-    ego_xy: Array,
-    ranges_m: Mapping[str, float],
-    side: str,
+    frames: Sequence[Boxes3D], stamps: Sequence[FrameStamp], ego_xy: Array, ranges_m: Mapping[str, float], side: str
 ) -> TrackedBoxes:
     """The boxes that are scored: in range, with points, with one score a track, and interpolated in gaps.
 

@@ -26,7 +26,9 @@ LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
 PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
-LEAST_SHARE, GAIN, LARGE_GAIN = 0.4, 0.1, 0.25  # of points that fit after a mistake is undone, and by how much more
+LEAST_SHARE = 0.4  # of points that fit after a mistake is undone
+EXCHANGED, GAIN = 0.25, 0.1  # by how much more, if images are exchanged, and if they are mirrored or late
+COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
 TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
 LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
 
@@ -95,6 +97,11 @@ def share(points: CameraPoints, rows: Poses) -> float:
     return float((1 / (1 + (misfits_px(points, rows) / SCALE_PX) ** 2)).mean())
 
 
+def cost(points: CameraPoints, rows: Poses) -> float:
+    """How badly points fit the poses: Cauchy's cost, in units of SCALE_PX."""
+    return float(np.log1p((misfits_px(points, rows) / SCALE_PX) ** 2).sum())
+
+
 def points_of(views: Items[FrameView], rows: Poses) -> dict[str, CameraPoints]:
     """The matched points of each camera that has enough of them, in the steps between views in which it moves."""
     found: dict[str, list[CameraPoints]] = {}
@@ -129,10 +136,12 @@ def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: Camera
             findings.append(_finding("images-exchanged", first, message, stated[first], gained, advice))
             left = {name: each for name, each in left.items() if name not in (first, second)}
     for name, each in left.items():
-        likeliest = max(_undone(each, rows, _interval_ns(points)), key=lambda undone: undone[0])
-        undone_share, code, message, advice = likeliest
-        if undone_share >= LEAST_SHARE and undone_share - stated[name] >= GAIN:
-            findings.append(_finding(code, name, message, stated[name], undone_share, advice))
+        before = cost(each, rows)
+        told = [one for one in _undone(each, rows, _interval_ns(points)) if one.is_told(rows, stated[name], before)]
+        if told:
+            likeliest = min(told, key=lambda one: cost(one.points, rows))
+            undone = share(likeliest.points, rows)
+            findings.append(_finding(likeliest.code, name, likeliest.message, stated[name], undone, likeliest.advice))
     return tuple(findings)
 
 
@@ -158,28 +167,44 @@ def _exchanges(
         gained = [(share(first.seen_by(there), rows), stated[name])]
         if other.name in points:
             gained.append((share(points[other.name].seen_by(first.camera), rows), stated[other.name]))
-        if all(undone >= LEAST_SHARE and undone - before >= LARGE_GAIN for undone, before in gained):
+        if all(undone >= LEAST_SHARE and undone - before >= EXCHANGED for undone, before in gained):
             yield min(undone for undone, _ in gained), name, other.name
 
 
-def _undone(points: CameraPoints, rows: Poses, interval_ns: int) -> Iterator[tuple[float, str, str, str]]:
-    """The mistakes of one camera: share of its points that fit where it is undone, code, message, advice."""
-    yield share(points, rows), "", "", ""
-    yield share(points.mirrored(), rows), "images-mirrored", "its images are mirrored", "mirror them"
+@dataclass(frozen=True)
+class _Undone:
+    """The points of a camera after a mistake is undone, with the texts of its finding."""
+
+    points: CameraPoints
+    code: str
+    message: str
+    advice: str
+
+    gain: float  # of the share of points that fit, at least
+
+    def is_told(self, rows: Poses, share_before: float, cost_before: float) -> bool:
+        """Whether the points fit now, and surely better than before."""
+        gain, after = cost_before - cost(self.points, rows), share(self.points, rows)
+        enough = after >= LEAST_SHARE and after - share_before >= self.gain
+        return enough and gain >= max(COST_GAIN, COST_SHARE * cost_before)
+
+
+def _undone(points: CameraPoints, rows: Poses, interval_ns: int) -> Iterator[_Undone]:
+    """The mistakes that one camera may have, undone."""
+    yield _Undone(points.mirrored(), "images-mirrored", "its images are mirrored", "mirror them", GAIN)
     for late_ns in (interval_ns, -interval_ns):
-        word = "late" if late_ns > 0 else "early"
-        message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {word}"
-        yield share(points.later(late_ns), rows), "images-late", message, "correct their times or their order"
+        message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {'late' if late_ns > 0 else 'early'}"
+        yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", GAIN)
     factor = best_focal(points, rows)
     if abs(np.log(factor)) >= LEAST_LONGER:
         message = f"the stated focal length is {1 / factor:.2f} times the one that the images show"
-        yield share(points.longer(factor), rows), "focal-length", message, "calibrate the lens, or correct its scale"
+        yield _Undone(points.longer(factor), "focal-length", message, "calibrate the lens, or correct its scale", 0)
     turn = best_turn(points, rows)
     up, right, roll = np.degrees(turn)
     if LEAST_TURN_DEG <= np.linalg.norm((up, right, roll)) <= MOST_TURN_DEG:
         message = f"it looks {abs(right):.1f}° further {'right' if right > 0 else 'left'} and {abs(up):.1f}° further "
         message += f"{'up' if up > 0 else 'down'} than stated, rolled by {roll:+.1f}°"
-        yield share(points.turned(turn), rows), "rotation-off", message, "measure it with `bevcli calibrate`"
+        yield _Undone(points.turned(turn), "rotation-off", message, "measure it with `bevcli calibrate`", 0)
 
 
 def _interval_ns(points: Mapping[str, CameraPoints]) -> int:

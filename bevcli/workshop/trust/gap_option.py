@@ -95,7 +95,8 @@ def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterat
     places = sorted({0, len(times) // 2, len(times) - 1}) if len(times) else []
     greys = [image.pixels_bgr.mean() for place in places for image in drive.load(place).images.values()]
     if greys and (grey := float(np.mean(greys))) < DARK_GREY:
-        yield RigDifference("light", (), f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117)", grey)
+        text = f"dark images: mean grey {grey:.0f} of 255 (theirs 95 to 117); measured with noise"
+        yield RigDifference("light", (), text, grey)
 
 
 @dataclass(frozen=True)
@@ -187,11 +188,11 @@ class MeasuredGap:
     def _differences(self, a: MeasuredRig, b: MeasuredRig) -> tuple[str, ...]:
         cells = [_cell(difference(a.scored, b.scored, column)) for column in a.scored.values]
         before, after = a.scored.found, b.scored.found
-        clear = is_clear(int((after & ~before).sum()), int((before & ~after).sum()))
-        return f"{b.name} - {a.name}", *cells, f"{after.mean() - before.mean():+.0%}" if clear else "within noise"
+        share = f"{after.mean() - before.mean():+.0%}" if is_clear(a.scored, b.scored) else "within noise"
+        return f"{b.name} - {a.name}", *cells, share
 
     def _sides(self, a: MeasuredRig, b: MeasuredRig) -> Iterator[str]:
-        clear = sorted(sides(a.scored.places, a.scored.found, b.scored.found), key=lambda row: row[3] - row[2])
+        clear = sorted(sides(a.scored, b.scored), key=lambda row: row[3] - row[2])
         if clear:
             yield from ("", f"found with {b.name}, and with {a.name}, where the difference is beyond noise")
         for side, count, before, after in clear:

@@ -118,7 +118,8 @@ def size_differences(rig: CameraRig, config: ModelConfig) -> Iterator[RigDiffere
     if off:
         low, high = min(off.values()), max(off.values())
         size = f"{low:.2f}" if round(low, 2) == round(high, 2) else f"{low:.2f} to {high:.2f}"
-        text = f"{_named(tuple(off), rig)}: objects are {size} times as large in the network's images as at nuScenes"
+        where = _named(tuple(off), rig)
+        text = f"{where}: objects are {size} times as large in the network's images as with nuScenes' cameras"
         yield RigDifference("size", tuple(off), text)
 
 

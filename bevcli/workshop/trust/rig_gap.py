@@ -212,6 +212,14 @@ class Scored:
         hits = matched[(matched >= 0) & (matches.predictions.column("scores") >= SHOWN_SCORE)]
         return np.asarray(np.isin(np.arange(len(matches.ground_truth)), hits))
 
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """(G,) the number of the vehicle, person or thing, which is the same in all frames of a street."""
+        truth = self.together.matches[0].ground_truth
+        streets = truth.frames * len(STREETS) // self.together.frame_count
+        names = [f"{street} {name}" for street, name in zip(streets, truth.column("instances"), strict=True)]
+        return np.asarray(np.unique(names, return_inverse=True)[1])
+
 
 def _columns(together: float, table: Any) -> dict[str, float]:
     first = next(iter(table.classes))
@@ -286,7 +294,8 @@ class Cost:
     def label(self) -> str:
         """The row of `shown`: a rig has its differences, a drive's are added to it."""
         kind = self.differences[0].kind
-        return f"with its {kind}" if kind in OF_DRIVE else f"without its {kind}"
+        other = ", of other frames" * (kind == "rate")
+        return f"with its {kind}{other}" if kind in OF_DRIVE else f"without its {kind}"
 
     @property
     def shown(self) -> Scored | None:
@@ -332,27 +341,36 @@ class PolarMap:
     found: NDArray[np.int64]
 
 
+def cells_of(places: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Sector and ring (G,) of places (G, 2), metres in the ego frame."""
+    turn = 2 * np.pi / SECTORS
+    sectors = np.round(np.arctan2(places[:, 1], places[:, 0]) / turn).astype(np.int64) % SECTORS
+    return sectors, (np.hypot(*places.T) // RING_M).astype(np.int64)
+
+
 def polar_map(places: Array, found: NDArray[np.bool_], range_m: float) -> PolarMap:
     """The map of objects at places (G, 2), metres in the ego frame, of which some are found (G,)."""
-    turn = 2 * np.pi / SECTORS
-    sectors = np.round(np.arctan2(places[:, 1], places[:, 0]) / turn).astype(int) % SECTORS
-    rings = (np.hypot(*places.T) // RING_M).astype(int)
-    shape = (SECTORS, int(np.ceil(range_m / RING_M)))
+    shape, cells = (SECTORS, int(np.ceil(range_m / RING_M))), np.stack(cells_of(places))
     counts, hits = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    np.add.at(counts, (sectors, rings), 1)
-    np.add.at(hits, (sectors[found], rings[found]), 1)
+    np.add.at(counts, tuple(cells), 1)
+    np.add.at(hits, tuple(cells[:, found]), 1)
     return PolarMap(counts, hits)
 
 
-def sides(places: Array, a: NDArray[np.bool_], b: NDArray[np.bool_]) -> Iterator[tuple[str, int, float, float]]:
-    """The sides on which b finds another share than a, beyond noise (a sign test): side, objects, both shares."""
-    names = np.array([side_of(float(yaw)) for yaw in np.degrees(np.arctan2(places[:, 1], places[:, 0]))])
+def sides(a: Scored, b: Scored) -> Iterator[tuple[str, int, float, float]]:
+    """The sides on which b finds another share than a, beyond noise: side, number of objects, and both shares."""
+    names = np.array([side_of(float(yaw)) for yaw in np.degrees(np.arctan2(a.places[:, 1], a.places[:, 0]))])
     for side in dict.fromkeys(names.tolist()):
         mine = names == side
-        if is_clear(int((b & ~a)[mine].sum()), int((a & ~b)[mine].sum())):
-            yield side, int(mine.sum()), float(a[mine].mean()), float(b[mine].mean())
+        if is_clear(a, b, mine):
+            yield side, int(mine.sum()), float(a.found[mine].mean()), float(b.found[mine].mean())
 
 
-def is_clear(gained: int, lost: int) -> bool:
-    """Whether so many objects that only one rig finds, and so many that only the other does, are beyond noise."""
-    return abs(gained - lost) > 2 * np.sqrt(gained + lost)
+def is_clear(a: Scored, b: Scored, weights: Array | NDArray[np.bool_] | float = 1.0) -> bool:
+    """Whether b finds more or fewer objects than a, beyond noise.
+
+    What one object changes in all frames together counts as one draw: the sum is compared with two of its standard
+    deviations, if the sign of each were chance. weights: (G,) of the objects.
+    """
+    changes = np.bincount(a.objects, weights * (b.found.astype(float) - a.found))
+    return bool(abs(changes.sum()) > 2 * np.sqrt((changes**2).sum()))

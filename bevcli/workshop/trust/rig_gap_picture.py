@@ -16,7 +16,16 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.rig.drawings import AXLE_TO_TAIL_M, CAR_LENGTH_M, CAR_WIDTH_M, FAINT, INK, PAPER, save
 from bevcli.rig.rig_checks import seen_range_deg
-from bevcli.workshop.trust.rig_gap import RING_M, SECTORS, SHOWN_SCORE, MeasuredRig, is_clear, polar_map
+from bevcli.workshop.trust.rig_gap import (
+    RING_M,
+    SECTORS,
+    SHOWN_SCORE,
+    MeasuredRig,
+    Scored,
+    cells_of,
+    is_clear,
+    polar_map,
+)
 
 EMPTY, NOISE = "#1b2027", "#39414c"
 FOUND = LinearSegmentedColormap.from_list("found", ["#8c2438", "#d9833b", "#f0e28a", "#63b77c", "#1f7a6d"])
@@ -36,8 +45,7 @@ def write_picture(path: Path, first: MeasuredRig, second: MeasuredRig, range_m: 
     with np.errstate(invalid="ignore", divide="ignore"):
         enough = (counts >= FEWEST) & (maps[0].counts > 0)
         shares = [np.where(enough, smoothed(each.found) / counts, np.nan) for each in maps]
-    gained, lost = (smoothed(polar_map(a.places, x, range_m).found) for x in (b.found & ~a.found, a.found & ~b.found))
-    change = np.where(np.isnan(shares[0]) | np.vectorize(is_clear)(gained, lost), shares[1] - shares[0], 0.0)
+    change = np.where(np.isnan(shares[0]) | _clear_cells(a, b, shares[0].shape), shares[1] - shares[0], 0.0)
     for place, values in enumerate((*shares, change)):
         axes: Any = figure.add_axes((0.015 + 0.33 * place, 0.16, 0.305, 0.69), projection="polar")
         colors = CHANGE(CHANGES(values)) if place == 2 else FOUND(SHARES(values))
@@ -55,6 +63,16 @@ def write_picture(path: Path, first: MeasuredRig, second: MeasuredRig, range_m: 
 def smoothed(counts: NDArray[np.int64]) -> Array:
     """(SECTORS, R) numbers with half of those of both neighbouring sectors."""
     return np.asarray(counts + 0.5 * (np.roll(counts, 1, axis=0) + np.roll(counts, -1, axis=0)))
+
+
+def _clear_cells(a: Scored, b: Scored, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(SECTORS, R) whether the difference of a cell is beyond noise."""
+    (sectors, rings), clear = cells_of(a.places), np.zeros(shape, bool)
+    for sector, ring in np.ndindex(shape):
+        apart = (sectors - sector + 1) % SECTORS  # 0 and 2: a neighbour
+        weights = np.select([apart == 1, apart == 0, apart == 2], [1.0, 0.5, 0.5]) * (rings == ring)
+        clear[sector, ring] = is_clear(a, b, weights)
+    return clear
 
 
 def _draw_cells(axes: Any, values: Array, colors: Array, counts: NDArray[np.int64] | str) -> None:

@@ -26,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.parsing.documents import TOML_BYTES, parse_toml, read_yaml
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import aligned, counted, reason_of
 from bevcli.workshop.formats import BAG_METADATA, BAG_SUFFIXES, is_packed_bag
+from bevcli.workshop.formats.markup import read_yaml
 from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, decompressed, frame_of
 
 if TYPE_CHECKING:
