@@ -6,6 +6,7 @@ show an error of the motion or of the calibration.
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -185,7 +186,7 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
     of_stated = None if others is None else yaw_rates_deg(others)[0]
     _draw_curve(yaw_rate, motion, yaw_rates_deg(motion), of_stated, "yaw rate, °/s")
     yaw_rate.set_xlabel("seconds")
-    kmh = speed.secondary_yaxis("right", functions=(lambda speed: KMH * speed, lambda speed: speed / KMH))
+    kmh = speed.secondary_yaxis("right", functions=(partial(np.multiply, KMH), partial(np.multiply, 1 / KMH)))
     kmh.set_ylabel("km/h")
     return figure
 

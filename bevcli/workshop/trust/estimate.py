@@ -15,7 +15,7 @@ import numpy as np
 from bevcli.config import settings_of_table
 from bevcli.evaluation.evaluate import finite, number
 from bevcli.evaluation.matching import DetectionConfig
-from bevcli.findings import Finding
+from bevcli.findings import Finding, errors_of
 from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
@@ -33,6 +33,8 @@ NO_FIT = (
     "these weights have no fit of figures to a true NDS: compare the figures with those of a drive on which the "
     "weights are known to work (`reference=DIR`)"
 )
+
+FAULTY = "scores stay high under the faults below: the true NDS is likely to be lower than estimated"
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,11 @@ class EstimatedScore:
             return "estimated NDS -"
         return f"estimated NDS {self.nd_score:.2f}, between {self.low:.2f} and {self.high:.2f} in 9 of 10 drives"
 
+    def with_faults(self, findings: tuple[Finding, ...]) -> "EstimatedScore":
+        """The score with the faults that show, and a note where they make it worse than estimated."""
+        is_worse = self.nd_score is not None and errors_of(findings)
+        return replace(self, findings=findings, notes=(*self.notes, FAULTY) if is_worse else self.notes)
+
     def table(self, reference: "EstimatedScore | None" = None) -> str:
         """The score, its figures and the tables as text. reference: of another drive, whose figures stand beside."""
         sides = [asdict(side.figures) for side in (self, reference) if side is not None]
@@ -123,7 +130,7 @@ def estimate_score(
     for frame, prediction in run(model, drive, temporal=temporal, track=False):
         frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego))
         after_frame()
-    return replace(estimate_of_boxes(model, frames, drive.rig), findings=find_faults(model, drive))
+    return estimate_of_boxes(model, frames, drive.rig).with_faults(find_faults(model, drive))
 
 
 def as_document(scores: Items[tuple[str, EstimatedScore]], reference: EstimatedScore | None) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def _clear_cells(a: Scored, b: Scored, shape: tuple[int, ...]) -> NDArray[np.boo
     (sectors, rings), clear = cells_of(a.places), np.zeros(shape, bool)
     for sector, ring in np.ndindex(shape):
         apart = (sectors - sector + 1) % SECTORS  # 0 and 2: a neighbour
-        weights = np.select([apart == 1, apart == 0, apart == 2], [1.0, 0.5, 0.5]) * (rings == ring)
+        weights = np.where(apart == 1, 1.0, np.where(apart <= 2, 0.5, 0.0)) * (rings == ring)
         clear[sector, ring] = is_clear(a, b, weights)
     return clear
 

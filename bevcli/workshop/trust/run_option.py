@@ -26,13 +26,11 @@ def _print_estimate(options: ScoreWithoutLabelsOptions, done: "tuple[Model, Sequ
     """Print the estimated score of a run, where this is asked for. done: the model, the drive and the run's folder."""
     if not options.score_without_labels:
         return
-    from dataclasses import replace
-
     from bevcli.workshop.trust.estimate import estimate_of_run
     from bevcli.workshop.trust.faults import find_faults
 
     model, drive, folder = done
-    say(replace(estimate_of_run(model, folder, drive.rig), findings=find_faults(model, drive)).table())
+    say(estimate_of_run(model, folder, drive.rig).with_faults(find_faults(model, drive)).table())
 
 
 SCORE_WITHOUT_LABELS = Extension(ScoreWithoutLabelsOptions, _print_estimate)
