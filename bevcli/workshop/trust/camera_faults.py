@@ -26,8 +26,8 @@ LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
 PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
-LEAST_SHARE = 0.4  # of points that fit after a mistake is undone
-EXCHANGED, GAIN = 0.25, 0.1  # by how much more, if images are exchanged, and if they are mirrored or late
+LEAST_SHARE = 0.55  # of points that fit after a mistake is undone
+EXCHANGED, GAIN, SMALL = 0.25, 0.1, 0.03  # by how much more, if images are exchanged; mirrored or late; of others
 COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
 TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
 LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
@@ -196,15 +196,15 @@ def _undone(points: CameraPoints, rows: Poses, interval_ns: int) -> Iterator[_Un
         message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {'late' if late_ns > 0 else 'early'}"
         yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", GAIN)
     factor = best_focal(points, rows)
-    if abs(np.log(factor)) >= LEAST_LONGER:
+    if LEAST_LONGER <= abs(np.log(factor)) < LENGTHS[-1]:  # the longest and shortest one tried are no measurement
         message = f"the stated focal length is {1 / factor:.2f} times the one that the images show"
-        yield _Undone(points.longer(factor), "focal-length", message, "calibrate the lens, or correct its scale", 0)
+        yield _Undone(points.longer(factor), "focal-length", message, "calibrate the lens, or correct its scale", SMALL)
     turn = best_turn(points, rows)
     up, right, roll = np.degrees(turn)
     if LEAST_TURN_DEG <= np.linalg.norm((up, right, roll)) <= MOST_TURN_DEG:
         message = f"it looks {abs(right):.1f}° further {'right' if right > 0 else 'left'} and {abs(up):.1f}° further "
         message += f"{'up' if up > 0 else 'down'} than stated, rolled by {roll:+.1f}°"
-        yield _Undone(points.turned(turn), "rotation-off", message, "measure it with `bevcli calibrate`", 0)
+        yield _Undone(points.turned(turn), "rotation-off", message, "measure it with `bevcli calibrate`", SMALL)
 
 
 def _interval_ns(points: Mapping[str, CameraPoints]) -> int:
