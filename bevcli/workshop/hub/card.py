@@ -79,8 +79,8 @@ def facts_of(name: str, checkpoint: Checkpoint, options: PackOptions) -> CardFac
     known = CardFacts(rigs=rigs)
     named = all_weights().get(name) if options.weights is None else None
     if checkpoint.path == bundled_weights(name):
-        known_scores, data, limit = BUNDLED[name]
-        known = CardFacts("Apache-2.0", (), known_scores, data, "", limit, rigs)
+        own_scores, scored_on, limit = BUNDLED[name]
+        known = CardFacts("Apache-2.0", (), own_scores, scored_on, "", limit, rigs)
     elif named is not None:
         source, data = named.source, ("nuscenes",) if named.source.published else ()
         where = source.page or source.url
