@@ -253,8 +253,8 @@ def load_model(
             weights ("tiny-fp16"), a FILE.toml, a model of the Hugging Face Hub ("hf:OWNER/NAME" or
             "hf:OWNER/NAME@REVISION"), or an exported FILE.onnx, which holds its weights and runs on the CPU in the
             precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
-        weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
-            "demo" has, or downloaded ones.
+        weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which
+            "demo" and "photographs" have, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
         report: called during a download with the bytes that are there, the size of the file or None, and name and URL.
         changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a

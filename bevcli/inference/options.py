@@ -35,7 +35,7 @@ class ModelOptions:
     weights: Path | None = option(
         reads="path",
         default=None,
-        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo), or those that "
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo, photographs), or those that "
         "`bevcli weights fetch` has downloaded.",
     )
     fetch: bool = option(
