@@ -30,7 +30,8 @@ class PackOptions:
     weights: Path | None = option(
         reads="path or name",
         default=None,
-        help="A .pth or a .safetensors that fits MODEL. Default: those in the package (demo, photographs), or downloaded ones.",
+        help="A .pth or a .safetensors that fits MODEL. Default: those in the package (demo, photographs), or "
+        "downloaded ones.",
         panel="Model",
     )
     licence: str = option(

@@ -26,6 +26,7 @@ LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
 PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
+USUAL_SHARE = 0.6  # of points of the middle camera; below it the poses are too inexact to judge single cameras by
 LEAST_SHARE = 0.55  # of points that fit after a mistake is undone
 EXCHANGED, GAIN, SMALL = 0.25, 0.1, 0.03  # by how much more, if images are exchanged; mirrored or late; of others
 COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
@@ -135,9 +136,16 @@ def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: Camera
             message, advice = f"its images are those of {second}, and the other way round", "exchange them"
             findings.append(_finding("images-exchanged", first, message, stated[first], gained, advice))
             left = {name: each for name, each in left.items() if name not in (first, second)}
+    usual = float(np.median(list(stated.values()) or [1.0]))
+    are_inexact = usual < USUAL_SHARE
+    if are_inexact:
+        message = "late images, focal lengths and rotations of single cameras were not checked"
+        found = f"the points of the middle camera fit the motion of the vehicle by {usual:.2f} of 1"
+        findings.append(Finding("cameras-unchecked", "info", None, message, found, f"{USUAL_SHARE} or more"))
     for name, each in left.items():
         before = cost(each, rows)
-        told = [one for one in _undone(each, rows, _interval_ns(points)) if one.is_told(rows, stated[name], before)]
+        tried = _undone(each, rows, _interval_ns(points), only_coarse=are_inexact)
+        told = [one for one in tried if one.is_told(rows, stated[name], before)]
         if told:
             likeliest = min(told, key=lambda one: cost(one.points, rows))
             undone = share(likeliest.points, rows)
@@ -189,9 +197,11 @@ class _Undone:
         return enough and gain >= max(COST_GAIN, COST_SHARE * cost_before)
 
 
-def _undone(points: CameraPoints, rows: Poses, interval_ns: int) -> Iterator[_Undone]:
-    """The mistakes that one camera may have, undone."""
+def _undone(points: CameraPoints, rows: Poses, interval_ns: int, *, only_coarse: bool) -> Iterator[_Undone]:
+    """The mistakes that one camera may have, undone. only_coarse: mirrored images alone."""
     yield _Undone(points.mirrored(), "images-mirrored", "its images are mirrored", "mirror them", GAIN)
+    if only_coarse:
+        return
     for late_ns in (interval_ns, -interval_ns):
         message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {'late' if late_ns > 0 else 'early'}"
         yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", GAIN)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.findings import Finding, rig_error
+from bevcli.findings import Finding, errors_of, rig_error
 from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
@@ -93,7 +93,7 @@ def one_cause(motion: tuple[Finding, ...], cameras: tuple[Finding, ...], measure
     """The findings about poses or those about single cameras: few cameras that are off do not make poses wrong."""
     if all(finding.severity == "info" for finding in motion):
         return (*motion, *cameras)
-    return cameras if 0 < len(cameras) < measured / 2 else motion
+    return cameras if 0 < len(errors_of(cameras)) < measured / 2 else motion
 
 
 def small_grey(pixels_bgr: NDArray[np.uint8]) -> Array:
