@@ -35,8 +35,8 @@ class ModelOptions:
     weights: Path | None = option(
         reads="path",
         default=None,
-        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo, photographs), or those "
-        "that `bevcli weights fetch` has downloaded.",
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo, "
+        "photographs), or those that `bevcli weights fetch` has downloaded.",
     )
     fetch: bool = option(
         default=False, help="Download the weights of MODEL if they are not there yet; of a hub, the newest version."

@@ -136,7 +136,7 @@ def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: Camera
             message, advice = f"its images are those of {second}, and the other way round", "exchange them"
             findings.append(_finding("images-exchanged", first, message, stated[first], gained, advice))
             left = {name: each for name, each in left.items() if name not in (first, second)}
-    usual = float(np.median(list(stated.values()) or [1.0]))
+    usual = sorted([stated[name] for name in left] or [1.0])[len(left) // 2]
     are_inexact = usual < USUAL_SHARE
     if are_inexact:
         message = "late images, focal lengths and rotations of single cameras were not checked"
