@@ -30,7 +30,7 @@ def test_the_demo_model_is_as_small_as_the_model_card_states() -> None:
     assert bundled_weights("demo").stat().st_size == pytest.approx(5.1e6, abs=0.05e6)
 
 
-def test_photographs_is_demo_with_another_backbone_in_the_package() -> None:
+def test_photographs_is_demo_with_another_backbone() -> None:
     demo, photographs = load_config("demo"), load_config("photographs")
     image = replace(photographs.image, mean=demo.image.mean, std=demo.image.std)
     same = {"name": "demo", "backbone": demo.backbone, "image": image, "training_rigs": demo.training_rigs}

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import planted
+import planted_faults
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -159,15 +159,15 @@ def test_boxes_agree_that_have_one_class_and_place():
     assert agreement([wanted], [given]) == (3, 1 / 3)
 
 
-class OneFrame(planted.DerivedSequence):
+class OneFrame(planted_faults.DerivedSequence):
     """A drive of one frame with one image."""
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels, self.name, self.rig, self.stamps, self.has_ego_motion = pixels, "one", RIG, (), False
 
-    def load(self, place: int) -> planted.Frame:
-        image = planted.CameraImage(0, self.pixels)
-        return planted.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
+    def load(self, place: int) -> planted_faults.Frame:
+        image = planted_faults.CameraImage(0, self.pixels)
+        return planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
 
 
 def test_colors_that_are_reversed_twice_are_the_same():
@@ -178,27 +178,27 @@ def test_colors_that_are_reversed_twice_are_the_same():
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> planted.Sequence:
+def street(tmp_path_factory: pytest.TempPathFactory) -> planted_faults.Sequence:
     cache, config = tmp_path_factory.mktemp("streets"), load_model("demo").config
     return RenderedDrives([1_000_000], cache, config).open(0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", planted.FAULTS)
-def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted.Sequence, fault: str):
-    plant, code = planted.FAULTS[fault]
+@pytest.mark.parametrize("fault", planted_faults.FAULTS)
+def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted_faults.Sequence, fault: str):
+    plant, code = planted_faults.FAULTS[fault]
     faulty = plant(street, "CAM_FRONT")
     findings = find_faults(load_model("demo"), faulty) if code == "color-order" else input_faults(faulty)
     assert code in {finding.code for finding in findings}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", planted.MODEL_FAULTS)
-def test_a_planted_fault_of_a_model_is_named(street: planted.Sequence, fault: str):
-    change, code = planted.MODEL_FAULTS[fault]
+@pytest.mark.parametrize("fault", planted_faults.MODEL_FAULTS)
+def test_a_planted_fault_of_a_model_is_named(street: planted_faults.Sequence, fault: str):
+    change, code = planted_faults.MODEL_FAULTS[fault]
     assert [finding.code for finding in model_faults(change(load_model("demo")), street)] == [code]
 
 
 @pytest.mark.slow
-def test_a_sound_rendered_drive_has_no_fault(street: planted.Sequence):
+def test_a_sound_rendered_drive_has_no_fault(street: planted_faults.Sequence):
     assert not [each for each in find_faults(load_model("demo"), street) if each.severity != "info"]

@@ -1,6 +1,6 @@
 """Drives with one planted fault each, and the table of which ones `find_faults` finds without labels.
 
-python tests/trust/planted.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
+python tests/trust/planted_faults.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
 """
 
 import copy
