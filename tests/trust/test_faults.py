@@ -144,6 +144,8 @@ def test_few_cameras_that_are_off_do_not_make_poses_wrong():
     assert one_cause((poses,), (camera,) * 3, 6) == (poses,)
     assert one_cause((poses,), (), 6) == (poses,)
     assert one_cause((info,), (camera,), 6) == (info, camera)
+    assert one_cause((info,), (camera,) * 4, 6) == (info,)
+    assert one_cause((), (camera,), 1) == (camera,)
 
 
 def boxes(xs: list[float], names: list[str], scores: list[float] | None = None) -> Boxes3D:
