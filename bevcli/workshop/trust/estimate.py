@@ -20,11 +20,10 @@ from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.parsing.documents import parse_toml
 from bevcli.printing import aligned
 from bevcli.sequences.files.boxes_file import FrameBoxes, read_boxes
-from bevcli.workshop.trust.faults import find_faults
+from bevcli.workshop.trust.faults import find_faults, frame_boxes
 from bevcli.workshop.trust.figures import Figures, figures_of, scores_of, within
 from bevcli.workshop.trust.fit import Fit
 
@@ -126,10 +125,7 @@ def estimate_score(
 
     Raises InputError where a frame cannot be read.
     """
-    frames = []
-    for frame, prediction in run(model, drive, temporal=temporal, track=False):
-        frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego))
-        after_frame()
+    frames = frame_boxes(model, drive, temporal=temporal, after_frame=after_frame)
     return estimate_of_boxes(model, frames, drive.rig).with_faults(find_faults(model, drive))
 
 

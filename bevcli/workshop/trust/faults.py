@@ -5,7 +5,7 @@ images; the order of colours, by the model's scores with the order reversed; an 
 that find little, by rendered streets.
 """
 
-from collections.abc import Iterable, Sequence as Items
+from collections.abc import Callable, Iterable, Sequence as Items
 from dataclasses import replace
 from itertools import pairwise
 
@@ -134,23 +134,26 @@ def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
     """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
     first = max(0, (len(drive.stamps) - TRIED) // 2)
     some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
-    boxes = boxes_without_history(model, some)
+    boxes = frame_boxes(model, some)
     broken = engine_findings(model, some, boxes) or weights_findings(model, boxes, drive.rig)
     return (*color_findings(model, some, boxes), *broken)
 
 
-def boxes_without_history(model: Model, drive: Sequence) -> list[FrameBoxes]:
-    """The boxes of each frame alone, in the ego frame."""
-    return [
-        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
-        for frame, prediction in run(model, drive, temporal=False, track=False)
-    ]
+def frame_boxes(
+    model: Model, drive: Sequence, *, temporal: bool = False, after_frame: Callable[[], None] = lambda: None
+) -> list[FrameBoxes]:
+    """The boxes of each frame, in the ego frame; by default of each frame alone, without history."""
+    frames = []
+    for frame, prediction in run(model, drive, temporal=temporal, track=False):
+        frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego))
+        after_frame()
+    return frames
 
 
 def color_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
     """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
     range_m = model.config.bev_grid.nearest_side_m
-    reversed_boxes = boxes_without_history(model, ReversedColors(drive))
+    reversed_boxes = frame_boxes(model, ReversedColors(drive))
     stated, undone = (figures_of(each, drive.rig, range_m).confidence for each in (boxes, reversed_boxes))
     if not undone - stated >= BETTER:
         return ()
@@ -163,7 +166,7 @@ def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> 
     """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine."""
     if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
         return ()
-    plain = boxes_without_history(replace(model, engine=TORCH, precision="fp32"), drive)
+    plain = frame_boxes(replace(model, engine=TORCH, precision="fp32"), drive)
     count, same = agreement([each.boxes for each in plain], [each.boxes for each in boxes])
     if count == 0 or same >= LEAST_SAME:
         return ()
