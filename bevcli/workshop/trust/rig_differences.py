@@ -109,9 +109,8 @@ def rig_differences(rig: CameraRig, known: KnownRigs, range_m: float) -> tuple[R
 
 def size_differences(rig: CameraRig, config: ModelConfig) -> Iterator[RigDifference]:
     """Cameras that show objects larger or smaller than nuScenes' camera of their direction, to the network."""
-    sizes = {}
+    known, sizes = nuscenes_like_rig(), {}
     for camera in rig.cameras:
-        known = nuscenes_like_rig()
         like = min(known.cameras, key=lambda one, yaw=camera.yaw: turn_deg(*np.degrees([one.yaw, yaw])))  # type: ignore[misc]
         sizes[camera.name] = _network_focal(camera, rig, config) / _network_focal(like, known, config)
     off = {name: size for name, size in sizes.items() if not SIZES[0] <= size <= SIZES[1]}
