@@ -10,9 +10,9 @@ import bevcli.workshop.synth
 ROOT = Path(bevcli.workshop.synth.__file__).parent
 ORDER = (
     *("corruptions", "options"),
-    *("mesh", "road_users", "catalog"),
-    *("city", "looks", "ground", "traffic", "simulation", "scenery"),
-    *("rig", "shading_kernels", "renderer"),
+    *("mesh", "road_users", "catalog", "material"),
+    *("city", "density", "looks", "ground", "traffic", "simulation", "scenery"),
+    *("rig", "shading_kernels", "photo_kernels", "photo_looks", "renderer"),
     *("drive", "drives", "commands"),
 )
 

@@ -11,13 +11,12 @@ from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth import traffic
 from bevcli.workshop.synth.catalog import Assets, Body, draw_body
 from bevcli.workshop.synth.city import DIRECTIONS, KERB_M, CityPlan, Line, Street, along, rounded_rectangle, side_of
+from bevcli.workshop.synth.density import Density
 from bevcli.workshop.synth.road_users import CYCLES, PERSON_NAMES
 
 STRIDE_M = 0.72  # distance after which the pose changes
 CROSSING_LINE_M = 3.2  # from the edge of the junction to the line on which people cross
 ALONG_PAVEMENT_M = 26.0  # length of a crosser's path on the pavement, before and after the road
-STROLLERS_PER_BLOCK = 4.5  # mean number
-SECONDS_BETWEEN_CROSSERS = 8.0  # mean time at a junction
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,17 @@ class Walker:
         return traffic.ActorState(self.body, position, yaw, attribute, velocity, int(walked / STRIDE_M) % 2)
 
 
-def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
-    """People who walk around a block on its pavement. span_s: start and end of the simulation, seconds."""
+def strollers(
+    city: CityPlan, assets: Assets, mean: float, span_s: tuple[float, float], column: int, row: int
+) -> list[Walker]:
+    """People who walk around a block on its pavement.
+
+    mean: of their number. span_s: start and end of the simulation, seconds.
+    """
     rng = city.stream("strollers", column, row)
     land = city.block(column, row)
     walkers = []
-    for k in range(int(rng.poisson(STROLLERS_PER_BLOCK))):
+    for k in range(int(rng.poisson(mean))):
         inset = rng.uniform(1.3, min(land.sidewalks) - 2.1)
         low, high = (land.low[0] + inset, land.low[1] + inset), (land.high[0] - inset, land.high[1] - inset)
         ring = np.roll(rounded_rectangle(low, high, 3.5), int(rng.integers(100)), axis=0)
@@ -83,9 +87,17 @@ def strollers(city: CityPlan, assets: Assets, span_s: tuple[float, float], colum
 
 
 def crossers(
-    city: CityPlan, assets: Assets, signals: traffic.Signals, span_s: tuple[float, float], node: tuple[int, int]
+    city: CityPlan,
+    assets: Assets,
+    every_s: float,
+    signals: traffic.Signals,
+    span_s: tuple[float, float],
+    node: tuple[int, int],
 ) -> list[Walker]:
-    """People who walk to the kerb at a junction (column, row), wait for the signal, cross the road and walk on."""
+    """People who walk to the kerb at a junction (column, row), wait for the signal, cross the road and walk on.
+
+    every_s: mean time between two of them, seconds. span_s: start and end of the simulation, seconds.
+    """
     rng = city.stream("crossers", *node)
     walkers: list[Walker] = []
     begin = span_s[0] - 30
@@ -109,7 +121,7 @@ def crossers(
         body = _person(assets, rng, f"crosser-{node[0]}-{node[1]}-{index}")
         times, walked_m = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
         walkers.append(Walker(city, body, path, times, walked_m, (ALONG_PAVEMENT_M, far)))
-        begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
+        begin += rng.exponential(every_s)
     return walkers
 
 
@@ -118,9 +130,6 @@ def _person(assets: Assets, rng: np.random.Generator, name: str) -> Body:
     return draw_body(assets.draw("pedestrian", rng, names), rng, name, 0.03, rng.uniform(0.94, 1.05))
 
 
-PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
-FILLED = 0.55  # share of parking spaces that are taken
-WORKS_SHARE = 0.27  # share of parking lanes (one side of a stretch) with road works
 PARKED_LOOKS = {**CYCLES, "bus": ("mini", "shuttle")}
 ATTRIBUTES = {
     "bicycle": "cycle.without_rider", "motorcycle": "cycle.without_rider", "pedestrian": "pedestrian.standing",
@@ -139,8 +148,8 @@ class StandingActor(traffic.ActorState):
 class Roadside:
     """The standing actors of a city. They are made when they are first needed, and kept."""
 
-    def __init__(self, city: CityPlan, assets: Assets) -> None:
-        self.city, self.assets = city, assets
+    def __init__(self, city: CityPlan, assets: Assets, density: Density = Density()) -> None:
+        self.city, self.assets, self._density = city, assets, density
         self.stretch = lru_cache(maxsize=None)(self._stretch)
         self.block = lru_cache(maxsize=None)(self._block)
 
@@ -169,11 +178,11 @@ class Roadside:
             return []
         rng = self.city.stream("kerbside", axis, index, cross, side)
         low, high = self.city.between_stop_lines(axis, index, cross)
-        low, high = low + 2.5, high - 2.5
+        low, high, parked = low + 2.5, high - 2.5, self._density.parked
         name = f"{axis}.{index}.{cross}.{side}"
         made: list[StandingActor] = []
         closed = (high + 1, high + 1)
-        if rng.random() < WORKS_SHARE:
+        if rng.random() < self._density.works:
             length = rng.uniform(15, 24)
             if length < high - low:  # there is no room for them in a short block
                 begin = rng.uniform(low, high - length)
@@ -181,13 +190,13 @@ class Roadside:
                 made += self._works(street, side, closed, rng, name)
         at = low
         while at < high - 4:
-            class_name = str(rng.choice(list(PARKED_MIX), p=list(PARKED_MIX.values())))
+            class_name = str(rng.choice(list(parked), p=list(parked.values())))
             body = self._body(class_name, rng, f"parked-{name}-{len(made)}", names=PARKED_LOOKS.get(class_name))
             length = float(body.size_lwh[0])
             if at + length > high:
                 break
             free = at + length + 1 < closed[0] or at > closed[1] + 1
-            if free and rng.random() < FILLED:
+            if free and rng.random() < self._density.filled:
                 offset = street.half_width - 0.18 - body.size_lwh[1] / 2
                 made.append(self._stand(street, body, at + length / 2, side * offset))
             at = at + length + rng.uniform(0.6, 1.3) if not (at <= closed[1] and not free) else closed[1] + 1.2
@@ -305,24 +314,25 @@ Actor = traffic.DrivingActor | StandingActor | Walker  # an annotated object ove
 
 WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
 AFTER_S = 0.6  # simulated time after the last frame
-VEHICLES, BICYCLES = 22, 6  # numbers around the ego vehicle, which counts as a vehicle
 REACH_M = 75.0  # traffic is simulated within this distance of the ego vehicle
 
 
 class Simulation:
     """All actors of a drive of `duration_s` seconds. The same city gives the same simulation."""
 
-    def __init__(self, city: CityPlan, assets: Assets, duration_s: float) -> None:
-        self.city, self.assets = city, assets
-        self.roadside = Roadside(city, assets)
+    def __init__(self, city: CityPlan, assets: Assets, duration_s: float, density: Density = Density()) -> None:
+        self.city, self.assets, self._density = city, assets, density
+        self.roadside = Roadside(city, assets, density)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
-        self.spawner = traffic.VehicleSpawner(city, assets, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
+        route_m = 14.0 * (self.span_s[1] - self.span_s[0]) + 60
+        self.spawner = traffic.VehicleSpawner(city, assets, route_m, density.traffic)
         self.ego_body = draw_body(assets.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
         self._ego = self.spawner.spawn_ego((traffic.Unit(self.ego_body, 0.0),))
         first = self._ego.route.passes[0]
         self.signals = traffic.Signals(city, (first.node, first.direction % 2))
-        self._crossers = lru_cache(maxsize=None)(partial(crossers, city, assets, self.signals, self.span_s))
-        self._strollers = lru_cache(maxsize=None)(partial(strollers, city, assets, self.span_s))
+        crossing = partial(crossers, city, assets, density.crosser_s, self.signals, self.span_s)
+        self._crossers = lru_cache(maxsize=None)(crossing)
+        self._strollers = lru_cache(maxsize=None)(partial(strollers, city, assets, density.strollers, self.span_s))
         self._driving: list[traffic.DrivingActor] = []
         self._run()
         self.ego = traffic.EgoTrack.smoothed(self._ego)
@@ -357,10 +367,11 @@ class Simulation:
         """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
         around = self._ego.route.at(self._ego.front + 25.0)
         taken = [vehicle.body_points() for vehicle in vehicles]
-        for attempt in range(6 * (VEHICLES + BICYCLES)):
+        most, most_bicycles = self._density.vehicles, self._density.bicycles
+        for attempt in range(6 * (most + most_bicycles)):
             bicycles = sum(v.bicycle for v in vehicles)
-            wants_bicycle = bicycles < BICYCLES and attempt % 4 == 0
-            if not wants_bicycle and len(vehicles) - bicycles >= VEHICLES:
+            wants_bicycle = bicycles < most_bicycles and attempt % 4 == 0
+            if not wants_bicycle and len(vehicles) - bicycles >= most:
                 continue
             new = self.spawner.spawn(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
             if new is not None:

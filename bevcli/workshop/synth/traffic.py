@@ -1,6 +1,7 @@
 """Traffic: signals, vehicles that keep their distance, obey signals and give way, and the states of actors."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Literal
@@ -300,18 +301,18 @@ class EgoTrack:
         return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
 
-TRAFFIC_MIX = {
-    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
-}  # fmt: skip
 MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
 SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
 
 
 class VehicleSpawner:
-    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
+    """Draws vehicles and their routes.
 
-    def __init__(self, city: CityPlan, assets: Assets, route_m: float) -> None:
-        self.city, self.assets, self.route_m = city, assets, route_m
+    route_m: length of the ego vehicle's route, metres; others in proportion. mix: class of the vehicles -> share.
+    """
+
+    def __init__(self, city: CityPlan, assets: Assets, route_m: float, mix: Mapping[str, float]) -> None:
+        self.city, self.assets, self.route_m, self._mix = city, assets, route_m, mix
         self._rng = city.stream("population")
         self._count = 0
 
@@ -365,7 +366,7 @@ class VehicleSpawner:
 
     def _units(self, bicycle: bool) -> tuple[Unit, ...]:
         rng, draw = self._rng, self.assets.draw
-        class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
+        class_name = "bicycle" if bicycle else str(rng.choice(list(self._mix), p=list(self._mix.values())))
         self._count += 1
         name = f"moving-{self._count}"
         if class_name == "train":
