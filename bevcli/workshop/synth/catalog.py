@@ -6,7 +6,7 @@ Street furniture, which is not annotated: trees, lamps, signs, benches, traffic 
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -315,6 +315,11 @@ CLOTHES: Colors = (
     (40, 42, 48), (70, 76, 88), (132, 136, 142), (204, 202, 196), (150, 40, 44), (40, 70, 130), (78, 112, 160),
     (58, 96, 70), (188, 148, 60), (120, 72, 110), (196, 112, 92), (96, 76, 60),
 )  # fmt: skip
+MODEL_SHARES = {
+    "car": 0.65, "truck": 0.35, "bus": 0.35, "motorcycle": 0.15, "pedestrian": 0.55, "barrier": 0.15,
+    "traffic_cone": 0.2,
+}  # share of the individuals of a class that are models, where there are models  # fmt: skip
+WITHOUT_MODELS = ("tractor", "worker", "rider")  # looks that are always ours
 OWN_PAINTS: dict[str, Colors] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
 
 
@@ -328,6 +333,8 @@ class Variant:
     size_lwh: NDArray[np.float64]  # (3,) usual length, width and height, metres
     paints: Colors  # colours to draw from for PAINT faces
     dyes: Colors  # colours to draw from for DYE faces
+    share: float = 1.0  # how often it is drawn, relative to the other models of its class
+    shaded: bool = False  # whether the albedo of PAINT and DYE faces is a factor on the drawn colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,6 +374,10 @@ _CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[mesh.Mesh]], Color
     "traffic_cone": (CONE_NAMES, traffic_cone, CAR_PAINTS, CLOTHES),
 }
 
+COLORS: dict[str, tuple[Colors, Colors]] = {
+    **{name: (paints, dyes) for name, (_, _, paints, dyes) in _CLASSES.items()}, "pedestrian": (CLOTHES, CLOTHES),
+}  # paints and dyes of each class  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Assets:
@@ -374,6 +385,7 @@ class Assets:
 
     by_class: Mapping[str, tuple[Variant, ...]]  # all variants of the annotated objects, by class
     furniture: StreetFurniture  # the repeated objects without annotations
+    models: Mapping[str, tuple[Variant, ...]] = field(default_factory=dict)  # by class, drawn in place of variants
 
     @staticmethod
     def build() -> "Assets":
@@ -392,7 +404,19 @@ class Assets:
     def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
         """Draw a variant of a class. names: draw from these variants only."""
         choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
-        return choices[int(rng.integers(len(choices)))]
+        chosen = choices[int(rng.integers(len(choices)))]
+        models = self._models(class_name, names or ())
+        if models and rng.random() < MODEL_SHARES.get(class_name, 0.0):
+            shares = np.array([model.share for model in models])
+            return models[int(rng.choice(len(models), p=shares / shares.sum()))]
+        return chosen
+
+    def _models(self, class_name: str, names: Collection[str]) -> list[Variant]:
+        """The models that may stand for variants of these names: in the same pose, and none for a special look."""
+        if any(part in name for name in names for part in WITHOUT_MODELS):
+            return []
+        standing = any(name.endswith("_standing") for name in names)
+        return [m for m in self.models.get(class_name, ()) if m.name.endswith("_standing") == standing]
 
 
 def _person(name: str, *strides: int) -> Variant:

@@ -24,10 +24,13 @@ from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
+from bevcli.workshop.synth.density import Density, draw_density
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
+from bevcli.workshop.synth.material import Material
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
+from bevcli.workshop.synth.photo_looks import SCENERY_M, Coats, PhotoLooks
 from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.synth.scenery import Scenery
@@ -36,10 +39,10 @@ from bevcli.workshop.synth.traffic import ActorState
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
-SCENERY_M = 135.0  # scenery is drawn within this distance
 NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
 SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
 TEXELS_M = {500: (0.125, 0.16), 1000: (0.06, 0.08), np.inf: (0.04, 0.06)}  # largest width -> of ground and shadows
+EGO_MIDDLE = (1.4, 0.0, 0.0)  # of the ego vehicle, in the ego frame, metres
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -71,8 +74,8 @@ class RenderedDrive:
         seed: the drive; 0 or greater.
         frames: number of frames.
         rate_hz: frames per second.
-        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s) and whether the looks are varied
-            (`Looks`); default: `nuscenes_like_rig` at 400x225.
+        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s), whether the looks are varied
+            (`Looks`), and their material; default: `nuscenes_like_rig` at 400x225.
         weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
         assets: the meshes, if they are built already.
         supersampling: samples per pixel along each axis (anti-aliasing).
@@ -99,14 +102,20 @@ class RenderedDrive:
         self._lenses = {camera.name: lens_parts(camera) for camera in self.rig.cameras if camera.distortion}
         self._map_half_extent_m = map_half_extent_m
         self._supersampling, self._threads = supersampling, threads
-        self._assets = assets or Assets.build()
+        self._assets, density = assets or Assets.build(), Density()
+        self._photo: PhotoLooks | None = None
         self._city = CityPlan(seed)
         names = self._city.stream("weather-name")
         name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
         self.weather = make_weather(name, self._city.stream("weather"))
         if self._looks is not None:
             self.weather = self._looks.weather(self.weather)
-        self.simulation = Simulation(self._city, self._assets, frames / rate_hz)
+            if drawn.material:
+                material, density = Material.read(drawn.material), draw_density(self._looks.stream("density"))
+                self._assets = replace(self._assets, models=material.models)
+                self._photo = PhotoLooks.draw(self._looks, material, self.weather)
+                self.weather = self._photo.weather
+        self.simulation = Simulation(self._city, self._assets, frames / rate_hz, density)
         self._ground = GroundPlan(self._city)
         width = max(camera.width for camera in self.rig.cameras) * supersampling
         self._texels_m = next(sizes for most, sizes in TEXELS_M.items() if width <= most)
@@ -175,7 +184,7 @@ class RenderedDrive:
         here: (2,) world, metres, the point around which the scenery is made.
         """
         # Those of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again.
-        scenery, ground, shadows = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
+        scenery, ground, shadows, coats = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         near = [states[k] for k in near_first]
         actors = [self._placed(state.body, state.pose, *state.position.tolist(), state.yaw) for state in near]
@@ -186,6 +195,13 @@ class RenderedDrive:
         snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather)
         if self._looks is not None:
             snapshot = replace(snapshot, pattern=self._looks.pattern())
+        if self._photo is not None and coats is not None:
+            ego, size = apply(world_from_ego.matrix, EGO_MIDDLE), self.simulation.ego_body.size_lwh
+            placed = [(state.position, state.yaw, state.body.size_lwh) for state in states]
+            placed.append((ego, world_from_ego.yaw, size))
+            strength, waves, hardness = snapshot.pattern
+            pattern = (strength * self._photo.pattern_share, waves, hardness)
+            snapshot = replace(snapshot, pattern=pattern, photo=self._photo.view(coats, placed, here))
 
         def render_one(name: str) -> RenderedView:
             pose = world_from_ego.matrix
@@ -198,15 +214,18 @@ class RenderedDrive:
         with ThreadPoolExecutor(self._threads) as pool:
             return dict(zip(names, pool.map(render_one, names), strict=True))
 
-    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
+    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap, Coats | None]:
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
-        scenery = self._scenery.around(center, SCENERY_M)
+        coats: Coats | None = None
+        scenery = self._scenery.around(center, SCENERY_M if self._photo is None else self._photo.scenery_m)
         if self._looks is not None:
             texture = replace(texture, texels=self._looks.ground(texture.texels))
             scenery = self._looks.scenery(scenery)
+        if self._photo is not None:
+            scenery, coats = self._photo.coated(scenery)
         shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
-        return scenery, texture, shadows
+        return scenery, texture, shadows, coats
 
     def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
         return self._template(body, pose).placed((x, y, z), yaw)
@@ -214,12 +233,13 @@ class RenderedDrive:
     def _make_template(self, body: Body, pose: int) -> TriangleSoup:
         mesh, paint = body.variant.poses[pose % len(body.variant.poses)], body.paint
         if self._looks is not None:
-            mesh, paint = self._looks.body(mesh, body.instance), self._looks.paint(paint, body.instance)
-        return TriangleSoup.from_mesh(mesh.fitted(body.size_lwh)).painted(paint, body.dye)
+            mesh = self._looks.body(mesh, body.instance, recolour=not body.variant.shaded)
+            paint = self._looks.paint(paint, body.instance)
+        return TriangleSoup.from_mesh(mesh.fitted(body.size_lwh)).painted(paint, body.dye, body.variant.shaded)
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
-        """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""
-        x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
+        """(T, 3, 3) triangles of the ego vehicle, for its shadow."""
+        x, y, _ = apply(world_from_ego.matrix, EGO_MIDDLE)
         return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
 
     def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:

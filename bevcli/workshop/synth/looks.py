@@ -125,10 +125,11 @@ class Looks:
         numbers = [zlib.crc32(str(name).encode()) for name in names]
         return np.random.default_rng([self.seed, 0x6C6F6F6B, *numbers])
 
-    def body(self, mesh: Mesh, name: str) -> Mesh:
-        """The mesh of an individual with a shape and colours of its own. name: of the individual."""
+    def body(self, mesh: Mesh, name: str, recolour: bool = True) -> Mesh:
+        """The mesh of an individual with a shape of its own and, with recolour, colours. name: of the individual."""
         rng = self.stream("body", name)
-        return recoloured(bent(mesh, rng), rng)
+        mesh = bent(mesh, rng)
+        return recoloured(mesh, rng) if recolour else mesh
 
     def paint(self, paint: NDArray[np.float32], name: str) -> NDArray[np.float32]:
         """(3,) linear RGB: any colour for a half of the individuals, else the given one."""

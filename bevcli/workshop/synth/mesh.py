@@ -138,11 +138,15 @@ class TriangleSoup:
         soup = cls(*(np.concatenate([getattr(part, field.name) for part in shifted]) for field in fields(cls)))
         return soup if objects is None else replace(soup, mesh_objects=np.asarray(objects, np.int32))
 
-    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32]) -> Self:
-        """The meshes with these linear colours (3,) on their PAINT and DYE faces."""
+    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32], shaded: bool = False) -> Self:
+        """The meshes with these linear colours (3,) on their PAINT and DYE faces.
+
+        shaded: whether the albedo of these faces is a factor on the colour.
+        """
         albedo = self.albedo.copy()
-        albedo[self.material == Material.PAINT] = paint
-        albedo[self.material == Material.DYE] = dye
+        for material, color in ((Material.PAINT, paint), (Material.DYE, dye)):
+            of = self.material == material
+            albedo[of] = np.minimum(albedo[of] * color, 1) if shaded else color
         return replace(self, albedo=albedo)
 
     def placed(self, position: tuple[float, float, float], yaw: float) -> Self:

@@ -21,6 +21,7 @@ from bevcli.jit import njit
 from bevcli.workshop.synth.ground import GroundTexture
 from bevcli.workshop.synth.looks import Weather
 from bevcli.workshop.synth.mesh import TriangleSoup
+from bevcli.workshop.synth.photo_looks import PhotoView
 from bevcli.workshop.synth.rig import LensPart
 from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT, shade_pixels
 
@@ -300,6 +301,7 @@ class WorldSnapshot:
     shadows: ShadowMap
     weather: Weather  # light, sky and haze
     pattern: tuple[float, float, float] = (0.0, 1.0, 0.0)  # strength, waves per metre, hardness; not on the ground
+    photo: PhotoView | None = None  # photographs over the shaded images
 
 
 @dataclass(frozen=True)
@@ -385,17 +387,21 @@ def shade(
     soup, ground, shadows, w = snapshot.soup, snapshot.ground, snapshot.shadows, snapshot.weather
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
     image = np.zeros((*buffer.triangles.shape, 3), np.uint8)
+    seen = (buffer.triangles, buffer.inverse_depth)
+    view = (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0])
     shade_pixels(
-        (buffer.triangles, buffer.inverse_depth),
+        seen,
         (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades, snapshot.pattern),
         (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
         (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.kind.shadow_softness_m),
         (w.light, w.to_sun, w.clouds, w.kind.haze_m, w.kind.lamps),
-        (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
+        view,
         _display_table(),
         needed,
         image,
     )
+    if snapshot.photo is not None:
+        snapshot.photo.retouch(seen, soup, view, _display_table(), needed, image)
     return image
 
 

@@ -207,6 +207,7 @@ class RigDistribution:
     coarsest: float = 0.6  # by a factor from this to 1
     jpeg_quality: tuple[int, int] = (60, 95)
     varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
+    material: str = ""  # folder of models and photographs for these drives (`Material`); "" for none
 
     def __post_init__(self) -> None:
         for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
@@ -222,8 +223,16 @@ class RigDistribution:
 
     @property
     def digest(self) -> str:
-        """Eight hexadecimal digits that differ between distributions."""
-        stated = astuple(self) if self.varied_share else astuple(self)[:-1]  # older caches stay valid
+        """Eight hexadecimal digits that differ between distributions and, by names and sizes, files of the material.
+
+        Raises InputError where the material's folder is missing or holds nothing of use.
+        """
+        stated = astuple(self)[:-1] if self.varied_share else astuple(self)[:-2]  # older caches stay valid
+        if self.varied_share and self.material:
+            from bevcli.workshop.synth.material import material_files  # trimesh, which other rigs do not need
+
+            files = material_files(self.material)
+            stated += tuple((path.parent.name, path.name, path.stat().st_size) for path in files)
         return hashlib.sha256(repr(stated).encode()).hexdigest()[:8]
 
 
@@ -236,6 +245,7 @@ class DrawnRig:
     supersampling: int = 1  # samples per pixel along each axis
     jpeg_quality: int = 90  # 1 to 100
     varied: bool = False  # whether the looks of the drive are varied
+    material: str = ""  # folder of what they are varied with (`Material`); "" for none
 
 
 def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:
@@ -255,7 +265,7 @@ def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) ->
     if random.random() < distribution.delayed_share:
         delays = {name: round(float(random.uniform(0, distribution.delay_s)), 3) for name in rig.names}
     varied = np.random.default_rng([seed, _STREAM, 1]).random() < distribution.varied_share  # leaves the rest as it is
-    return DrawnRig(rig, delays, samples, quality, bool(varied))
+    return DrawnRig(rig, delays, samples, quality, bool(varied), distribution.material if varied else "")
 
 
 def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: float, random: Generator) -> CameraRig:
