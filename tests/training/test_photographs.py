@@ -5,28 +5,16 @@ from __future__ import annotations
 import time
 
 import photographs
-import pytest
-import torch
 
-from bevcli.config import load_config
-from bevcli.model.network import build_network
-from bevcli.workshop.training.augmentation import RandomisationConfig
+from bevcli.config import TRAINING, load_table
+from bevcli.workshop.training.job import TrainingConfig
 
 
-@pytest.mark.slow
-def test_teaching_changes_the_neck_and_the_upper_stages_only(tmp_path) -> None:
-    torch.manual_seed(0)
-    model = build_network(load_config(photographs.model_file(tmp_path / "photographs.toml")))
-    before = {name: value.clone() for name, value in model.named_parameters()}
-    width, height = load_config("demo").image.padded_size
-    images = [torch.randint(256, (2, 3, height, width), dtype=torch.uint8) for _ in range(2)]
-    chance = RandomisationConfig(0.5, 0.5, 0.5, 0.5, 0.5, 0.5)
-    photographs.teach(model, images, chance, seconds=1e-3, new_neck=True)
-    changed = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
-    lower = [f"backbone.stages.{stage}." for stage in range(photographs.FIRST_TAUGHT_STAGE - 1)]
-    assert changed
-    assert all(name.startswith(("neck.", "backbone.stages.")) for name in changed)
-    assert not [name for name in changed if name.startswith(tuple(lower))]
+def test_the_model_file_names_the_material(tmp_path) -> None:
+    plain = photographs.model_file(tmp_path / "plain.toml")
+    with_material = photographs.model_file(tmp_path / "photographs.toml", tmp_path / "material")
+    assert load_table(plain, TRAINING, TrainingConfig).rigs.material == ""
+    assert load_table(with_material, TRAINING, TrainingConfig).rigs.material == str(tmp_path / "material")
 
 
 def test_the_learning_rate_falls_with_the_time() -> None:
