@@ -34,7 +34,7 @@ BUNDLED: dict[str, tuple[dict[str, float], str, str]] = {
     "photographs": (
         {"mAP": 0.364, "NDS": 0.468},
         f"3 {RENDERED}",
-        "The weights were trained on rendered streets (`bevcli render`); they find cars on real images, and invent some.",
+        "Trained on rendered streets (`bevcli render`); of real images they find cars, and invent some.",
     ),
 }
 PUBLISHED_DATA = "nuScenes validation split"
