@@ -104,7 +104,7 @@ class RenderedDrives(FolderDrives):
         image, (width, height) = config.image, config.image.size
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
-            if rig.varied_share and rig.material:
+            if rig.material:
                 Material.read(rig.material)  # a wrong file is an error before the training begins
             self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
             sizes = [image_for_rig(drawn.rig, image).padded_size for drawn in self._rigs]

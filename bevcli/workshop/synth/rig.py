@@ -220,6 +220,8 @@ class RigDistribution:
             if not values or not low <= min(values) <= max(values) <= high:
                 kind = "is a probability," if name.endswith("_share") else "must be"
                 raise ValueError(f"{name} {kind} from {low} to {high}")
+        if self.material and not self.varied_share:
+            raise ValueError("material is for drives with varied looks: varied_share must be above 0")
 
     @property
     def digest(self) -> str:
@@ -228,7 +230,7 @@ class RigDistribution:
         Raises InputError where the material's folder is missing or holds nothing of use.
         """
         stated = astuple(self)[:-1] if self.varied_share else astuple(self)[:-2]  # older caches stay valid
-        if self.varied_share and self.material:
+        if self.material:
             from bevcli.workshop.synth.material import material_files  # trimesh, which other rigs do not need
 
             files = material_files(self.material)
