@@ -84,10 +84,11 @@ def panoramas(package: Path, out: Path) -> None:
 
 
 def displayed(light: Array, brightness: float) -> Array:
-    """An image (HEIGHT, WIDTH, 3), 0 to 255, of linear RGB; numbers that are not finite are the sun."""
-    is_light = (np.isfinite(light) & (light >= 0)).all(-1, keepdims=True)
-    light = np.where(is_light, light, 500).clip(0, 500)
-    x = light * brightness / np.median(light.mean(-1))
+    """An image (HEIGHT, WIDTH, 3), 0 to 255, of linear RGB; the sun, whose colours compression has lost, is white."""
+    x = light * brightness / np.nanmedian(light)
+    low, high = x.min(-1, keepdims=True), x.max(-1, keepdims=True)
+    has_colors = np.isfinite(high - low) & (low > -1) & ((high < 1) | (low > 0.01 * high))
+    x = np.where(has_colors, x, 500).clip(0, 500)
     x = x * (1 + x / 9) / (1 + 0.55 * x)
     srgb = x.clip(0, 1).astype(np.float32) ** (1 / 2.2) * 255
     around = np.pad(srgb, ((0, 0), (8, 8), (0, 0)), "wrap")
