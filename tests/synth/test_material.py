@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.density import Density, draw_density
 from bevcli.workshop.synth.drive import RenderedDrive
-from bevcli.workshop.synth.material import Material
+from bevcli.workshop.synth.material import MaterialFolder
 from bevcli.workshop.synth.mesh import PAINT, TriangleSoup, block
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 
@@ -94,7 +94,7 @@ def test_what_is_not_drawn_anew_stays_in_place(varied: RenderedDrive, assets: As
 def test_textures_repeat_and_keep_their_aspect(tmp_path: Path) -> None:
     write_textures(tmp_path)
     cv2.imwrite(str(tmp_path / "textures/facade-stripes.png"), np.full((4, 12, 3), 85, np.uint8))
-    textures = Material.read(str(tmp_path)).textures
+    textures = MaterialFolder.read(str(tmp_path)).textures
     facade = textures.of_kind["facade"][0]
 
     assert textures.aspects[facade] == 3
@@ -103,7 +103,7 @@ def test_textures_repeat_and_keep_their_aspect(tmp_path: Path) -> None:
 
 
 def test_paint_of_a_model_is_the_color_of_the_individual(folder: Path) -> None:
-    model = Material.read(str(folder)).models["car"][0]
+    model = MaterialFolder.read(str(folder)).models["car"][0]
     color, dye = np.array([0.8, 0.4, 0.2], np.float32), np.zeros(3, np.float32)
     soup = TriangleSoup.from_mesh(model.poses[0]).painted(color, dye, model.shaded)
 
@@ -112,7 +112,7 @@ def test_paint_of_a_model_is_the_color_of_the_individual(folder: Path) -> None:
 
 
 def test_models_replace_a_share_of_their_class(folder: Path, assets: Assets) -> None:
-    more = replace(assets, models=Material.read(str(folder)).models)
+    more = replace(assets, models=MaterialFolder.read(str(folder)).models)
     random, same = np.random.default_rng(1), np.random.default_rng(1)
 
     assert 0.55 < np.mean([more.draw("car", random).shaded for _ in range(300)]) < 0.75
@@ -125,7 +125,7 @@ def test_models_replace_a_share_of_their_class(folder: Path, assets: Assets) -> 
 
 def test_standing_people_are_standing_models(tmp_path: Path, assets: Assets) -> None:
     write_model(write_model(tmp_path, "pedestrian-a"), "pedestrian-b_standing")
-    more, random = replace(assets, models=Material.read(str(tmp_path)).models), np.random.default_rng(0)
+    more, random = replace(assets, models=MaterialFolder.read(str(tmp_path)).models), np.random.default_rng(0)
     drawn = {n: {more.draw("pedestrian", random, [n]).name for _ in range(50)} for n in ("man", "man_standing")}
 
     assert drawn == {"man": {"man", "a"}, "man_standing": {"man_standing", "b_standing"}}
@@ -176,16 +176,16 @@ def test_a_wrong_model_is_an_error(name: str, changes: dict[str, np.ndarray], me
     write_model(tmp_path, name, **changes)
 
     with pytest.raises(InputError, match=message):
-        Material.read(str(tmp_path))
+        MaterialFolder.read(str(tmp_path))
 
 
 def test_wrong_textures_and_images_are_errors(tmp_path: Path) -> None:
     write_textures(tmp_path)
     cv2.imwrite(str(tmp_path / "textures/roof-a.png"), np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match=r"roof-a\.png: expected KIND-NAME.png .*found 'roof'"):
-        Material.read(str(tmp_path))
+        MaterialFolder.read(str(tmp_path))
     (tmp_path / "textures/roof-a.png").unlink()
     write_sky(tmp_path)
     (tmp_path / "skies/pink.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"pink\.png: expected a whole image"):
-        Material.read(str(tmp_path))
+        MaterialFolder.read(str(tmp_path))

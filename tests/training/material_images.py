@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from bevcli.workshop.synth.material import TEXTURE_MEAN, TEXTURE_SIZE
+
 Array = NDArray[np.float32]
 
 HEIGHT, WIDTH = 512, 2048  # of a sky
@@ -19,8 +21,6 @@ BRIGHTNESS = {  # of the middle of each panorama, before its lights are compress
 WITHOUT_HORIZON = 430  # rows of a panorama that show hardly more than the sky
 COLLAGES = 16
 FACADES_AND_TREES = ((26, 17), (8, 70), (40, 10), (14, 36))  # of the collages, in turn
-TEXTURE_MEAN = 85
-TEXTURE_SIZE = 256
 FACADE_MEAN = 188  # sRGB of the grey that a facade's texture multiplies
 COLORFULNESS = 0.35  # of the textures that multiply a colour of the street
 TREES = """dirt/dirt-2/tree10_n.png dirt/dirt-2/tree13_n.png dirt/dirt-2/tree15_n.png road/brondehach/tree2_n.png

@@ -22,15 +22,7 @@ from bevcli.workshop.synth.mesh import Material, Mesh, linear
 Array = NDArray[np.float64]
 
 MOST_FACES = 11_500
-LONGEST_EDGES_M = (
-    0.07,
-    0.1,
-    0.14,
-    0.2,
-    0.3,
-    0.5,
-    0.8,
-)  # of faces with a varying texture; the first that needs few enough
+LONGEST_EDGES_M = 0.07, 0.1, 0.14, 0.2, 0.3, 0.5, 0.8  # of faces with a varying texture, tried in turn
 VARIES = 0.055  # standard deviation of sRGB within a face
 INSIDE = r"^(DRIVER|SEAT|STEER|CONSOLE|COCKPIT|ROLLBAR|CABIN|ANTENNA|GIRTHS|ROOFIN|BOTTOM)|INSID"
 GLASS = r"glass|^window|^WI(?!\w*LIGH|REAREND|PER|GRILL)"
@@ -104,12 +96,12 @@ def read_scene(path: Path, turn: Array) -> Soup:
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
-        material, uv, color = mesh.visual.material, mesh.visual.uv, np.ones(4)
+        material, uv = mesh.visual.material, mesh.visual.uv
         if hasattr(material, "baseColorFactor"):  # glTF; both kinds of colours are linear already
             image, factor = material.baseColorTexture, material.baseColorFactor
         else:
             image, factor = material.image, material.diffuse
-        color = color if factor is None else np.asarray(factor, float)[:4] / 255
+        color = np.ones(4) if factor is None else np.asarray(factor, float)[:4] / 255
         corners = trimesh.transform_points(mesh.vertices, transform)[mesh.faces] @ turn.T
         uv = np.zeros((len(corners), 3, 2)) if uv is None else uv[mesh.faces]
         part = Part(material.name or name, color, None if image is None else linear_image(image))

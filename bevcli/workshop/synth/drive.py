@@ -27,10 +27,10 @@ from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.density import Density, draw_density
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
-from bevcli.workshop.synth.material import Material
+from bevcli.workshop.synth.material import MaterialFolder
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
-from bevcli.workshop.synth.photo_looks import SCENERY_M, Coats, PhotoLooks
+from bevcli.workshop.synth.photo_looks import Coats, PhotoLooks
 from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.synth.scenery import Scenery
@@ -39,6 +39,7 @@ from bevcli.workshop.synth.traffic import ActorState
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
+SCENERY_M = 135.0  # scenery is drawn within this distance
 NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
 SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
 TEXELS_M = {500: (0.125, 0.16), 1000: (0.06, 0.08), np.inf: (0.04, 0.06)}  # largest width -> of ground and shadows
@@ -111,7 +112,7 @@ class RenderedDrive:
         if self._looks is not None:
             self.weather = self._looks.weather(self.weather)
             if drawn.material:
-                material, density = Material.read(drawn.material), draw_density(self._looks.stream("density"))
+                material, density = MaterialFolder.read(drawn.material), draw_density(self._looks.stream("density"))
                 self._assets = replace(self._assets, models=material.models)
                 self._photo = PhotoLooks.draw(self._looks, material, self.weather)
                 self.weather = self._photo.weather
@@ -218,7 +219,8 @@ class RenderedDrive:
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         coats: Coats | None = None
-        scenery = self._scenery.around(center, SCENERY_M if self._photo is None else self._photo.scenery_m)
+        reach_m = SCENERY_M if self._photo is None else min(SCENERY_M, self._photo.scenery_m)
+        scenery = self._scenery.around(center, reach_m)
         if self._looks is not None:
             texture = replace(texture, texels=self._looks.ground(texture.texels))
             scenery = self._looks.scenery(scenery)

@@ -26,7 +26,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive
-from bevcli.workshop.synth.material import Material
+from bevcli.workshop.synth.material import MaterialFolder
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 from bevcli.writing import write_whole
@@ -105,7 +105,7 @@ class RenderedDrives(FolderDrives):
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
             if rig.material:
-                Material.read(rig.material)  # a wrong file is an error before the training begins
+                MaterialFolder.read(rig.material)  # a wrong file is an error before the training begins
             self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
             sizes = [image_for_rig(drawn.rig, image).padded_size for drawn in self._rigs]
             counts = [len(drawn.rig.cameras) for drawn in self._rigs]

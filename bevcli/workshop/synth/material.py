@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.parsing.files import decode_image, read_bytes
 from bevcli.workshop.synth.catalog import COLORS, Variant
-from bevcli.workshop.synth.mesh import Material as Kind, Mesh
+from bevcli.workshop.synth.mesh import Material, Mesh
 
 TEXTURE_KINDS = ("wall", "facade", "asphalt", "pavement", "leaf")
 TEXTURE_MEAN = 85  # the value that leaves the brightness as it is
 TEXTURE_SIZE = 256
 FILES = ("models/*-*.npz", "skies/*.png", "textures/*-*.png")
 MOST_PIXELS, MOST_BYTES = 2**25, 2**28
-ALLOWED = (Kind.MATTE, Kind.PAINT, Kind.GLASS, Kind.GLOW, Kind.DYE)
+ALLOWED = (Material.MATTE, Material.PAINT, Material.GLASS, Material.GLOW, Material.DYE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Textures:
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
+class MaterialFolder:
     """What lies in a folder."""
 
     models: Mapping[str, tuple[Variant, ...]]  # by class
@@ -56,7 +56,7 @@ class Material:
 
     @staticmethod
     @lru_cache(maxsize=1)
-    def read(folder: str) -> "Material":
+    def read(folder: str) -> "MaterialFolder":
         """The material in a folder; it is read once in a process. Raises InputError."""
         files = material_files(folder)
         models: dict[str, tuple[Variant, ...]] = {}
@@ -64,7 +64,7 @@ class Material:
             model = _read_model(path)
             models[model.class_name] = (*models.get(model.class_name, ()), model)
         skies = tuple(_read_image(path) for path in files if path.parent.name == "skies")
-        return Material(models, skies, _read_textures([path for path in files if path.parent.name == "textures"]))
+        return MaterialFolder(models, skies, _read_textures([path for path in files if path.parent.name == "textures"]))
 
 
 def material_files(folder: str) -> list[Path]:

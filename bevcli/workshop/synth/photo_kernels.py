@@ -11,6 +11,7 @@ import numpy as np
 from bevcli.jit import njit
 from bevcli.workshop.synth.material import TEXTURE_MEAN, TEXTURE_SIZE
 from bevcli.workshop.synth.mesh import Material
+from bevcli.workshop.synth.shading_kernels import pixel_ray
 
 GROUND, GLASS, GLOW, LEAVES = (int(m) for m in (Material.GROUND, Material.GLASS, Material.GLOW, Material.LEAVES))
 TO_DISPLAY = 1 / 2.2  # exponent that turns a factor on the light into one on display values
@@ -40,10 +41,7 @@ def retouch_pixels(buffer, surfaces, view, haze_m, sky, textures, coats, ground,
         for u in range(width):
             if not needed[v, u]:
                 continue
-            rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
-            ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
-            rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]
-            length = np.sqrt(rx * rx + ry * ry + rz * rz)
+            rx, ry, rz, length = pixel_ray(ray_from_image, u, v)
             t = triangles[v, u]
             if t < 0 and rz >= -1e-4 * length:
                 if has_sky:

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth.looks import Looks, Weather
-from bevcli.workshop.synth.material import Material, Textures
-from bevcli.workshop.synth.mesh import Material as Kind, TriangleSoup, linear
+from bevcli.workshop.synth.material import MaterialFolder, Textures
+from bevcli.workshop.synth.mesh import Material, TriangleSoup, linear
 from bevcli.workshop.synth.photo_kernels import retouch_pixels
 from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT
 
-SCENERY_M = 135.0  # scenery is drawn within this distance
 NO_SKY = np.zeros((0, 0, 3), np.uint8)
 SKY_SHARE, NEAR_SHARE, TEXTURED_SHARE, CONTACT_SHARE, GLOSS_SHARE = 0.7, 0.5, 0.85, 0.85, 0.8  # of the drives
 CONTACT_M, CONTACT_CELL_M = 144, 0.1  # side of the square with shadows under objects, size of its cells
@@ -42,7 +41,7 @@ class PhotoLooks:
     looks: Looks
     textures: Textures
     weather: Weather  # with the colours of the sky
-    scenery_m: float  # the scenery is drawn within this distance; a near one lets the sky's horizon be seen
+    scenery_m: float  # the scenery ends here at the latest; a near end lets the sky's horizon be seen
     sky: NDArray[np.uint8]  # (H, W, 3) RGB; empty for none
     sky_light: NDArray[np.float64]  # (256, 3) light of its values
     turn: float  # of the sky about the vertical, radians
@@ -56,7 +55,7 @@ class PhotoLooks:
     contact: float  # strength of the shadows under objects
 
     @staticmethod
-    def draw(looks: Looks, material: Material, weather: Weather) -> "PhotoLooks":
+    def draw(looks: Looks, material: MaterialFolder, weather: Weather) -> "PhotoLooks":
         """The photographs of the drive with these looks."""
         rng, textures = looks.stream("photo"), material.textures
         has_sky = len(material.skies) > 0 and rng.random() < SKY_SHARE
@@ -75,7 +74,7 @@ class PhotoLooks:
         contact = float(rng.uniform(0.4, 0.7)) * (rng.random() < CONTACT_SHARE)
         gloss = float(rng.uniform(0.1, 0.75)) * (rng.random() < GLOSS_SHARE)
         return PhotoLooks(
-            looks, textures, weather, reach if near and has_sky else SCENERY_M, sky, sky_light,
+            looks, textures, weather, reach if near and has_sky else np.inf, sky, sky_light,
             float(rng.uniform(0, 2 * np.pi)), bool(rng.random() < 0.5), gloss,
             float(rng.uniform(0.1, 0.5)) if textured and rng.random() < 0.6 else 1.0,
             float(rng.uniform(0, 0.8)) * textured, float(rng.uniform(0.3, 1.0)) * textured,
@@ -95,10 +94,10 @@ class PhotoLooks:
                 rng.uniform(1, 2),
             )
             (facade, aspect), height = self.textures.pick("facade", rng), rng.uniform(7, 16)
-            walls = np.flatnonzero(material[start:end] == Kind.FACADE) + start
+            walls = np.flatnonzero(material[start:end] == Material.FACADE) + start
             if len(walls) and facade >= 0 and rng.random() < self.facades:
                 row[:6] = facade, height * aspect, height, 1.0, row[4], 0.0
-                material[walls] = Kind.MATTE
+                material[walls] = Material.MATTE
                 albedo[walls] = FACADE_GREY * rng.uniform(0.6, 1.4) * rng.uniform(0.9, 1.1, 3)
         counts = soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0]
         coats = Coats(np.repeat(np.arange(len(counts), dtype=np.int32), counts), rows)

@@ -207,7 +207,7 @@ class RigDistribution:
     coarsest: float = 0.6  # by a factor from this to 1
     jpeg_quality: tuple[int, int] = (60, 95)
     varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
-    material: str = ""  # folder of models and photographs for these drives (`Material`); "" for none
+    material: str = ""  # folder of models and photographs for these drives (`MaterialFolder`); "" for none
 
     def __post_init__(self) -> None:
         for name in ("cameras", "fov_deg", "height_m", "radius_m", "bev_height_m", "jpeg_quality"):
@@ -247,7 +247,7 @@ class DrawnRig:
     supersampling: int = 1  # samples per pixel along each axis
     jpeg_quality: int = 90  # 1 to 100
     varied: bool = False  # whether the looks of the drive are varied
-    material: str = ""  # folder of what they are varied with (`Material`); "" for none
+    material: str = ""  # folder of what they are varied with (`MaterialFolder`); "" for none
 
 
 def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) -> DrawnRig:

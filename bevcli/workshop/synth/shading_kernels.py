@@ -47,10 +47,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
         for u in range(width):
             if not needed[v, u]:
                 continue
-            rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
-            ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
-            rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]
-            length = np.sqrt(rx * rx + ry * ry + rz * rz)
+            rx, ry, rz, length = pixel_ray(ray_from_image, u, v)
             t = triangles[v, u]
             kind = GROUND
             nx, ny, nz = 0.0, 0.0, 1.0
@@ -105,6 +102,15 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
             for c in range(3):
                 a[c] += (haze[c] - a[c]) * veil
             _put(image, v, u, a, table, table_scale)
+
+
+@njit(nogil=True, inline="always")
+def pixel_ray(ray_from_image, u, v):
+    """The world ray of a pixel, with depth 1: x, y, z and length."""
+    rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
+    ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
+    rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]
+    return rx, ry, rz, np.sqrt(rx * rx + ry * ry + rz * rz)
 
 
 @njit(nogil=True, inline="always")
