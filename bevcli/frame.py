@@ -222,7 +222,7 @@ class DriveFacts:
     motion_measured: bool = False
 
 
-class Sequence(Protocol):
+class Drive(Protocol):
     """A drive: frames in order. A reader inherits it for the attributes that have a default.
 
     Attributes:
@@ -258,15 +258,15 @@ class Sequence(Protocol):
         """Number of ground-truth boxes of the drive by class, where they are in one table; else empty."""
         return {}
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        """The image files and videos of the frame at a place; none where its images are in `input_files`."""
+    def image_files(self, index: int) -> tuple[Path, ...]:
+        """The image files and videos of the frame at an index; none where its images are in `input_files`."""
         return ()
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        """The frame at a place for scoring: it needs no images. By default it has them, as from `load`."""
-        return self.load(place)
+    def ground_truth_frame(self, index: int) -> Frame:
+        """The frame at an index for scoring: it needs no images. By default it has them, as from `load`."""
+        return self.load(index)
 
-    def load(self, place: int) -> Frame:
+    def load(self, index: int) -> Frame:
         """The frame at a place (0 to len(stamps) - 1), with decoded images. Called in order, from one thread.
 
         An image that cannot be read is listed in `Frame.dropped`; other mistakes raise InputError.
@@ -274,10 +274,13 @@ class Sequence(Protocol):
         ...
 
 
-class DerivedSequence(Sequence):
+Sequence = Drive  # the name that version 0.2 had for it
+
+
+class DerivedDrive(Drive):
     """A sequence made from another one, with all that the other states. A subclass changes some of it."""
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: Drive) -> None:
         self.sequence = sequence
         self.name, self.rig, self.stamps = valid_text(sequence.name), sequence.rig, sequence.stamps
         self.has_ego_motion, self.notes, self.facts = sequence.has_ego_motion, sequence.notes, sequence.facts
@@ -291,11 +294,11 @@ class DerivedSequence(Sequence):
     def class_counts(self) -> Mapping[str, int]:
         return self.sequence.class_counts
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self.sequence.image_files(place)
+    def image_files(self, index: int) -> tuple[Path, ...]:
+        return self.sequence.image_files(index)
 
-    def load(self, place: int) -> Frame:
-        return self.sequence.load(place)
+    def load(self, index: int) -> Frame:
+        return self.sequence.load(index)
 
 
 @dataclass(frozen=True)

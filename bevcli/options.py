@@ -4,7 +4,7 @@ Python takes the dataclass or keywords, the command line makes its flags from th
 from them too. The help text is also what the class's docstring says of the attribute: it stands nowhere else.
 
     @options("Input")
-    class SequenceOptions:
+    class InputOptions:
         \"""Options of every input format.\"""
 
         rate_hz: float | None = option(default=None, help="Thin to this many frames per second.", flag="--rate")

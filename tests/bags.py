@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose
@@ -123,7 +123,7 @@ def camera_info(camera: Camera, time_ns: int, frame: str) -> dict[str, Any]:
 
 
 def drive_messages(
-    sequence: Sequence, ego_motion: EgoMotion | None, *, poses_in: str = "odometry", delay_ns: int = 0
+    sequence: Drive, ego_motion: EgoMotion | None, *, poses_in: str = "odometry", delay_ns: int = 0
 ) -> Iterator[Message]:
     """A drive as ROS messages: images, calibration, static transforms, and poses as "odometry" or "tf".
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
@@ -25,7 +25,7 @@ def make_rig(yaws_deg: dict[str, float] | None = None) -> CameraRig:
     return CameraRig(tuple(make_camera(name, yaw) for name, yaw in yaws_deg.items()), default_ego_from_bev())
 
 
-class MemorySequence(Sequence):
+class MemoryDrive(Drive):
     """A drive of noise images on a gentle curve, in memory."""
 
     name = "memory"
@@ -35,10 +35,10 @@ class MemorySequence(Sequence):
         self.rig = make_rig() if rig is None else rig
         self.stamps = tuple(FrameStamp(i, scenes[i], 10**18 + int(i * step_s * 1e9)) for i in range(count))
 
-    def load(self, place: int) -> Frame:
-        stamp = self.stamps[place]
-        pose = self.pose(place)
-        random = np.random.default_rng(place)
+    def load(self, index: int) -> Frame:
+        stamp = self.stamps[index]
+        pose = self.pose(index)
+        random = np.random.default_rng(index)
         images = {
             camera.name: CameraImage(
                 stamp.timestamp_ns, random.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
@@ -54,21 +54,21 @@ class MemorySequence(Sequence):
             kinematics=Kinematics(np.array([0.1, 0.0, GRAVITY]), np.array([0, 0, 0.1]), np.array([6.0, 0, 0])),
         )
 
-    def pose(self, place: int) -> Pose:
-        yaw = 0.05 * place
-        return Pose(np.array([3.0 * place, 0.1 * place, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+    def pose(self, index: int) -> Pose:
+        yaw = 0.05 * index
+        return Pose(np.array([3.0 * index, 0.1 * index, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
 
-class WithoutImages(MemorySequence):
+class WithoutImages(MemoryDrive):
     """The same drive, with some images missing: place -> cameras, or "all"."""
 
     def __init__(self, missing, **options):
         super().__init__(**options)
         self.missing = missing
 
-    def load(self, place: int) -> Frame:
-        frame = super().load(place)
-        gone = self.missing.get(place, ())
+    def load(self, index: int) -> Frame:
+        frame = super().load(index)
+        gone = self.missing.get(index, ())
         names = frame.rig.names if gone == "all" else gone
         kept = {name: image for name, image in frame.images.items() if name not in names}
         return replace(frame, images=kept, dropped=dict.fromkeys(names, "missing"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.config import load_config
 from bevcli.errors import OutputError
@@ -75,7 +75,7 @@ def with_truth(frame: Frame) -> Frame:
 
 def record(
     path: Path,
-    sequence: MemorySequence,
+    sequence: MemoryDrive,
     options: RecordingOptions | None = None,
     *,
     untrained: bool = False,

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 from recorded_drive import with_truth
 
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
@@ -20,7 +20,7 @@ RIG = CameraRig(
 )
 
 
-class SmallDrive(MemorySequence):
+class SmallDrive(MemoryDrive):
     """Noise images of 80 x 45 pixels, which differ from drive to drive."""
 
     def __init__(self, seed: int, frames: int):

@@ -41,11 +41,11 @@ def boxes(*names: str, scores: float | None = None) -> Boxes3D:
 
 
 def frames(names: tuple[str, ...], score: float | None = None) -> list[dict]:
-    def one(place: int, name: str) -> dict:
-        box = {"class": name, "center": [10.0 + 8 * place, 0.0, 1.0], "size_lwh": [4.0, 2.0, 1.5], "yaw": 0.0}
+    def one(index: int, name: str) -> dict:
+        box = {"class": name, "center": [10.0 + 8 * index, 0.0, 1.0], "size_lwh": [4.0, 2.0, 1.5], "yaw": 0.0}
         return box | ({} if score is None else {"score": score})
 
-    return [{"frame": 0, "timestamp_ns": 0, "boxes": [one(place, name) for place, name in enumerate(names)]}]
+    return [{"frame": 0, "timestamp_ns": 0, "boxes": [one(index, name) for index, name in enumerate(names)]}]
 
 
 def write(path: Path, names: tuple[str, ...], score: float | None = None, **head) -> Path:

@@ -21,7 +21,7 @@ from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.rig import CheckOptions
 from bevcli.sequences.format import option_classes
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.writing import output_errors, write_whole
 
@@ -71,7 +71,7 @@ def viz(
     ],
     options: ViewOptions,
     recording: Annotated[RecordingOptions, Part(only=("score",))],
-    source: SequenceOptions,
+    source: InputOptions,
     format_options: FormatValues,
 ) -> None:
     """Show a recording, or a drive with labels and boxes of any model; or write an image, a video or a summary.
@@ -89,7 +89,7 @@ def viz(
     if not is_recording(shown):
         _record_drive(shown, options, recording, source, format_options)
         return
-    kinds = (ViewOptions, RecordingOptions, SequenceOptions, *option_classes())
+    kinds = (ViewOptions, RecordingOptions, InputOptions, *option_classes())
     usual = {name: value for kind in kinds for name, value in defaults(kind).items()}
     for_drives = {
         "boxes": options.boxes,
@@ -117,7 +117,7 @@ def show(recording: Path, options: ViewOptions, name: Path | None = None) -> Non
 
 
 def _record_drive(
-    path: Path, options: ViewOptions, recording: RecordingOptions, source: SequenceOptions, format_options: FormatValues
+    path: Path, options: ViewOptions, recording: RecordingOptions, source: InputOptions, format_options: FormatValues
 ) -> None:
     """Record a drive and boxes, and show the recording."""
     from bevcli.cli.progress import Progress, odometry_bar
@@ -197,7 +197,7 @@ def project_debug(
     input: Annotated[
         Path, argument("A drive, such as a sequence folder, a ROS bag or a video, or a calibration alone.")
     ],
-    source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
+    source: Annotated[InputOptions, Part(only=("allow_outside",))],
     format_options: Annotated[
         FormatValues,
         Part(
@@ -274,7 +274,7 @@ def evaluate(
     ground_truth: Annotated[
         Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
-    source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
+    source: Annotated[InputOptions, Part(only=("scene", "class_map"))],
     format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     options: EvaluationOptions,
     results: Annotated[FormatValues, Part(classes=score_options)],

@@ -13,10 +13,10 @@ from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 if TYPE_CHECKING:
-    from bevcli.frame import Frame, Prediction, Sequence
+    from bevcli.frame import Drive, Frame, Prediction
     from bevcli.inference.load import Model
 
 PANEL = "Run"
@@ -28,7 +28,7 @@ def run(
     model: ModelOptions,
     run_options: RunOptions,
     recording: RecordingOptions,
-    source: SequenceOptions,
+    source: InputOptions,
     first: Annotated[Steps, ExtensionsOf("run")],
     last: Annotated[Steps, ExtensionsOf("run-done")],
     output: OutputOptions,
@@ -106,7 +106,7 @@ def run(
     say(f"next     bevcli viz {shlex.quote(str(out))}")
 
 
-def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:
+def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[str]:
     """Notes on a model and a drive before the run starts. live: whether a viewer follows the run."""
     notes = list(drive.notes)
     if model.untrained:

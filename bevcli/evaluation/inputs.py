@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.detection import DetectionScores
 from bevcli.evaluation.submission import is_submission, read_submission
-from bevcli.frame import Frame, FrameStamp, Sequence as Drive
+from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
@@ -22,7 +22,7 @@ from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def open_ground_truth(
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
     if path.is_dir() and any(kind.annotated and kind.recognises(path) for kind in formats()):
-        return _open_drive(path, SequenceOptions(class_map or {}, scene=scene, classes=tuple(classes)))
+        return _open_drive(path, InputOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, class_map, classes)
     if scene is not None:
@@ -119,7 +119,7 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
     return ScoredInput(BoxesFile("world", tuple(frames)), root, None, drive, racks, impossible)
 
 
-def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
+def _open_drive(path: Path, options: InputOptions) -> ScoredInput:
     drive = open_sequence(path, options)
     frames, impossible = [], 0
     for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):

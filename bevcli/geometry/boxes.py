@@ -132,11 +132,11 @@ class Boxes3D:
         listed = ", ".join(f"{count} {names[i]}" for i, count in sorted(enumerate(counts), key=lambda each: -each[1]))
         return f"Boxes3D({len(self)} boxes{': ' if listed else ''}{listed})"
 
-    def _box(self, place: int) -> Box3D:
+    def _box(self, index: int) -> Box3D:
         found = {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
-        row = {key: values[place].item() for key, values in found.items() if values is not None}
-        center, size, yaw, velocity = (c[place] for c in (self.centers, self.sizes_lwh, self.yaws, self.velocities))
-        return Box3D(str(self.classes[place]), row.pop("score", None), center, size, float(yaw), velocity, row)
+        row = {key: values[index].item() for key, values in found.items() if values is not None}
+        center, size, yaw, velocity = (c[index] for c in (self.centers, self.sizes_lwh, self.yaws, self.velocities))
+        return Box3D(str(self.classes[index]), row.pop("score", None), center, size, float(yaw), velocity, row)
 
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""

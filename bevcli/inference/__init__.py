@@ -1,1 +1,1 @@
-"""From a Sequence to Predictions."""
+"""From a drive to Predictions."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, config_of_table, known_models, read_model_file, settings_of_table
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
-from bevcli.frame import ColorOrder, Frame, FrameStamp, Prediction, Sequence, check_color_order
+from bevcli.frame import ColorOrder, Drive, Frame, FrameStamp, Prediction, check_color_order
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.frames_from_memory import checked_images
@@ -180,7 +180,7 @@ class Model:
     def in_engine(
         self,
         rig: CameraRig,
-        drive: Sequence | None = None,
+        drive: Drive | None = None,
         *,
         parts: str = "",
         report: Callable[[str], None] = lambda note: None,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import ColorOrder, DriveFacts, Frame, FrameStamp, Prediction, Sequence, check_color_order
+from bevcli.frame import ColorOrder, Drive, DriveFacts, Frame, FrameStamp, Prediction, check_color_order
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
@@ -25,7 +25,7 @@ from bevcli.registry import load
 
 def run(
     model: Model,
-    sequence: Sequence,
+    sequence: Drive,
     *,
     temporal: bool = True,
     track: bool = True,

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, Frame, FrameResult, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.frame import BevMap, Drive, Frame, FrameResult, FrameStamp, NewStart, Prediction, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
@@ -89,7 +89,7 @@ class BegunStep:
 
     prepared: PreparedFrame
     marks: list[tuple[str, Any]]
-    upcoming: Items[PreparedFrame]
+    upcoming: Sequence[PreparedFrame]
     start: RunnerState[Any]
     started_anew: NewStart | None
     after: RunnerState[Any]
@@ -129,7 +129,7 @@ class Runner:
         return Preprocessor(self.config, cameras, pixels=self.options.takes_pixels)
 
     def step(
-        self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
+        self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[RunnerState[Any], Prediction]:
         """The state and the prediction after one frame.
 
@@ -146,7 +146,9 @@ class Runner:
         state = state or RunnerState()
         return self.finish(self.begin(state, prepared, upcoming), state.tracks)
 
-    def begin(self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()) -> BegunStep:
+    def begin(
+        self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
+    ) -> BegunStep:
         """Launches a step, of which a GPU computes most afterwards. Arguments: see `step`; tracks are not used."""
         frame = prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
@@ -203,7 +205,7 @@ class Runner:
         return {"boxes": boxes, "results": shown, "segmentation": segmentation}
 
     def frames(
-        self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor
+        self, sequence: Drive, indices: Sequence[int], preprocessor: Preprocessor
     ) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
         """Yields `prepared` and `upcoming` of `step` for these frames of a sequence, read and prepared in advance.
 
@@ -223,7 +225,7 @@ class Runner:
             waiting.extend(islice(source, 1))
 
     def run(
-        self, sequence: Sequence, indices: Items[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
+        self, sequence: Drive, indices: Sequence[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
     ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
         """Yields frame, prediction and state after each of these frames of a sequence.
 
@@ -275,7 +277,7 @@ class Runner:
         seconds = (stamp.timestamp_ns - before.timestamp_ns) / 1e9
         return None if 0 < seconds <= self.config.max_gap_s else NewStart(StartReason.GAP, seconds)
 
-    def _usable(self, prepared: PreparedFrame, upcoming: Items[PreparedFrame]) -> list[PreparedFrame]:
+    def _usable(self, prepared: PreparedFrame, upcoming: Sequence[PreparedFrame]) -> list[PreparedFrame]:
         """The upcoming frames with images that continue the frame's scene without a gap."""
         usable: list[PreparedFrame] = []
         stamp = prepared.frame.stamp

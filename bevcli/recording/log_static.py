@@ -139,7 +139,7 @@ class RecordedBoxes:
 
 
 class RecordedDrive(Protocol):
-    """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
+    """The facts about a drive that go into a recording: those of a `Drive`, or of a `Session`."""
 
     name: str
     rig: CameraRig

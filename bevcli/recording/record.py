@@ -9,7 +9,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 from bevcli.evaluation.matching import ranges_m
-from bevcli.frame import Frame, Sequence as Drive
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.printing import counted

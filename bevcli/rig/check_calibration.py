@@ -23,10 +23,10 @@ from bevcli.rig.sequence_checks import check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FORMAT as NATIVE
-from bevcli.sequences.native.folder import FolderSequence, read_frames_table
+from bevcli.sequences.native.folder import FolderDrive, read_frames_table
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import RigOptions, SequenceOptions
+from bevcli.sequences.options import InputOptions, RigOptions
 from bevcli.writing import write_whole
 
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
@@ -166,14 +166,14 @@ def _read_folder(
     findings: list[Finding] = []
     outside = bool(given.get("allow_outside"))
     own = FolderOptions(**{name: given[name] for name in NAMES & given.keys()})
-    options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
+    options = InputOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
-        sequence = FolderSequence(folder, options, own, rig)
+        sequence = FolderDrive(folder, options, own, rig)
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderSequence(folder, replace(options, ego_motion="static"), own, rig)
+            sequence = FolderDrive(folder, replace(options, ego_motion="static"), own, rig)
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:

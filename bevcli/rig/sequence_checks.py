@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from bevcli.findings import Finding, errors_of, rig_error
-from bevcli.frame import DerivedSequence, FrameStamp, Sequence as Drive
+from bevcli.frame import DerivedDrive, Drive, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
@@ -32,7 +32,7 @@ JUMP_FACTOR = 5.0  # a step this much faster than the median is a jump
 CHECKED_POSES = 5000  # before a run: of a longer drive, every second, third, … pose is checked
 
 
-class CheckedDrive(DerivedSequence):
+class CheckedDrive(DerivedDrive):
     """A drive that was checked once: the errors of `check_calibration` that need no images and no BEV grid.
 
     source: the drive's path, for the command that each line names.

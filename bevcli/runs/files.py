@@ -12,7 +12,7 @@ import numpy as np
 from bevcli.config import as_table
 from bevcli.errors import OutputError
 from bevcli.evaluation.box_format import CsvWriter
-from bevcli.frame import Frame, FrameResult, Prediction, Sequence, result_of
+from bevcli.frame import Drive, Frame, FrameResult, Prediction, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
@@ -58,7 +58,7 @@ class RunFiles:
     def __init__(
         self,
         folder: RunFolder,
-        sequence: Sequence,
+        sequence: Drive,
         model: Model,
         options: RunOptions,
         live: LiveSink | None = None,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
-from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.frame import Drive, Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.inference.pipeline import WriteBehind
 from bevcli.inference.runner import RunnerState, read_commands
@@ -25,7 +25,7 @@ Step = tuple[Frame, Prediction, RunnerState[Any]]
 
 def run_into_folder(
     model: Model,
-    sequence: Sequence,
+    sequence: Drive,
     out: Path,
     options: RunOptions | None = None,
     *,

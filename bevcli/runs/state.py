@@ -22,7 +22,7 @@ from torch import Tensor
 from bevcli._version import __version__
 from bevcli.checkpoints import read_safetensors
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.frame import Drive, Frame, Prediction
 from bevcli.inference.load import Model, hash_of
 from bevcli.inference.runner import Memory, RunnerState
 from bevcli.model.upload import tensors_in
@@ -68,7 +68,7 @@ class RunState(Generic[Memory]):
     runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
 
-def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, str]:
+def run_facts(model: Model, sequence: Drive, options: object) -> dict[str, str]:
     """Name -> hash or value of all that the results of a run depend on.
 
     options: the dataclass of the run's options; each of its fields is a fact.
@@ -171,7 +171,7 @@ def _file_facts(path: Path) -> tuple[str, int, str]:
         return path.name, -1, str(error)
 
 
-def _image_facts(sequence: Sequence) -> str:
+def _image_facts(sequence: Drive) -> str:
     """Number, and hash of names, sizes and times of change, of the image files and videos of all frames."""
     paths = dict.fromkeys(path for index in range(len(sequence.stamps)) for path in sequence.image_files(index))
     facts_hash = hashlib.sha256()

@@ -14,10 +14,10 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.options import defaults
 from bevcli.parsing.files import is_there
 from bevcli.registry import entries, load
-from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.sequences.options import FormatOptions, InputOptions
 
 if TYPE_CHECKING:
-    from bevcli.frame import Frame, FrameResult, Sequence
+    from bevcli.frame import Drive, Frame, FrameResult
 
 TrueResult = Callable[["Frame"], "FrameResult | None"]  # of a frame with its pose, in its bev frame
 GROUP: Final = "bevcli.sequences"
@@ -47,14 +47,14 @@ class Format:
     name: str
     expected: str
     recognises: Callable[[Path], bool]
-    opener: str | Callable[[Path, SequenceOptions, Any], Sequence]
+    opener: str | Callable[[Path, InputOptions, Any], Drive]
     options: type[FormatOptions] = FormatOptions
     annotated: bool = False
     has_poses: bool = True
     precedence: int = 0
 
-    def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
-        """A path of this format as a Sequence. Raises InputError."""
+    def open(self, path: Path, common: InputOptions, own: FormatOptions) -> Drive:
+        """A path of this format as a drive. Raises InputError."""
         opener = resolve_name(self.opener) if isinstance(self.opener, str) else self.opener
         return opener(path, common, own)
 

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, result_within
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, decode_image, media_type_of, read_bytes, size_of_image
 from bevcli.sequences.files.boxes_file import count_classes
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 if TYPE_CHECKING:
     from bevcli.sequences.videos import VideoReader
@@ -218,7 +218,7 @@ def bev_frame_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[s
     return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
 
 
-class ListedSequence(Sequence):
+class ListedDrive(Drive):
     """A drive whose frames are listed, and whose images are read when a frame is loaded.
 
     Args:
@@ -229,13 +229,13 @@ class ListedSequence(Sequence):
         motion: the vehicle's poses; None if they are not known.
         truth: the boxes of frames in the world frame, by their places in the drive.
         notes: for the user.
-        input_files: see `Sequence`.
+        input_files: see `Drive`.
     """
 
     def __init__(
         self,
         path: Path,
-        common: SequenceOptions,
+        common: InputOptions,
         rigs: CameraRig | tuple[CameraRig, ...],
         entries: tuple[FrameEntry, ...],
         motion: EgoMotion | None,
@@ -258,24 +258,24 @@ class ListedSequence(Sequence):
     def class_counts(self) -> Mapping[str, int]:
         return count_classes(self._truth.values())
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        sources = self._entries[place].sources.values()
+    def image_files(self, index: int) -> tuple[Path, ...]:
+        sources = self._entries[index].sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
-        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
+    def ground_truth_frame(self, index: int) -> Frame:
+        entry = self._entries[index]  # its reasons for missing images are left out: `strict` refuses them
+        return self._frame(index, FrameEntry(entry.stamp, {}, {}, entry.origin))
 
-    def load(self, place: int) -> Frame:
-        return self._frame(place, self._entries[place])
+    def load(self, index: int) -> Frame:
+        return self._frame(index, self._entries[index])
 
-    def _frame(self, place: int, entry: FrameEntry) -> Frame:
+    def _frame(self, index: int, entry: FrameEntry) -> Frame:
         """The frame at a place, of its entry or of one without images.
 
         Without ego-motion, poses are the identity, and the vehicle is at rest.
         Raises InputError as `ImageReader.read`, and for a time that the ego-motion does not cover.
         """
-        rig, motion, frame_ns = self._rigs[place], self.ego_motion, entry.stamp.timestamp_ns
+        rig, motion, frame_ns = self._rigs[index], self.ego_motion, entry.stamp.timestamp_ns
         images, dropped = self._images.read(entry.sources, rig, entry.dropped)
         times = dict.fromkeys(rig.names, frame_ns)
         times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
@@ -290,5 +290,5 @@ class ListedSequence(Sequence):
             world_from_ego_at=dict(zip(times, poses[1:], strict=True)),
             kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
             dropped=dropped,
-            ground_truth=self._truth.get(place),
+            ground_truth=self._truth.get(index),
         )

@@ -1,7 +1,7 @@
-"""`open_sequence`: opens an input of any format as a Sequence, and selects a scene, a range of frames, a frame rate."""
+"""`open_sequence`: opens an input of any format as a drive, and selects a scene, a range of frames, a frame rate."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence as Indices
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
 from bevcli.registry import load
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
@@ -24,7 +24,7 @@ SHORTEST_PERIODS_NS = 3_000_000, 5_000_000  # between frames: a shorter one has 
 LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
-def open_sequence(path: str | Path, options: SequenceOptions | None = None, **changes: Any) -> Sequence:
+def open_sequence(path: str | Path, options: InputOptions | None = None, **changes: Any) -> Drive:
     """Open a drive.
 
     It is a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file, a ROS 2 bag, or a drive of
@@ -44,14 +44,14 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     Args:
         path: the folder or file.
         options: the options of every format; None for the defaults.
-        changes: options as keywords, those of `SequenceOptions` and those of the path's format: `RigOptions`,
+        changes: options as keywords, those of `InputOptions` and those of the path's format: `RigOptions`,
             `NuScenesOptions`, `BagOptions`, `Argoverse2Options` and so on, or the options of an installed format.
 
     Raises InputError if the path has no known format, a file is missing or invalid, the format does not have an option,
     or no frame is left; TypeError for an option that no format has.
     """
-    path, common = Path(path), defaults(SequenceOptions)
-    options = gather(SequenceOptions, options, {name: changes.pop(name) for name in common if name in changes})
+    path, common = Path(path), defaults(InputOptions)
+    options = gather(InputOptions, options, {name: changes.pop(name) for name in common if name in changes})
     if options.scene is not None and (drive := _drive_of(path, options.scene)):
         path, options = drive, replace(options, scene=None)
     if options.odometry:
@@ -80,7 +80,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         sequence = select_range(sequence, options.frames)
     if not options.odometry:
         return sequence
-    measured: Sequence = load("bevcli.motion", "drive")(sequence, whole, options.after_step)
+    measured: Drive = load("bevcli.motion", "drive")(sequence, whole, options.after_step)
     return measured
 
 
@@ -89,36 +89,36 @@ def _drive_of(root: Path, name: str) -> Path | None:
     return None if not root.is_dir() or is_drive(root) else drives_in(root).get(name)
 
 
-class Selection(DerivedSequence):
+class Selection(DerivedDrive):
     """The frames of another sequence at some of its indices."""
 
-    def __init__(self, sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> None:
+    def __init__(self, sequence: Drive, indices: Sequence[int], notes: tuple[str, ...] = ()) -> None:
         super().__init__(sequence)
         self._indices = tuple(indices)
         self.stamps = tuple(sequence.stamps[index] for index in self._indices)
         self.notes = (*sequence.notes, *notes)
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self.sequence.image_files(self._indices[place])
+    def image_files(self, index: int) -> tuple[Path, ...]:
+        return self.sequence.image_files(self._indices[index])
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self.sequence.ground_truth_frame(self._indices[place])
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self.sequence.ground_truth_frame(self._indices[index])
 
-    def load(self, place: int) -> Frame:
-        return self.sequence.load(self._indices[place])
+    def load(self, index: int) -> Frame:
+        return self.sequence.load(self._indices[index])
 
 
-class WithoutGroundTruth(DerivedSequence):
+class WithoutGroundTruth(DerivedDrive):
     """A sequence without its ground truth."""
 
-    def load(self, place: int) -> Frame:
-        return replace(super().load(place), ground_truth=None, ground_truth_map=None, ground_truth_results=())
+    def load(self, index: int) -> Frame:
+        return replace(super().load(index), ground_truth=None, ground_truth_map=None, ground_truth_results=())
 
 
-class WithClassNames(DerivedSequence):
+class WithClassNames(DerivedDrive):
     """A sequence whose ground truth has the names of known classes, without impossible boxes; a note names others."""
 
-    def __init__(self, sequence: Sequence, names: ClassNames) -> None:
+    def __init__(self, sequence: Drive, names: ClassNames) -> None:
         super().__init__(sequence)
         self._names = names
         self.notes = (*sequence.notes, *names.note(sequence.class_counts, f"{sequence.name}: the ground truth"))
@@ -130,11 +130,11 @@ class WithClassNames(DerivedSequence):
             counts[self._names[name]] += count
         return counts
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._renamed(self.sequence.ground_truth_frame(place))
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._renamed(self.sequence.ground_truth_frame(index))
 
-    def load(self, place: int) -> Frame:
-        return self._renamed(self.sequence.load(place))
+    def load(self, index: int) -> Frame:
+        return self._renamed(self.sequence.load(index))
 
     def _renamed(self, frame: Frame) -> Frame:
         truth = frame.ground_truth
@@ -144,7 +144,7 @@ class WithClassNames(DerivedSequence):
         return replace(frame, ground_truth=self._names.renamed(kept), impossible_boxes=len(truth) - len(kept))
 
 
-def check_time_unit(sequence: Sequence, source: object) -> None:
+def check_time_unit(sequence: Drive, source: object) -> None:
     """Raise InputError where frames follow each other so fast that their times are no nanoseconds."""
     pairs = pairwise(sequence.stamps)
     periods = [after.timestamp_ns - before.timestamp_ns for before, after in pairs if before.scene == after.scene]
@@ -159,7 +159,7 @@ def check_time_unit(sequence: Sequence, source: object) -> None:
         )
 
 
-def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:
+def select(sequence: Drive, indices: Sequence[int], notes: tuple[str, ...] = ()) -> Drive:
     """The frames of a sequence at `indices`. If these are all and `notes` is empty, the sequence itself.
 
     indices: positions in the sequence, from 0. notes: added to the sequence's own.
@@ -169,7 +169,7 @@ def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = (
     return Selection(sequence, indices, notes)
 
 
-def select_scene(sequence: Sequence, scene: str) -> Sequence:
+def select_scene(sequence: Drive, scene: str) -> Drive:
     """The frames of one scene. Raises InputError if the sequence does not have it."""
     indices = [index for index, stamp in enumerate(sequence.stamps) if stamp.scene == scene]
     if not indices:
@@ -179,7 +179,7 @@ def select_scene(sequence: Sequence, scene: str) -> Sequence:
     return select(sequence, indices)
 
 
-def select_range(sequence: Sequence, frames: slice) -> Sequence:
+def select_range(sequence: Drive, frames: slice) -> Drive:
     """The frames in a range of positions, as Python slices a list. Raises InputError if there are none."""
     indices = range(len(sequence.stamps))[frames]
     if not indices:
@@ -189,12 +189,12 @@ def select_range(sequence: Sequence, frames: slice) -> Sequence:
     return select(sequence, indices)
 
 
-def select_every(sequence: Sequence, step: int) -> Sequence:
+def select_every(sequence: Drive, step: int) -> Drive:
     """Every `step`-th frame of each scene, from the scene's first frame on."""
     return select(sequence, [index for scene in scenes_of(sequence.stamps) for index in scene[::step]])
 
 
-def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
+def select_rate(sequence: Drive, rate_hz: float) -> Drive:
     """The sequence thinned to about `rate_hz` frames per second, scene by scene.
 
     A model expects the frame rate that it was trained with: its velocities and its history depend on it. In each
@@ -224,7 +224,7 @@ def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
     return select(sequence, kept, tuple(notes))
 
 
-def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
+def scenes_of(stamps: Sequence[FrameStamp]) -> Iterator[list[int]]:
     """The indices of each scene: a run of consecutive frames with the same scene name."""
     for _, indices in groupby(range(len(stamps)), key=lambda index: stamps[index].scene):
         yield list(indices)

@@ -69,7 +69,7 @@ class ClassOptions:
 
 
 @options("Input")
-class SequenceOptions(ClassOptions):
+class InputOptions(ClassOptions):
     """The options of every input format: which frames, and how strictly they are read."""
 
     frames: slice | None = option(
@@ -129,7 +129,7 @@ class SequenceOptions(ClassOptions):
         if self.ego_motion == "static":
             raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"`')
 
-    def for_model(self, config: ModelConfig, *, temporal: bool = True) -> SequenceOptions:
+    def for_model(self, config: ModelConfig, *, temporal: bool = True) -> InputOptions:
         """The options for a run of a model: its rate and classes, and ego-motion only where history needs it."""
         use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)

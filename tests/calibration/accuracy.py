@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
@@ -56,7 +56,7 @@ class CameraError:
     deviations: tuple[float, ...]
 
 
-def errors_of_drive(drive: Sequence, levels: list[int], seeds: list[int]) -> Iterator[CameraError]:
+def errors_of_drive(drive: Drive, levels: list[int], seeds: list[int]) -> Iterator[CameraError]:
     """Measure the calibration of a drive once a level and seed, and yield what is left for each camera."""
     options = CalibrateOptions()
     views = read_views(drive, options.pairs)
@@ -69,15 +69,15 @@ def errors_of_drive(drive: Sequence, levels: list[int], seeds: list[int]) -> Ite
                 yield _error(drive.name, level, seed, right, result, estimate)
 
 
-class WrongTimes(DerivedSequence):
+class WrongTimes(DerivedDrive):
     """A drive with ego-motion in which one camera states times, and poses at them, that are too late by a constant."""
 
-    def __init__(self, sequence: Sequence, camera: str, late_ms: float) -> None:
+    def __init__(self, sequence: Drive, camera: str, late_ms: float) -> None:
         super().__init__(sequence)
         self._camera, self._late_ns = camera, round(late_ms * 1e6)
 
-    def load(self, place: int) -> Frame:
-        frame, name, motion = self.sequence.load(place), self._camera, self.ego_motion
+    def load(self, index: int) -> Frame:
+        frame, name, motion = self.sequence.load(index), self._camera, self.ego_motion
         if name not in frame.images or motion is None:
             return frame
         time = frame.images[name].timestamp_ns + self._late_ns
@@ -86,7 +86,7 @@ class WrongTimes(DerivedSequence):
         return replace(frame, images=images, world_from_ego_at={**frame.world_from_ego_at, name: pose})
 
 
-def delays_of_drive(drive: Sequence, delays_ms: list[float]) -> Iterator[str]:
+def delays_of_drive(drive: Drive, delays_ms: list[float]) -> Iterator[str]:
     """One line for each camera and delay: the delay that is found, and its deviation."""
     options = CalibrateOptions()
     views = read_views(drive, options.pairs)
@@ -102,7 +102,7 @@ def delays_of_drive(drive: Sequence, delays_ms: list[float]) -> Iterator[str]:
         )
 
 
-def _with_noise(drive: Sequence, views: Views, level: int, seed: int) -> Views:
+def _with_noise(drive: Drive, views: Views, level: int, seed: int) -> Views:
     """The views with the noisy rig that `bevcli stress` would state."""
     if not level:
         return views

@@ -6,20 +6,20 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion
 from bevcli.geometry.transforms import rigid
 
 
-class ThroughLens(DerivedSequence):
+class ThroughLens(DerivedDrive):
     """A drive of cameras without distortion, as lenses would have shown it; `zoom` keeps their images filled."""
 
-    def __init__(self, sequence: Sequence, lens: Distortion, zoom: float = 1.0) -> None:
+    def __init__(self, sequence: Drive, lens: Distortion, zoom: float = 1.0) -> None:
         super().__init__(sequence)
         self.rig = replace(self.rig, cameras=tuple(_with_lens(each, lens, zoom) for each in self.rig.cameras))
 
-    def load(self, place: int) -> Frame:
-        frame = self.sequence.load(place)
+    def load(self, index: int) -> Frame:
+        frame = self.sequence.load(index)
         images = {}
         for plain, camera in zip(self.sequence.rig.cameras, self.rig.cameras, strict=True):
             pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
@@ -34,11 +34,11 @@ def _with_lens(camera: Camera, lens: Distortion, zoom: float) -> Camera:
     return replace(camera, distortion=lens, intrinsics=camera.intrinsics * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
 
 
-class BlackImages(DerivedSequence):
+class BlackImages(DerivedDrive):
     """A drive with black images."""
 
-    def load(self, place: int) -> Frame:
-        frame = self.sequence.load(place)
+    def load(self, index: int) -> Frame:
+        frame = self.sequence.load(index)
         black = {name: replace(one, pixels_bgr=np.zeros_like(one.pixels_bgr)) for name, one in frame.images.items()}
         return replace(frame, images=black)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from accuracy import WrongTimes, errors_of_drive
 from command_line import MINI_TOML, command
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 from planted import BlackImages, ThroughLens, angle_deg, distance_m, wrong_rig
 from typer.testing import CliRunner
 
@@ -127,42 +127,42 @@ def test_a_right_calibration_is_not_changed():
 
 def test_one_frame_is_refused():
     with pytest.raises(InputError, match="has one frame"):
-        bevcli.calibrate(MemorySequence(count=1))
+        bevcli.calibrate(MemoryDrive(count=1))
 
 
 def test_a_drive_without_ego_motion_is_refused():
-    drive = MemorySequence(count=9)
+    drive = MemoryDrive(count=9)
     drive.has_ego_motion = False
     with pytest.raises(InputError, match="has no ego-motion"):
         bevcli.calibrate(drive)
 
 
 def test_a_vehicle_that_stands_is_refused():
-    drive = MemorySequence(count=9)
-    drive.pose = lambda place: MemorySequence.pose(drive, 0)
+    drive = MemoryDrive(count=9)
+    drive.pose = lambda place: MemoryDrive.pose(drive, 0)
     with pytest.raises(InputError, match="moves between 0 pairs"):
         bevcli.calibrate(drive)
 
 
 def test_few_frames_are_refused():
     with pytest.raises(InputError, match="moves between 3 pairs"):
-        bevcli.calibrate(MemorySequence(count=4))
+        bevcli.calibrate(MemoryDrive(count=4))
 
 
 def test_several_scenes_are_refused():
     with pytest.raises(InputError, match="has 2 scenes"):
-        bevcli.calibrate(MemorySequence(count=9, scenes="aaaabbbbb"))
+        bevcli.calibrate(MemoryDrive(count=9, scenes="aaaabbbbb"))
 
 
 def test_black_images_are_refused():
     with pytest.raises(InputError, match="no image shows anything"):
-        bevcli.calibrate(BlackImages(MemorySequence(count=9)))
+        bevcli.calibrate(BlackImages(MemoryDrive(count=9)))
 
 
 @pytest.mark.slow
 def test_images_of_noise_are_refused():
     with pytest.raises(InputError, match="no points were found"):
-        bevcli.calibrate(MemorySequence(count=9))
+        bevcli.calibrate(MemoryDrive(count=9))
 
 
 def typed(*arguments: str):

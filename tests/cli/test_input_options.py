@@ -12,7 +12,7 @@ from bevcli.errors import BevcliError
 from bevcli.inference.load import Model, choose_device
 from bevcli.inference.options import complete_model
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions, parse_frames, parse_rate
+from bevcli.sequences.options import InputOptions, parse_frames, parse_rate
 
 
 @pytest.mark.parametrize(
@@ -41,10 +41,10 @@ def test_invalid_rate_is_a_usage_error(text):
 
 def test_static_takes_precedence_over_no_temporal(mini_model):
     model = Model(mini_model)
-    static = SequenceOptions(ego_motion="static")
+    static = InputOptions(ego_motion="static")
     assert static.for_model(model.config, temporal=False).ego_motion == "static"
-    assert SequenceOptions().for_model(model.config, temporal=False).ego_motion == "optional"
-    assert SequenceOptions().for_model(model.config).ego_motion == "required"
+    assert InputOptions().for_model(model.config, temporal=False).ego_motion == "optional"
+    assert InputOptions().for_model(model.config).ego_motion == "required"
 
 
 def test_model_names_are_completed():

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from command_line import MINI_TOML
 from forks import FORKS, run_in_fork
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from small_fleet import RIG
 
 from bevcli.sequences.files.boxes_file import read_boxes
@@ -57,7 +57,7 @@ def place(tmp_path_factory):
     """A folder with a drive, a model and the folder `whole` of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("interrupted")
     (folder / "mini.toml").write_text(MINI_TOML)
-    sequence = MemorySequence(FRAMES, RIG, scenes="a" * FRAMES)
+    sequence = MemoryDrive(FRAMES, RIG, scenes="a" * FRAMES)
     with NativeWriter(folder / "drive", with_ego_motion=True) as writer:
         for index in range(FRAMES):
             writer.write(sequence.load(index))

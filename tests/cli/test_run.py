@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import MINI_TOML, command
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 
 from bevcli.cli.run import _run_notes
 from bevcli.errors import OutputError
@@ -63,8 +63,8 @@ def test_the_command_runs_the_sample_and_says_untrained(tmp_path):
 
 
 def test_some_frames_give_the_same_boxes_as_the_whole(job):
-    whole = read_boxes(job(MemorySequence(4), out="whole") / "predictions.json")
-    part = read_boxes(job(MemorySequence(2), out="part") / "predictions.json")
+    whole = read_boxes(job(MemoryDrive(4), out="whole") / "predictions.json")
+    part = read_boxes(job(MemoryDrive(2), out="part") / "predictions.json")
     for one, other in zip(part.frames, whole.frames, strict=False):
         assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-4)
         assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-5)
@@ -74,9 +74,9 @@ def test_one_thread_and_two_agree(job):
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = read_boxes(job(MemorySequence(2), out="one") / "predictions.json")
+        one = read_boxes(job(MemoryDrive(2), out="one") / "predictions.json")
         torch.set_num_threads(2)
-        two = read_boxes(job(MemorySequence(2), out="two") / "predictions.json")
+        two = read_boxes(job(MemoryDrive(2), out="two") / "predictions.json")
     finally:
         torch.set_num_threads(threads)
     for a, b in zip(one.frames, two.frames, strict=True):
@@ -85,7 +85,7 @@ def test_one_thread_and_two_agree(job):
 
 
 def test_bev_features_are_written_with_what_explains_them(job, tmp_path):
-    job(MemorySequence(2))
+    job(MemoryDrive(2))
     features = np.load(tmp_path / "bev/000001.npy")
     facts = json.loads((tmp_path / "bev/000001.json").read_text())
     assert features.shape == (12, 10, 32)
@@ -106,13 +106,13 @@ def test_gaps_are_in_the_summary(job):
 
 
 def test_without_ego_motion_boxes_are_given_in_the_ego_frame(job):
-    standing = MemorySequence(1)
+    standing = MemoryDrive(1)
     standing.has_ego_motion = False
     assert read_boxes(job(standing) / "predictions.json").frame_of_reference == "ego"
 
 
 def test_keyframes_of_nuscenes_also_go_into_a_submission(job):
-    class WithTokens(MemorySequence):
+    class WithTokens(MemoryDrive):
         def load(self, place):
             return replace(super().load(place), sample_token=f"token-{place}")
 
@@ -121,7 +121,7 @@ def test_keyframes_of_nuscenes_also_go_into_a_submission(job):
 
 
 def test_what_was_done_survives_a_failure_in_a_later_frame(job, tmp_path):
-    class Failing(MemorySequence):
+    class Failing(MemoryDrive):
         def load(self, place):
             if place == 2:
                 raise OutputError("a failure")
@@ -150,7 +150,7 @@ def test_a_missing_image_is_a_warning_and_with_strict_an_error(tmp_path):
 
 def test_the_note_on_rendered_streets_is_for_other_drives_only(mini_model):
     bundled = replace(Model(mini_model), bundled=True)
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     notes = "\n".join(_run_notes(bundled, drive))
     assert "these weights were trained on rendered streets" in notes
     assert "`--model photographs` finds more" in notes

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.frame import MAP_CLASSES
 from bevcli.inference.load import Model
@@ -16,7 +16,7 @@ from bevcli.sequences.files.map_folder import open_maps
 def run(config, out, frames, *, force=False):
     torch.manual_seed(0)
     options = RunOptions(recording=RecordingOptions("minimal"))
-    run_into_folder(Model(BEVFormer(config).eval()), MemorySequence(frames), out, options, force=force)
+    run_into_folder(Model(BEVFormer(config).eval()), MemoryDrive(frames), out, options, force=force)
 
 
 def test_maps_are_written_and_an_earlier_runs_maps_are_gone(mini_config, tmp_path):

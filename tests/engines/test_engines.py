@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from forks import FORKS
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -75,7 +75,7 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     exported = load_exported(small_file, "onnxruntime")
     width, height = exported.config.image.size
     camera = make_camera("FRONT", 0, width, height)
-    drive = MemorySequence(1, CameraRig((camera, replace(camera, name="BACK")), default_ego_from_bev()))
+    drive = MemoryDrive(1, CameraRig((camera, replace(camera, name="BACK")), default_ego_from_bev()))
     frame = drive.load(0)
     pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
     frame = replace(frame, images={"FRONT": replace(frame.images["FRONT"], pixels_bgr=pixels)})

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, WeightsError
@@ -109,7 +109,7 @@ def test_a_file_for_wide_cameras_is_larger_and_embeds_the_rig(tmp_path):
     model = Model(network).for_rig(rig)
     assert (model.config.image.size, network.config.image.size) == ((144, 81), (96, 64))
     export_onnx(model.network, tmp_path / "wide.onnx", contents=model.contents(), cameras=2)
-    differences = list(check_exported(tmp_path / "wide.onnx", Model(network), MemorySequence(2, rig=rig)))
+    differences = list(check_exported(tmp_path / "wide.onnx", Model(network), MemoryDrive(2, rig=rig)))
     assert max(row.logits for row in differences) < 1e-3
     assert max(row.bev for row in differences) < 1e-4
     metadata = {entry.key: entry.value for entry in onnx.load(tmp_path / "wide.onnx").metadata_props}

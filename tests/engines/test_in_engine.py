@@ -25,7 +25,7 @@ from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVi
 from bevcli.workshop.engines.exported import load_exported
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 from small_model import model_for_engines
 from typer.testing import CliRunner
 
@@ -44,7 +44,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def drive():
-    return MemorySequence(2, make_rig({"FRONT": 0.0, "BACK": 180.0}))
+    return MemoryDrive(2, make_rig({"FRONT": 0.0, "BACK": 180.0}))
 
 
 @pytest.fixture(scope="module")

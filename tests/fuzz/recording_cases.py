@@ -9,7 +9,7 @@ from random import Random
 
 import numpy as np
 import pyarrow as pa
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 from recorded_drive import record
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
@@ -54,7 +54,7 @@ def cut_recording(seeds: Path, case: Path, random: Random) -> None:
 def _recorded(seeds: Path) -> Path:
     path = seeds / "frames.rrd"
     if not path.exists():
-        record(path, MemorySequence(3, make_rig({"CAM_FRONT": 0.0})))
+        record(path, MemoryDrive(3, make_rig({"CAM_FRONT": 0.0})))
     return path
 
 

@@ -13,7 +13,7 @@ from random import Random
 import msgspec
 import torch
 from damage import HUGE, damage, edited
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 from mutations import TEXT, changed_tree
 from safetensors.torch import save
 from small_model import small_model
@@ -152,7 +152,7 @@ def _prepared(seeds: Path, case: Path) -> dict[str, bytes]:
         tuple(make_camera(name, yaw, 64, 36) for name, yaw in zip(CAMERAS, (0, 180), strict=True)),
         default_ego_from_bev(),
     )
-    drive = MemorySequence(FRAMES, rig)
+    drive = MemoryDrive(FRAMES, rig)
     with NativeWriter(case / "drive", with_ego_motion=True) as writer:
         for place in range(FRAMES):
             writer.write(drive.load(place))

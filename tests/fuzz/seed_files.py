@@ -16,7 +16,7 @@ import torch
 import trimesh
 import yaml
 from bags import drive_messages, write_mcap, write_rosbag2
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 from nuscenes_tables import Size, scene_name, write_tables
 from recorded_drive import record
 from written_formats import WRITTEN
@@ -45,7 +45,7 @@ def write_seeds(folder: Path) -> None:
     _videos(folder / "videos_drive")
     _rig(folder / "rig")
     _weights(folder)
-    record(folder / "recording.rrd", MemorySequence(1, make_rig({"CAM_FRONT": 0.0})))
+    record(folder / "recording.rrd", MemoryDrive(1, make_rig({"CAM_FRONT": 0.0})))
     _nuscenes(folder / "nuscenes")
     _other_formats(folder)
     _boxes(folder)

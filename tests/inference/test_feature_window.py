@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 from stepping import CPU, run
 
 from bevcli.geometry.transforms import Pose, inverse
@@ -48,7 +48,7 @@ def test_a_missing_frame_takes_the_nearest_towards_the_current(frames, exists, s
 def test_every_frame_passes_the_backbone_once(window_model, frames):
     model, calls = window_model(*frames), []
     with model.backbone.register_forward_hook(lambda module, inputs, output: calls.append(len(inputs[0]))):
-        predictions, _ = run(model, MemorySequence(6))
+        predictions, _ = run(model, MemoryDrive(6))
     assert len(predictions) == 6
     assert calls == [6] * 6  # six cameras, six frames
 
@@ -56,13 +56,13 @@ def test_every_frame_passes_the_backbone_once(window_model, frames):
 def test_each_frame_of_the_window_is_encoded_once_a_step(window_model):
     model, calls = window_model(-3, -2, -1, 0), []
     with model.encoder.register_forward_hook(lambda *_: calls.append(1)):
-        run(model, MemorySequence(5))
+        run(model, MemoryDrive(5))
     assert len(calls) == 1 + 2 + 3 + 4 + 4
 
 
 def test_every_frame_of_the_window_matters(window_model):
     model = window_model(-2, -1, 0)
-    whole = run(model, MemorySequence(3))[0][2]
+    whole = run(model, MemoryDrive(3))[0][2]
     for dropped in (0, 1):
         assert differs(whole, run(model, WithoutImages({dropped: "all"}, count=3))[0][2])
 
@@ -70,13 +70,13 @@ def test_every_frame_of_the_window_matters(window_model):
 def test_the_state_has_a_fixed_length(window_model):
     for frames, lengths in [((-3, -2, -1, 0), [1, 2, 3, 3, 3]), ((-1, 0, 1), [2, 2, 2, 2, 1]), ((0,), [0] * 5)]:
         runner = Runner(window_model(*frames), CPU)
-        steps = runner.run(MemorySequence(5), range(5), Preprocessor(runner.config))
+        steps = runner.run(MemoryDrive(5), range(5), Preprocessor(runner.config))
         assert [len(state.memory.frames) for _, _, state in steps] == lengths
 
 
 @pytest.mark.parametrize("cut", [1, 2, 4])
 def test_a_run_cut_in_two_equals_the_whole(window_model, cut):
-    model, sequence = window_model(-2, -1, 0), MemorySequence(5)
+    model, sequence = window_model(-2, -1, 0), MemoryDrive(5)
     whole, _ = run(model, sequence)
     first, state = run(model, sequence, range(cut))
     second, _ = run(model, sequence, range(cut, 5), state)
@@ -85,7 +85,7 @@ def test_a_run_cut_in_two_equals_the_whole(window_model, cut):
 
 
 def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
-    model, sequence = window_model(-1, 0, 1, 2), MemorySequence(6)
+    model, sequence = window_model(-1, 0, 1, 2), MemoryDrive(6)
     whole, _ = run(model, sequence)
     steps = Runner(model, CPU).run(sequence, range(6), Preprocessor(model.config))
     for _ in range(3):
@@ -98,7 +98,7 @@ def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
 
 def test_a_scene_change_inside_the_window_equals_a_fresh_start(window_model):
     for frames in [(-3, -2, -1, 0), (-1, 0, 1)]:
-        model, sequence = window_model(*frames), MemorySequence(5, scenes="aaabb")
+        model, sequence = window_model(*frames), MemoryDrive(5, scenes="aaabb")
         whole, _ = run(model, sequence)
         assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "", "new scene", ""]
         for places in (range(3), range(3, 5)):
@@ -108,7 +108,7 @@ def test_a_scene_change_inside_the_window_equals_a_fresh_start(window_model):
 
 
 def test_a_gap_in_time_starts_anew(window_model):
-    sequence = MemorySequence(2, step_s=2.5)
+    sequence = MemoryDrive(2, step_s=2.5)
     for frames in [(-1, 0), (0, 1)]:
         predictions, _ = run(window_model(*frames), sequence)
         alone, _ = run(window_model(*frames), sequence, [1])
@@ -117,7 +117,7 @@ def test_a_gap_in_time_starts_anew(window_model):
 
 
 def test_without_history_every_frame_stands_alone(window_model):
-    sequence = MemorySequence(3)
+    sequence = MemoryDrive(3)
     for frames in [(-1, 0), (-1, 0, 1)]:
         predictions, _ = run(window_model(*frames), sequence, temporal=False)
         assert {str(p.started_anew or "") for p in predictions} == {"history is off"}
@@ -126,21 +126,21 @@ def test_without_history_every_frame_stands_alone(window_model):
 
 
 def test_the_first_frame_of_a_scene_fills_the_window_with_itself(window_model):
-    model, sequence = window_model(-2, -1, 0), MemorySequence(3)
+    model, sequence = window_model(-2, -1, 0), MemoryDrive(3)
     with_history, without = run(model, sequence)[0], run(model, sequence, temporal=False)[0]
     assert_same(with_history[0], without[0])
     assert differs(with_history[1], without[1])
 
 
 def test_a_later_frame_changes_the_current_one(window_model):
-    model, sequence = window_model(-1, 0, 1), MemorySequence(3)
+    model, sequence = window_model(-1, 0, 1), MemoryDrive(3)
     whole, cut = run(model, sequence)[0], run(model, sequence, range(2))[0]
     assert_same(whole[0], cut[0])
     assert differs(whole[1], cut[1])
 
 
 def test_a_model_of_one_frame_says_that_it_uses_no_history(window_model):
-    predictions, _ = run(window_model(0), MemorySequence(2))
+    predictions, _ = run(window_model(0), MemoryDrive(2))
     assert {str(p.started_anew or "") for p in predictions} == {"the model uses no history"}
 
 
@@ -149,13 +149,13 @@ def test_a_frame_without_images_passes_the_state_on(window_model):
         model = window_model(*frames)
         predictions, _ = run(model, WithoutImages({1: "all"}, count=4))
         assert [p.skipped for p in predictions] == [False, True, False, False]
-        spanned, _ = run(model, MemorySequence(4), [0, 2, 3])
+        spanned, _ = run(model, MemoryDrive(4), [0, 2, 3])
         assert_same(predictions[2], spanned[1])
 
 
 def test_a_probe_sees_the_current_frame(window_model):
     model, probes = window_model(-1, 0), ((0.0, 12.0),)
-    sequence = MemorySequence(2)
+    sequence = MemoryDrive(2)
     view = run(model, sequence, ask_attention=True, probes=probes)[0][1].attention
     alone = run(model, sequence, [1], ask_attention=True, probes=probes)[0][0].attention
     assert view.history_weight is None
@@ -163,7 +163,7 @@ def test_a_probe_sees_the_current_frame(window_model):
 
 
 def test_every_stage_is_timed(window_model):
-    prediction = run(window_model(-1, 0), MemorySequence(2))[0][1]
+    prediction = run(window_model(-1, 0), MemoryDrive(2))[0][1]
     assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "fusion", "decoder", "box_decoding"]
 
 
@@ -171,7 +171,7 @@ def test_every_stage_is_timed(window_model):
 def test_memory_stays_flat_over_200_frames_of_a_window_of_eight(window_model):
     model = window_model(*range(-7, 1))
     runner = Runner(model, CPU)
-    prepared = [Preprocessor(model.config)(MemorySequence(1).load(0))] * 200
+    prepared = [Preprocessor(model.config)(MemoryDrive(1).load(0))] * 200
     state, counts = None, []
     for index, frame in enumerate(prepared):
         stamp = replace(frame.frame.stamp, index=index, timestamp_ns=10**18 + index * 500_000_000)
@@ -185,7 +185,7 @@ def test_memory_stays_flat_over_200_frames_of_a_window_of_eight(window_model):
 
 def test_the_bev_frame_moves_with_the_vehicle():
     """Both near the world's origin (float32) and far from it (float64)."""
-    ego_from_bev = MemorySequence(1).rig.ego_from_bev
+    ego_from_bev = MemoryDrive(1).rig.ego_from_bev
     for origin in (0.0, 5e6):
         now, then = (
             Pose(np.array([origin + x, origin / 2, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
@@ -197,8 +197,8 @@ def test_the_bev_frame_moves_with_the_vehicle():
 
 def test_an_interrupted_run_is_resumed_with_its_window(window_model, tmp_path):
     model = Model(window_model(-1, 0, 1))
-    run_into_folder(model, MemorySequence(5), tmp_path / "whole")
-    run_into_folder(model, MemorySequence(5), tmp_path / "cut", should_stop=iter([False, False, True]).__next__)
-    run_into_folder(model, MemorySequence(5), tmp_path / "cut", resume=True)
+    run_into_folder(model, MemoryDrive(5), tmp_path / "whole")
+    run_into_folder(model, MemoryDrive(5), tmp_path / "cut", should_stop=iter([False, False, True]).__next__)
+    run_into_folder(model, MemoryDrive(5), tmp_path / "cut", resume=True)
     for name in ("predictions.json", "tracks.csv"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

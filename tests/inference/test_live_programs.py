@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 
 import bevcli
 from bevcli.geometry.transforms import rigid, rotation_about_z
@@ -152,7 +152,7 @@ def image_message(image, encoding):
 
 def test_the_node_publishes_the_boxes_of_a_session(model, rig, ros):
     page = program("bevcli_node")
-    drive, session = MemorySequence(3, rig), bevcli.Session(model, rig)
+    drive, session = MemoryDrive(3, rig), bevcli.Session(model, rig)
     node = page.BevcliNode(model, rig, {"CAM_FRONT": "/front", "CAM_BACK": "/back"})
     [(period_s, step)] = node.timers
     assert period_s == 0.5

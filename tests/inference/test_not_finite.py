@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.errors import WeightsError
 from bevcli.inference.preprocess import Preprocessor
@@ -16,7 +16,7 @@ CPU = torch.device("cpu")
 
 
 def run(model, frames=3):
-    steps = Runner(model, CPU, StepOptions()).run(MemorySequence(frames), range(frames), Preprocessor(model.config))
+    steps = Runner(model, CPU, StepOptions()).run(MemoryDrive(frames), range(frames), Preprocessor(model.config))
     return [prediction for _, prediction, _ in steps]
 
 
@@ -50,7 +50,7 @@ def test_the_module_where_numbers_stop_being_finite_is_named(mini_model, module,
 
 
 def test_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
-    sequence, calls = MemorySequence(4), []
+    sequence, calls = MemoryDrive(4), []
 
     def spoil_second(module, arguments, output):
         calls.append(module)
@@ -73,7 +73,7 @@ def test_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
 def test_an_input_that_is_not_finite_is_named(mini_model, prepared_model):
     model = prepare_for_inference(mini_model, CPU) if prepared_model else mini_model
     runner, preprocessor, sequence = Runner(model, CPU, StepOptions()), Preprocessor(mini_model.config), None
-    sequence = MemorySequence(1)
+    sequence = MemoryDrive(1)
     prepared = preprocessor(sequence.load(0))
     images = prepared.images.clone()
     images[0, 0, 0, 0, 0] = float("nan")

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 import bevcli
 from bevcli.errors import InputError, WeightsError
 
-DRIVE = MemorySequence(1)
+DRIVE = MemoryDrive(1)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from simulated_device import OnDevice, SimulatedDevice, pinned, simulated
 
 from bevcli.config import known_models, load_config
@@ -54,7 +54,7 @@ def frames(config: ModelConfig, *, same_projection: bool = False) -> list[Prepar
 
     same_projection: all frames have the projections of the first one.
     """
-    drive, preprocess = MemorySequence(count=FRAMES), Preprocessor(config)
+    drive, preprocess = MemoryDrive(count=FRAMES), Preprocessor(config)
     prepared = []
     for place in range(FRAMES):
         frame = drive.load(place)
@@ -214,7 +214,7 @@ def test_a_real_gpu_is_waited_for_as_often_as_the_simulated_one(name, monkeypatc
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
 def test_uploading_images_ahead_changes_no_box():
     config, device = small_version("demo"), torch.device("cuda:0")
-    model, drive = prepare_for_inference(made_up_model(config), device), MemorySequence(count=FRAMES)
+    model, drive = prepare_for_inference(made_up_model(config), device), MemoryDrive(count=FRAMES)
     preprocess = Preprocessor(config)
     in_turn = run(model, device, [preprocess(drive.load(place)) for place in range(FRAMES)], [])
     ahead = Runner(model, device, StepOptions()).run(drive, range(FRAMES), preprocess)

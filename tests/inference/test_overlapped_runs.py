@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 from simulated_device import simulated
 from test_other_devices import CPU, sample_plainly, small_version
 
@@ -25,7 +25,7 @@ FRAMES = 6
 TRACKER = TrackerConfig(birth_score=0.0, keep_score=0.0)
 
 
-class Drive(WithoutImages):
+class MadeDrive(WithoutImages):
     """A drive of two scenes, with a frame without images. A frame `broken` cannot be read."""
 
     broken = FRAMES
@@ -46,7 +46,11 @@ def overlapping(monkeypatch):
 
 def steps_of(model, change=lambda prepared: prepared, broken=FRAMES):
     """The steps of a run, and the message of the error that ended it. change: of each frame before its step."""
-    runner, drive, preprocess = Runner(model, CPU, StepOptions(tracker=TRACKER)), Drive(), Preprocessor(model.config)
+    runner, drive, preprocess = (
+        Runner(model, CPU, StepOptions(tracker=TRACKER)),
+        MadeDrive(),
+        Preprocessor(model.config),
+    )
     drive.broken, steps = broken, []
     try:
         for step in runner.run(drive, range(FRAMES), lambda frame: change(preprocess(frame))):
@@ -119,7 +123,7 @@ def test_an_error_of_a_finished_step_ends_the_run(mini_model, monkeypatch, overl
 
 def interrupt_and_resume(model, out):
     """A run that ends at a frame that cannot be read, then after one frame, then with the drive."""
-    drive = Drive()
+    drive = MadeDrive()
     drive.broken = 4
     with pytest.raises(InputError, match="frame 4"):
         run_into_folder(model, drive, out)
@@ -133,7 +137,7 @@ def interrupt_and_resume(model, out):
 @pytest.mark.usefixtures("unchecked_recordings")
 def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, overlapping):
     model = Model(mini_model, tracker=TRACKER)
-    run_into_folder(model, Drive(), tmp_path / "whole")
+    run_into_folder(model, MadeDrive(), tmp_path / "whole")
     interrupt_and_resume(model, tmp_path / "out")
     for name in ("predictions.json", "tracks.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -142,7 +146,7 @@ def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, over
 @pytest.mark.slow
 @pytest.mark.usefixtures("unchecked_recordings")
 def test_an_interrupted_run_on_a_gpu_has_all_frames(mini_model, tmp_path, monkeypatch):
-    run_into_folder(Model(mini_model, tracker=TRACKER), Drive(), tmp_path / "cpu")
+    run_into_folder(Model(mini_model, tracker=TRACKER), MadeDrive(), tmp_path / "cpu")
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
         interrupt_and_resume(Model(mini_model, device.device, tracker=TRACKER), tmp_path / "gpu")
     found, expected = (read_boxes(tmp_path / name / "predictions.json").frames for name in ("gpu", "cpu"))
@@ -158,7 +162,7 @@ def test_an_interrupted_run_on_a_gpu_has_all_frames(mini_model, tmp_path, monkey
 def test_a_gpu_gets_the_next_frame_before_results_are_waited_for(name, monkeypatch):
     """Each frame waits once, for its own results: what the device copies has no numbers before."""
     config, count = small_version(name), 4  # the first ones warm up and are captured
-    model, drive, preprocess = made_up_model(config), MemorySequence(count), Preprocessor(config)
+    model, drive, preprocess = made_up_model(config), MemoryDrive(count), Preprocessor(config)
     expected = list(Runner(model, CPU, StepOptions(tracker=TRACKER)).run(drive, range(count), preprocess))
     with simulated("cuda:1", monkeypatch, sample_plainly) as device:
         fast = prepare_for_inference(model, device.device)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutImages, make_camera, make_rig
+from memory_drive import MemoryDrive, WithoutImages, make_camera, make_rig
 
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
@@ -33,7 +33,7 @@ def textbook_image(pixels, image):
 @pytest.mark.parametrize("order", ["rgb", "bgr"])
 def test_images_equal_normalising_before_resizing(mini_config, order):
     config = replace(mini_config, image=replace(mini_config.image, color_order=order))
-    frame = MemorySequence().load(1)
+    frame = MemoryDrive().load(1)
     images = Preprocessor(config)(frame).images[0].numpy()
     expected = [textbook_image(frame.images[name].pixels_bgr, config.image) for name in config.cameras]
     np.testing.assert_allclose(images, np.stack(expected), rtol=0, atol=1e-5)
@@ -42,7 +42,7 @@ def test_images_equal_normalising_before_resizing(mini_config, order):
 def test_area_resizing_averages_pixels(mini_config):
     """Stripes that are finer than the network's pixels become grey."""
     config = replace(mini_config, image=replace(mini_config.image, resize="area"))
-    frame = MemorySequence().load(1)
+    frame = MemoryDrive().load(1)
     name = config.cameras[0]
     stripes = np.zeros_like(frame.images[name].pixels_bgr)
     stripes[:, ::2] = 200  # a network pixel covers two by two pixels
@@ -55,7 +55,7 @@ def test_area_resizing_averages_pixels(mini_config):
 
 
 def test_projection_uses_the_pose_at_each_cameras_time(mini_config):
-    frame = MemorySequence().load(1)
+    frame = MemoryDrive().load(1)
     late = Pose(frame.world_from_ego.translation + [1.5, 0, 0], frame.world_from_ego.quaternion)
     frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": late})
     point_bev = np.array([2.0, 15.0, -1.0])
@@ -68,7 +68,7 @@ def test_projection_uses_the_pose_at_each_cameras_time(mini_config):
 
 def test_an_image_of_another_aspect_ratio_is_fitted_as_its_rig(mini_config):
     camera = make_camera("CAM_FRONT", 0, width=300, height=300)
-    sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
+    sequence = MemoryDrive(rig=CameraRig((camera,), make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
     assert prepared.images.shape == (1, 1, 3, 96, 160)
     assert prepared.scales == (pytest.approx(0.3),)
@@ -83,7 +83,7 @@ def test_an_image_of_another_aspect_ratio_is_fitted_as_its_rig(mini_config):
 
 def test_images_of_different_sizes_form_one_batch(mini_config):
     cameras = (make_camera("CAM_FRONT", 0, 320, 180), make_camera("CAM_BACK", 180, 640, 400))
-    sequence = MemorySequence(rig=CameraRig(cameras, make_rig().ego_from_bev))
+    sequence = MemoryDrive(rig=CameraRig(cameras, make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
     assert prepared.images.shape == (1, 2, 3, 96, 160)
     assert prepared.scales == (0.5, 90 / 400)
@@ -97,7 +97,7 @@ def test_images_are_undistorted_before_resizing(mini_config):
     drawn = np.zeros((180, 320, 3), np.uint8)
     seen, _ = bent.project_ego(point_ego)
     cv2.circle(drawn, np.round(seen * 16).astype(int).tolist(), 5 * 16, (255, 255, 255), -1, shift=4)
-    sequence = MemorySequence(rig=CameraRig((bent,), make_rig().ego_from_bev))
+    sequence = MemoryDrive(rig=CameraRig((bent,), make_rig().ego_from_bev))
     frame = sequence.load(0)
     frame = replace(frame, images={"CAM_FRONT": replace(frame.images["CAM_FRONT"], pixels_bgr=drawn)})
     bright = Preprocessor(mini_config)(frame).images[0, 0, 0].numpy() > 0
@@ -118,7 +118,7 @@ def test_projections_follow_the_resized_image_within_a_pixel(mini_config):
     """A bright spot, resized to a quarter, lies where its ray is projected to."""
     config = replace(mini_config, image=replace(mini_config.image, resize="area", half_pixel_shift=True))
     camera = make_camera("CAM_FRONT", 0, width=640, height=384)
-    sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
+    sequence = MemoryDrive(rig=CameraRig((camera,), make_rig().ego_from_bev))
     frame = sequence.load(0)
     dark = np.zeros((384, 640, 3), np.uint8)
     dark[100:107, 300:307] = 255  # its centre is pixel (303, 103)
@@ -143,7 +143,7 @@ def wide_rig(half_width_over_focal: float, count: int = 3) -> CameraRig:
 
 def test_images_of_wide_cameras_are_enlarged_to_the_focal_length(mini_config):
     config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
-    sequence = MemorySequence(rig=wide_rig(2.0))  # 80 pixels of focal length, 40 in images of the model's size
+    sequence = MemoryDrive(rig=wide_rig(2.0))  # 80 pixels of focal length, 40 in images of the model's size
     prepared = Preprocessor(config)(sequence.load(0))
     assert prepared.scales == pytest.approx((1.5, 1.5, 1.5))
     assert prepared.images.shape == (1, 3, 3, 288, 480)
@@ -173,7 +173,7 @@ def test_images_of_long_focal_lengths_keep_the_models_size(mini_config):
 
 def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
     config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
-    prepared = [Preprocessor(config)(MemorySequence(rig=wide_rig(wide)).load(0)) for wide in (2.0, 1.0)]
+    prepared = [Preprocessor(config)(MemoryDrive(rig=wide_rig(wide)).load(0)) for wide in (2.0, 1.0)]
     batch = joined_inputs([model_inputs(frame, None, config) for frame in prepared])
     assert batch.images.shape == (2, 3, 3, 288, 480)
     height, width = prepared[1].images.shape[-2:]
@@ -187,7 +187,7 @@ def test_frames_are_prepared_without_threads_of_openmp(mini_config, monkeypatch)
     """More of them than processors would no longer spin while they wait: the model would take a fifth longer."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     preprocess = Preprocessor(replace(mini_config, image=replace(mini_config.image, size=(512, 288))))
-    frame, started, threads = MemorySequence().load(1), [], torch.get_num_threads()
+    frame, started, threads = MemoryDrive().load(1), [], torch.get_num_threads()
     preprocess(frame)
 
     def prepare():
@@ -211,7 +211,7 @@ def preprocessing_threads() -> set[int | None]:
 
 def test_one_pool_of_threads_prepares_all_frames(mini_config, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    before, sequence = preprocessing_threads(), MemorySequence(8)
+    before, sequence = preprocessing_threads(), MemoryDrive(8)
     preprocess = Preprocessor(mini_config)
     used = set()
     for place in range(8):

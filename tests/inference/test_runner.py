@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutImages, make_rig
+from memory_drive import MemoryDrive, WithoutImages, make_rig
 from stepping import CPU, run
 
 from bevcli.errors import InputError
@@ -23,14 +23,14 @@ def assert_same(one, other):
 
 
 def test_history_matters(mini_model):
-    sequence = MemorySequence(2)
+    sequence = MemoryDrive(2)
     with_history, without = run(mini_model, sequence)[0][1], run(mini_model, sequence, temporal=False)[0][1]
     assert (with_history.bev - without.bev).abs().max() > 1e-3
     assert (with_history.started_anew, str(without.started_anew)) == (None, "history is off")
 
 
 def test_a_run_cut_in_two_equals_the_whole(mini_model):
-    sequence = MemorySequence(4)
+    sequence = MemoryDrive(4)
     whole, _ = run(mini_model, sequence)
     first, state = run(mini_model, sequence, range(2))
     second, _ = run(mini_model, sequence, range(2, 4), state)
@@ -40,23 +40,23 @@ def test_a_run_cut_in_two_equals_the_whole(mini_model):
 
 def test_autocast_around_a_run_has_no_effect(mini_model):
     prepared = prepare_for_inference(mini_model, CPU)
-    expected, _ = run(prepared, MemorySequence(2))
+    expected, _ = run(prepared, MemoryDrive(2))
     with torch.autocast("cpu", torch.bfloat16):
-        found, _ = run(prepared, MemorySequence(2))
+        found, _ = run(prepared, MemoryDrive(2))
     assert torch.equal(found[1].bev, expected[1].bev)
     assert np.array_equal(found[1].boxes.centers, expected[1].boxes.centers)
 
 
 def test_a_new_scene_equals_a_fresh_start(mini_model):
-    whole, _ = run(mini_model, MemorySequence(4, scenes="aabb"))
-    fresh, _ = run(mini_model, MemorySequence(4, scenes="aabb"), range(2, 4))
+    whole, _ = run(mini_model, MemoryDrive(4, scenes="aabb"))
+    fresh, _ = run(mini_model, MemoryDrive(4, scenes="aabb"), range(2, 4))
     assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "new scene", ""]
     assert_same(whole[2], fresh[0])
     assert_same(whole[3], fresh[1])
 
 
 def test_a_gap_in_time_starts_anew(mini_model):
-    predictions, _ = run(mini_model, MemorySequence(2, step_s=2.5))
+    predictions, _ = run(mini_model, MemoryDrive(2, step_s=2.5))
     assert str(predictions[1].started_anew) == "gap of 2.5 s"
 
 
@@ -66,7 +66,7 @@ def test_a_frame_without_images_passes_the_state_on(mini_model):
     assert [p.skipped for p in predictions] == [False, True, False]
     assert len(predictions[1].boxes) == 0
     assert predictions[2].started_anew is None
-    spanned, _ = run(mini_model, MemorySequence(3), [0, 2])
+    spanned, _ = run(mini_model, MemoryDrive(3), [0, 2])
     assert_same(predictions[2], spanned[1])
 
 
@@ -74,19 +74,19 @@ def test_a_frame_without_images_passes_the_state_on(mini_model):
     "yaws", [{"CAM_FRONT": 0.0}, dict(list(NUSCENES_YAWS_DEG.items())[:5]), {**NUSCENES_YAWS_DEG, "seventh": 90.0}]
 )
 def test_any_number_of_cameras_runs(mini_model, yaws):
-    predictions, _ = run(mini_model, MemorySequence(2, rig=make_rig(yaws)))
+    predictions, _ = run(mini_model, MemoryDrive(2, rig=make_rig(yaws)))
     assert all(np.isfinite(p.boxes.centers).all() and len(p.boxes) == 20 for p in predictions)
 
 
 def test_boxes_move_to_the_world_by_the_pose_of_their_frame(mini_model):
-    sequence = MemorySequence(2)
+    sequence = MemoryDrive(2)
     prediction = run(mini_model, sequence)[0][1]
     matrix = sequence.pose(1).matrix @ sequence.rig.ego_from_bev
     assert prediction.boxes_world.centers == pytest.approx(apply(matrix, prediction.boxes.centers))
 
 
 def test_the_probe_answers_in_pixels_and_shares(mini_model):
-    predictions, _ = run(mini_model, MemorySequence(2), ask_attention=True, probes=((0.0, 12.0),))
+    predictions, _ = run(mini_model, MemoryDrive(2), ask_attention=True, probes=((0.0, 12.0),))
     view = predictions[1].attention
     assert predictions[0].attention.history_weight is None
     assert view.history_weight.shape == (12, 10)
@@ -100,11 +100,11 @@ def test_the_probe_answers_in_pixels_and_shares(mini_model):
 
 def test_a_probe_outside_the_map_is_a_mistake(mini_model):
     with pytest.raises(InputError, match="outside the BEV map"):
-        run(mini_model, MemorySequence(1), ask_attention=True, probes=((100.0, 0.0),))
+        run(mini_model, MemoryDrive(1), ask_attention=True, probes=((100.0, 0.0),))
 
 
 def test_every_stage_is_timed(mini_model):
-    prediction = run(mini_model, MemorySequence(1))[0][0]
+    prediction = run(mini_model, MemoryDrive(1))[0][0]
     assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "decoder", "box_decoding"]
     assert all(seconds > 0 for seconds in prediction.stage_seconds.values())
 
@@ -112,7 +112,7 @@ def test_every_stage_is_timed(mini_model):
 def test_a_segmentation_head_fills_the_prediction(mini_config):
     torch.manual_seed(0)
     model = BEVFormer(replace(mini_config, heads=("detection", "segmentation")))
-    predictions, _ = run(model, MemorySequence(2))
+    predictions, _ = run(model, MemoryDrive(2))
     # Four cells of the map along each side of a BEV cell; there are 12 x 10 of those.
     assert [prediction.segmentation.cells.shape for prediction in predictions] == [(48, 40)] * 2
     assert list(predictions[0].stage_seconds)[-3:] == ["segmentation_head", "box_decoding", "map_merging"]
@@ -128,7 +128,7 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
     runner = Runner(mini_model, CPU, StepOptions())
     handle = runner.model.encoder.layers[0].spatial_cross_attention.register_forward_hook(keep)
     preprocess = Preprocessor(mini_model.config)
-    whole = preprocess(MemorySequence(1).load(0))
+    whole = preprocess(MemoryDrive(1).load(0))
     runner.step(None, whole)
     with_camera = seen["queries"]
     runner.step(None, preprocess(WithoutImages({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
@@ -144,9 +144,9 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
 def test_runners_leave_no_hooks_on_a_model(mini_model):
     """Several runners in turn, as in training, and one whose step fails."""
     for _ in range(3):
-        run(mini_model, MemorySequence(1), ask_attention=True, probes=((0.0, 12.0),))
+        run(mini_model, MemoryDrive(1), ask_attention=True, probes=((0.0, 12.0),))
     runner = Runner(mini_model, CPU)
-    prepared = Preprocessor(mini_model.config)(MemorySequence(1).load(0))
+    prepared = Preprocessor(mini_model.config)(MemoryDrive(1).load(0))
     with pytest.raises(RuntimeError):
         runner.step(None, replace(prepared, images=prepared.images[:, :, :1]))
     assert not any(module._forward_hooks or module._forward_pre_hooks for module in mini_model.modules())

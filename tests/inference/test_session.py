@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutImages, make_rig
+from memory_drive import MemoryDrive, WithoutImages, make_rig
 
 import bevcli
 from bevcli.errors import InputError
@@ -64,14 +64,14 @@ def test_a_session_equals_a_run_on_the_sample_drive():
 
 
 def test_rgb_images_are_those_of_the_other_order(model):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame, expected = next(bevcli.run(model, drive))
     images = {name: image.pixels_bgr[..., ::-1] for name, image in frame.images.items()}
     assert_same(step(bevcli.Session(model, drive.rig, color_order="rgb"), frame, images=images), expected)
 
 
 def test_a_gap_begins_anew_and_a_reset_too(model):
-    frame, session = MemorySequence(1).load(0), bevcli.Session(model, make_rig())
+    frame, session = MemoryDrive(1).load(0), bevcli.Session(model, make_rig())
     times = [0, 500_000_000, 10_000_000_000]
     begun = [step(session, frame, timestamp_ns=time).started_anew for time in times]
     assert [None if one is None else one.reason for one in begun] == [StartReason.FIRST_FRAME, None, StartReason.GAP]
@@ -82,7 +82,7 @@ def test_a_gap_begins_anew_and_a_reset_too(model):
 
 
 def test_frames_out_of_order_change_nothing(model):
-    drive = MemorySequence(3)
+    drive = MemoryDrive(3)
     session = bevcli.Session(model, drive.rig)
     expected = [prediction for _, prediction in bevcli.run(model, drive)]
     for place in range(3):
@@ -102,13 +102,13 @@ WRONG_IMAGES = [
 @pytest.mark.parametrize(("images", "message"), WRONG_IMAGES)
 def test_other_images_are_refused(model, images, message):
     with pytest.raises(InputError, match=message):
-        step(bevcli.Session(model, make_rig()), MemorySequence(1).load(0), images=images)
+        step(bevcli.Session(model, make_rig()), MemoryDrive(1).load(0), images=images)
 
 
 @pytest.mark.parametrize("pose", [np.eye(3), np.diag([1, 1, 2, 1]), np.diag([1, 1, -1, 1]), np.full((4, 4), np.nan)])
 def test_poses_that_are_not_rigid_are_refused(model, pose):
     with pytest.raises(InputError, match=r"`world_from_ego`: (expected a Pose|is not a rigid transform)"):
-        step(bevcli.Session(model, make_rig()), MemorySequence(1).load(0), world_from_ego=pose)
+        step(bevcli.Session(model, make_rig()), MemoryDrive(1).load(0), world_from_ego=pose)
 
 
 def test_a_session_that_cannot_be_is_refused(model, window_model):
@@ -136,7 +136,7 @@ def test_motion_is_derived_from_the_poses(model, rate_hz):
 
 
 def test_a_recording_follows_a_session(model, tmp_path: Path):
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     session = bevcli.Session(model, drive.rig, name="car 7")
     with bevcli.Recording(tmp_path / "live.rrd", session, model) as recording:
         for place in range(2):

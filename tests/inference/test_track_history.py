@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 from stepping import CPU, run
 
 from bevcli.inference.load import Model
@@ -69,7 +69,7 @@ def assert_same(one, other, *, ids: bool = True) -> None:
 
 @pytest.fixture(scope="module")
 def whole(model):
-    return run(model, MemorySequence(6))[0]
+    return run(model, MemoryDrive(6))[0]
 
 
 def test_tracks_are_born_go_on_and_end(whole):
@@ -109,14 +109,14 @@ def test_a_prediction_has_the_map_of_the_models_classes(whole, config):
 
 @pytest.mark.parametrize("cut", [1, 3, 5])
 def test_a_run_cut_in_two_equals_the_whole(model, whole, cut):
-    first, state = run(model, MemorySequence(6), range(cut))
-    second, _ = run(model, MemorySequence(6), range(cut, 6), state)
+    first, state = run(model, MemoryDrive(6), range(cut))
+    second, _ = run(model, MemoryDrive(6), range(cut, 6), state)
     for one, other in zip(whole, first + second, strict=True):
         assert_same(one, other)
 
 
 def test_the_prepared_model_gives_the_same_tracks(model, whole):
-    found, _ = run(prepare_for_inference(model, CPU), MemorySequence(6))
+    found, _ = run(prepare_for_inference(model, CPU), MemoryDrive(6))
     for one, other in zip(whole, found, strict=True):
         assert one.boxes.instances.tolist() == other.boxes.instances.tolist()
         assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-2)
@@ -131,7 +131,7 @@ def zero_first_frame(model) -> UniAD:
 
 
 def test_a_scene_change_ends_all_tracks_and_no_identity_returns(model):
-    sequence = MemorySequence(6, scenes="aaabbb")
+    sequence = MemoryDrive(6, scenes="aaabbb")
     for network in (model, zero_first_frame(model)):
         predictions, _ = run(network, sequence)
         assert [str(p.started_anew or "") for p in predictions] == ["first frame", "", "", "new scene", "", ""]
@@ -146,21 +146,21 @@ def test_a_scene_change_ends_all_tracks_and_no_identity_returns(model):
 
 def test_a_first_frame_sees_the_motion_since_the_scene_before(model):
     """As in the released code. With first_frame = "zero" it sees none: the two runs differ from there on."""
-    sequence = MemorySequence(4, scenes="aabb")
+    sequence = MemoryDrive(4, scenes="aabb")
     with_motion, without = (run(network, sequence)[0] for network in (model, zero_first_frame(model)))
     assert (with_motion[2].bev - without[2].bev).abs().max() > 1e-3
 
 
 def test_a_gap_in_time_starts_anew(model):
-    predictions, _ = run(model, MemorySequence(2, step_s=2.5))
+    predictions, _ = run(model, MemoryDrive(2, step_s=2.5))
     assert str(predictions[1].started_anew) == "gap of 2.5 s"
     assert min(identities(predictions[1])) > max(identities(predictions[0]))
 
 
 def test_without_history_frames_stand_alone_without_identities(model):
-    predictions, _ = run(model, MemorySequence(3), temporal=False)
+    predictions, _ = run(model, MemoryDrive(3), temporal=False)
     assert {str(p.started_anew or "") for p in predictions} == {"history is off"}
-    alone, _ = run(model, MemorySequence(3), [1], temporal=False)
+    alone, _ = run(model, MemoryDrive(3), [1], temporal=False)
     assert_same(predictions[1], alone[0], ids=False)
     assert predictions[1].boxes.instances is None
 
@@ -168,7 +168,7 @@ def test_without_history_frames_stand_alone_without_identities(model):
 def test_a_frame_without_images_passes_the_tracks_on(model):
     predictions, _ = run(model, WithoutImages({1: "all"}, count=4))
     assert [p.skipped for p in predictions] == [False, True, False, False]
-    spanned, _ = run(model, MemorySequence(4), [0, 2, 3])
+    spanned, _ = run(model, MemoryDrive(4), [0, 2, 3])
     assert_same(predictions[2], spanned[1])
 
 
@@ -180,7 +180,7 @@ def test_a_scene_that_begins_without_images_keeps_no_identities(model):
 
 def test_identities_go_on_after_a_frame_that_is_not_finite(model):
     runner, preprocessor = Runner(model, CPU, StepOptions(tracker=TrackerConfig())), Preprocessor(model.config)
-    frames = [preprocessor(MemorySequence(3).load(place)) for place in range(3)]
+    frames = [preprocessor(MemoryDrive(3).load(place)) for place in range(3)]
     state, first = runner.step(None, frames[0])
     spoilt = frames[1].images.clone()
     spoilt[0, 0, 0, 0, 0] = float("nan")
@@ -202,22 +202,22 @@ def loaded(model) -> Model:
 
 
 def test_a_run_takes_the_models_identities_none_without_tracking(loaded, whole):
-    tracked = [prediction for _, prediction in run_model(loaded, MemorySequence(3))]
+    tracked = [prediction for _, prediction in run_model(loaded, MemoryDrive(3))]
     for one, other in zip(tracked, whole, strict=False):
         assert one.boxes.instances.tolist() == other.boxes.instances.tolist()
-    for _, prediction in run_model(loaded, MemorySequence(2), track=False):
+    for _, prediction in run_model(loaded, MemoryDrive(2), track=False):
         assert prediction.boxes.instances is None
         assert prediction.boxes.duplicates is None
 
 
 def test_without_history_the_tracker_gives_identities(loaded):
-    for _, prediction in run_model(loaded, MemorySequence(2), temporal=False):
+    for _, prediction in run_model(loaded, MemoryDrive(2), temporal=False):
         assert (prediction.boxes.instances != "").all()  # this tracker starts a track from every box
 
 
 def test_an_interrupted_run_is_resumed_with_its_tracks(loaded, tmp_path):
     options = RunOptions(recording=RecordingOptions(score=0.5))
-    drive = MemorySequence(5, scenes="aaabb")
+    drive = MemoryDrive(5, scenes="aaabb")
     run_into_folder(loaded, drive, tmp_path / "whole", options)
     stops = iter([False, True]).__next__
     run_into_folder(loaded, drive, tmp_path / "cut", options, should_stop=stops)
@@ -238,7 +238,7 @@ class OneDrive(list):
         return self[index]
 
 
-class Labelled(MemorySequence):
+class Labelled(MemoryDrive):
     """Its true boxes are the predicted ones."""
 
     def __init__(self, predictions):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors
 import torch
-from memory_drive import MemorySequence, make_camera, make_rig
+from memory_drive import MemoryDrive, make_camera, make_rig
 
 from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
@@ -76,7 +76,7 @@ def test_boxes_in_ego_do_not_depend_on_the_drives_bev_frame(mini_config, ego_fro
     runner = Runner(build_model(config), torch.device("cpu"))
     found = []
     for frame_of_drive in (default_ego_from_bev(), ego_from_bev):
-        drive = MemorySequence(2, rig=replace(make_rig(), ego_from_bev=frame_of_drive))
+        drive = MemoryDrive(2, rig=replace(make_rig(), ego_from_bev=frame_of_drive))
         results = [prediction for _, prediction, _ in runner.run(drive, range(2), Preprocessor(config))]
         found.append(results[-1].boxes_ego)
     np.testing.assert_allclose(found[0].centers, found[1].centers, atol=1e-4)

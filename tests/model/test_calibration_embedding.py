@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from memory_drive import MemorySequence, make_camera, make_rig
+from memory_drive import MemoryDrive, make_camera, make_rig
 from small_model import HEIGHT, WIDTH, small_config, small_inputs, small_model
 
 from bevcli.checkpoints import compare, load_weights
@@ -79,7 +79,7 @@ def test_each_sequence_of_a_batch_may_have_its_own_embeddings():
 
 
 def test_a_drive_in_memory_gives_rays_of_finite_numbers():
-    frame = MemorySequence().load(0)
+    frame = MemoryDrive().load(0)
     camera = frame.rig.cameras[0]
     matrix = camera.image_from_camera @ camera.camera_from_ego @ frame.rig.ego_from_bev
     features = ray_features(torch.tensor(matrix, dtype=torch.float32)[None], ((9, 16),), (180, 320), 1.84)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
@@ -22,7 +22,7 @@ def test_an_exported_vad_equals_the_model(mini_vad: VAD, tmp_path: Path) -> None
     file = tmp_path / "vad.onnx"
     export_onnx(mini_vad, file)
     exported = load_exported(file, "onnxruntime")
-    drive = MemorySequence(3)
+    drive = MemoryDrive(3)
     *_, last = check_exported(file, Model(mini_vad), drive)
     assert last.further.keys() == {
         "line_class_logits", "line_points", "future_offsets", "mode_logits", "plan_offsets"

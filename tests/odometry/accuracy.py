@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.inference.load import load_model
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion, measure_motion
 from bevcli.workshop.training.options import ValidationOptions
 from bevcli.workshop.training.train import score_drives
@@ -80,17 +80,17 @@ class DriveErrors:
     processor_s: float
 
 
-class WithoutPoses(DerivedSequence):
+class WithoutPoses(DerivedDrive):
     """A drive of one rig whose poses are all the identity, as of one without ego-motion, with some of its cameras."""
 
-    def __init__(self, sequence: Sequence, cameras: list[str] | None = None) -> None:
+    def __init__(self, sequence: Drive, cameras: list[str] | None = None) -> None:
         super().__init__(sequence)
         self._names = list(sequence.rig.names) if cameras is None else cameras
         self.rig = replace(sequence.rig, cameras=tuple(sequence.rig[name] for name in self._names))
         self.has_ego_motion, self.ego_motion = False, None
 
-    def load(self, place: int) -> Frame:
-        frame, nowhere = self.sequence.load(place), Pose.from_matrix(np.eye(4))
+    def load(self, index: int) -> Frame:
+        frame, nowhere = self.sequence.load(index), Pose.from_matrix(np.eye(4))
         still = replace(frame.kinematics, angular_rate=np.zeros(3), velocity=np.zeros(3))
         return replace(
             frame,
@@ -102,7 +102,7 @@ class WithoutPoses(DerivedSequence):
         )
 
 
-def measured(drive: Sequence, cameras: list[str] | None = None) -> tuple[DriveErrors, MeasuredMotion]:
+def measured(drive: Drive, cameras: list[str] | None = None) -> tuple[DriveErrors, MeasuredMotion]:
     """The errors of a drive with poses, and what was measured."""
     begin = time.process_time()
     motion = measure_motion(WithoutPoses(drive, cameras))
@@ -115,7 +115,7 @@ def measured(drive: Sequence, cameras: list[str] | None = None) -> tuple[DriveEr
     return DriveErrors(drive.name, steps, way_m, off_m, processor_s), motion
 
 
-def true_poses(drive: Sequence) -> Array:
+def true_poses(drive: Drive) -> Array:
     """(F, 4, 4) world_from_ego of the frames as the drive states them."""
     motion = drive.ego_motion
     assert motion is not None
@@ -174,20 +174,20 @@ class OpenDrives:
 
     input_shapes = None
 
-    def __init__(self, drives: list[Sequence]) -> None:
+    def __init__(self, drives: list[Drive]) -> None:
         self._drives = drives
 
     def __len__(self) -> int:
         return len(self._drives)
 
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         return self._drives[index]
 
 
 def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iterator[str]:
     """A line each for a model's scores with the right and with the measured motion, and their ratio."""
     loaded = load_model(model)
-    options, chosen = SequenceOptions(every=1, classes=loaded.config.classes), ValidationOptions(each=True)
+    options, chosen = InputOptions(every=1, classes=loaded.config.classes), ValidationOptions(each=True)
     right = [open_sequence(path, options) for path in paths]
     measured_drives = [MeasuredDrive(drive, motion) for drive, motion in zip(right, motions, strict=True)]
     found = []

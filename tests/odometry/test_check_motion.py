@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from stated_mistakes import FIRST, MISTAKES, SHOWN, stated
 
 import bevcli
@@ -26,7 +26,7 @@ SCALE = Finding("motion-scale", "warning", None, "the poses have another scale t
 INFO = Finding("motion-not-compared", "info", None, "the poses were not compared with the images")
 
 
-class Drive(MemorySequence):
+class MadeDrive(MemoryDrive):
     """The drive of stated_mistakes.py: nine frames, and their poses in a table or not."""
 
     def __init__(self, poses, in_table=True):
@@ -52,18 +52,18 @@ def shown(monkeypatch):
 
 @pytest.mark.parametrize("in_table", [True, False])
 def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
-    assert stated_motion_findings(Drive(stated(), in_table)) == ()
-    (finding,) = stated_motion_findings(Drive(MISTAKES["km/h"][0], in_table))
+    assert stated_motion_findings(MadeDrive(stated(), in_table)) == ()
+    (finding,) = stated_motion_findings(MadeDrive(MISTAKES["km/h"][0], in_table))
     assert finding.code == "motion-scale"
 
 
 def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch):
     monkeypatch.setattr(calibrate, "motion_findings", lambda drive: (OFF,))
     check = commands.CHECK_MOTION.apply
-    (finding,) = check(CheckMotionOptions(), lambda: Drive(MISTAKES["km/h"][0]))
+    (finding,) = check(CheckMotionOptions(), lambda: MadeDrive(MISTAKES["km/h"][0]))
     assert finding.code == "motion-scale"
-    assert check(CheckMotionOptions(), lambda: Drive(stated())) == (OFF,)
-    assert check(CheckMotionOptions(motion=False), lambda: Drive(MISTAKES["km/h"][0])) == ()
+    assert check(CheckMotionOptions(), lambda: MadeDrive(stated())) == (OFF,)
+    assert check(CheckMotionOptions(motion=False), lambda: MadeDrive(MISTAKES["km/h"][0])) == ()
 
 
 def test_one_cause_is_told_where_both_are_off():
@@ -76,7 +76,7 @@ def test_one_cause_is_told_where_both_are_off():
 
 
 def test_frames_are_chosen_where_the_poses_turn():
-    drive = Drive(stated())
+    drive = MadeDrive(stated())
     times = drive.ego_motion.timestamps_ns
     drive.stamps = tuple(FrameStamp(place, "", int(time)) for place, time in enumerate(times[::10]))  # 5 Hz
     places = chosen_places(drive)
@@ -88,9 +88,9 @@ def test_frames_are_chosen_where_the_poses_turn():
 
 
 def test_a_short_drive_and_the_longest_scene_are_taken():
-    assert chosen_places(MemorySequence(4)) == [0, 1, 2, 3]
-    assert chosen_places(MemorySequence(6, scenes="aabbbb")) == [2, 3, 4, 5]
-    assert chosen_places(MemorySequence(0)) == []
+    assert chosen_places(MemoryDrive(4)) == [0, 1, 2, 3]
+    assert chosen_places(MemoryDrive(6, scenes="aabbbb")) == [2, 3, 4, 5]
+    assert chosen_places(MemoryDrive(0)) == []
 
 
 def test_what_cannot_be_measured_is_said(monkeypatch):
@@ -98,10 +98,10 @@ def test_what_cannot_be_measured_is_said(monkeypatch):
         raise InputError("memory: has one frame")
 
     monkeypatch.setattr(check_motion, "measure_motion", refuse)
-    (finding,) = stated_motion_findings(MemorySequence(1))
+    (finding,) = stated_motion_findings(MemoryDrive(1))
     assert (finding.code, finding.severity) == ("motion-not-compared", "info")
     assert "memory: has one frame" in finding.message
-    without = MemorySequence(1)
+    without = MemoryDrive(1)
     without.has_ego_motion = False
     assert stated_motion_findings(without) == ()
 

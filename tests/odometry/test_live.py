@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 import bevcli
 from bevcli.errors import InputError
@@ -26,7 +26,7 @@ class Meter:
     ahead = 0.0
 
     def __init__(self):
-        drive = MemorySequence(COUNT)
+        drive = MemoryDrive(COUNT)
         poses = [drive.pose(place).matrix for place in range(COUNT)]
         self.steps = [inverse(a) @ b for a, b in pairwise(poses)]
         self.frames = 0
@@ -46,7 +46,7 @@ class Meter:
 @pytest.fixture
 def session(mini_model, monkeypatch):
     monkeypatch.setattr(live, "MotionMeter", Meter)
-    return bevcli.Session(bevcli.Model(mini_model), MemorySequence(1).rig)
+    return bevcli.Session(bevcli.Model(mini_model), MemoryDrive(1).rig)
 
 
 def images_of(frame):
@@ -60,7 +60,7 @@ def path(drive):
 
 
 def test_a_session_without_poses_is_one_with_the_measured_ones(session, mini_model):
-    drive = MemorySequence(COUNT)
+    drive = MemoryDrive(COUNT)
     given = bevcli.Session(bevcli.Model(mini_model), drive.rig)
     for place, pose in enumerate(path(drive)):
         frame = drive.load(place)
@@ -75,7 +75,7 @@ def test_a_session_without_poses_is_one_with_the_measured_ones(session, mini_mod
 
 def test_the_history_gets_the_corrected_pose(session, monkeypatch):
     monkeypatch.setattr(Meter, "ahead", 0.5)
-    drive, histories, step = MemorySequence(COUNT), [], session._runner.step
+    drive, histories, step = MemoryDrive(COUNT), [], session._runner.step
 
     def spy(state, prepared):
         histories.append(state.memory and state.memory.pose.matrix)
@@ -93,7 +93,7 @@ def test_the_history_gets_the_corrected_pose(session, monkeypatch):
 
 
 def test_poses_for_some_frames_only_are_refused(session):
-    frame = MemorySequence(1).load(0)
+    frame = MemoryDrive(1).load(0)
     session.step(images_of(frame), None, 0)
     with pytest.raises(InputError, match="is a pose, but for the frame before it was None"):
         session.step(images_of(frame), np.eye(4), 1)
@@ -107,7 +107,7 @@ def test_poses_for_some_frames_only_are_refused(session):
 
 
 def test_a_reset_begins_a_new_world(session):
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     for time, place in enumerate((0, 1)):
         session.step(images_of(drive.load(place)), None, time)
     assert np.linalg.norm(session.frame.world_from_ego.translation) > 1
@@ -117,7 +117,7 @@ def test_a_reset_begins_a_new_world(session):
 
 
 def test_a_gap_begins_a_new_world(session):
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     for time in (0, 10**9, 60 * 10**9):
         prediction = session.step(images_of(drive.load(0)), None, time)
     assert prediction.started_anew.reason is StartReason.GAP

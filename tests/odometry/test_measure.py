@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion, MeasuredStep, MotionMeter, measure_motion
@@ -16,7 +16,7 @@ from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion, Meas
 STREET = "samples/street"
 
 
-def true_steps(drive: Sequence) -> list[Array]:
+def true_steps(drive: Drive) -> list[Array]:
     """The motions (4, 4) between the frames of a drive."""
     assert drive.ego_motion is not None
     poses = [drive.ego_motion.pose_at(stamp.timestamp_ns).matrix for stamp in drive.stamps]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.odometry.measure import measure_motion
 
@@ -17,10 +17,10 @@ STEPS, STEP_NS = 300, 500_000_000
 GROWS_MIB = 30.0  # at most, after a third of the steps; features of frames that are kept would be 100 MiB
 
 
-class ToAndFro(DerivedSequence):
+class ToAndFro(DerivedDrive):
     """The first frames of a drive to and fro, in images of half the size of its first camera."""
 
-    def __init__(self, sequence: Sequence, frames: int, count: int) -> None:
+    def __init__(self, sequence: Drive, frames: int, count: int) -> None:
         super().__init__(sequence)
         first, turn = sequence.stamps[0], 2 * (frames - 1)
         self._places = [min(place % turn, turn - place % turn) for place in range(count)]
@@ -29,8 +29,8 @@ class ToAndFro(DerivedSequence):
         )
         self.rig = replace(sequence.rig, cameras=(sequence.rig.cameras[0].scaled(0.5),))
 
-    def load(self, place: int) -> Frame:
-        frame, stamp, (camera,) = self.sequence.load(self._places[place]), self.stamps[place], self.rig.cameras
+    def load(self, index: int) -> Frame:
+        frame, stamp, (camera,) = self.sequence.load(self._places[index]), self.stamps[index], self.rig.cameras
         image = frame.images[camera.name]
         half = cv2.resize(image.pixels_bgr, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         images = {camera.name: replace(image, timestamp_ns=stamp.timestamp_ns, pixels_bgr=half.astype(np.uint8))}

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from command_line import MINI_TOML, command
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from true_motion import STREET, motion_of, street_copy
 
 import bevcli
@@ -17,7 +17,7 @@ from bevcli.errors import InputError
 from bevcli.evaluation.inputs import pair_frames
 from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch.job import Job
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredDrive
@@ -95,14 +95,14 @@ def test_frames_outside_of_the_range_are_not_measured(folder, measuring):
 
 
 def test_a_fast_drive_is_thinned(folder):
-    fast = MemorySequence(9, scenes="a" * 9, step_s=1 / 30)
+    fast = MemoryDrive(9, scenes="a" * 9, step_s=1 / 30)
     assert [stamp.index for stamp in at_most_rate(fast).stamps] == [0, 3, 6]
-    slow = MemorySequence(4, step_s=1 / MOST_RATE_HZ)
+    slow = MemoryDrive(4, step_s=1 / MOST_RATE_HZ)
     assert at_most_rate(slow) is slow
 
 
 def test_scenes_have_motions_of_their_own(monkeypatch):
-    drive = MemorySequence(5, scenes="aabbb")
+    drive = MemoryDrive(5, scenes="aabbb")
     monkeypatch.setattr(measure, "measure_motion", lambda scene, after_step: motion_of(scene))
     found = with_measured_motion(drive, drive)
     assert found.has_ego_motion
@@ -153,7 +153,7 @@ def test_a_drive_is_shown_with_measured_poses(folder, tmp_path, measuring):
 
 
 def test_a_drive_of_a_batch_is_measured(folder, measuring):
-    job = Job("runs/fleet", source=SequenceOptions(odometry=True))
+    job = Job("runs/fleet", source=InputOptions(odometry=True))
     assert job.open(folder, None).has_ego_motion
     assert len(measuring) == 1
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 from rerun.chunk import RrdReader
 from true_motion import motion_of
 
@@ -22,7 +22,7 @@ def squares(places):
     return (np.floor(places / SQUARE_M).sum(-1) % 2).astype(np.uint8)
 
 
-class ChessBoard(MemorySequence):
+class ChessBoard(MemoryDrive):
     """A drive over a chess board, whose images are made ray by ray."""
 
     def load(self, place):
@@ -122,7 +122,7 @@ def test_an_even_choice_of_the_points_is_shown_where_they_are():
 
 
 def test_a_drive_without_poses_has_no_stated_ones():
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     drive.has_ego_motion = False
     watched = WatchedDrive(drive)
     watched.load(0)

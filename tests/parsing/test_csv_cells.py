@@ -4,7 +4,7 @@ import csv
 from dataclasses import replace
 
 import pytest
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 from recorded_drive import boxes_ahead
 
 from bevcli.evaluation.box_format import write_csv
@@ -25,7 +25,7 @@ def test_a_name_comes_back_and_is_no_formula(name):
 
 
 def test_scene_and_camera_come_back_from_frames_csv(tmp_path):
-    drive = MemorySequence(2, make_rig({"=FRONT": 0.0}))
+    drive = MemoryDrive(2, make_rig({"=FRONT": 0.0}))
     with NativeWriter(tmp_path / "drive", with_ego_motion=True) as writer:
         for place in range(2):
             frame = drive.load(place)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import TINY, NamedModel, boxes_ahead, predict
 
 from bevcli.config import as_table, config_of_table
@@ -46,7 +46,7 @@ def drawn(frame):
 
 
 def test_a_mesh_fills_the_boxes_of_its_class(tmp_path, wedge, in_this_process):
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     frames = [drive.load(place) for place in range(2)]
     with Recording(tmp_path / "r.rrd", drive, NamedModel(config=with_mesh(wedge))) as recording:
         recording.log(frames[0], predict(frames[0]))
@@ -76,7 +76,7 @@ def test_a_mesh_changes_no_result_nor_hash():
 
 
 def test_without_a_mesh_there_is_no_entity(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame = drive.load(0)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, predict(frame))
@@ -101,7 +101,7 @@ def test_a_wrong_mesh_is_one_line_before_anything_is_written(
         (tmp_path / name).write_bytes(content)
     monkeypatch.setattr(meshes, "MOST_TRIANGLES", 1)
     model = NamedModel(config=with_mesh(tmp_path / name))
-    with pytest.raises(InputError, match=message) as caught, Recording(tmp_path / "r.rrd", MemorySequence(1), model):
+    with pytest.raises(InputError, match=message) as caught, Recording(tmp_path / "r.rrd", MemoryDrive(1), model):
         pass
     assert str(caught.value).startswith(f'mesh of class "car": {tmp_path / name}: ')
     assert "\n" not in str(caught.value)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
 
 from bevcli.config import load_config
@@ -39,12 +39,12 @@ def with_futures():
 
 
 @pytest.fixture(scope="module")
-def drive() -> MemorySequence:
-    return MemorySequence(2)
+def drive() -> MemoryDrive:
+    return MemoryDrive(2)
 
 
 @pytest.fixture(scope="module")
-def frames(drive: MemorySequence, tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
+def frames(drive: MemoryDrive, tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     """Two frames; the second has no image, and so no results."""
     path = tmp_path_factory.mktemp("lines") / "r.rrd"
     with Recording(path, drive, PLANNER) as recording:
@@ -70,7 +70,7 @@ def test_the_legend_names_lines_paths_and_futures(frames: list[RecordedFrame]) -
     assert frames[1].values(f"{entities.LEGEND}/texts", "Points2D:labels")[-5:] == expected
 
 
-def test_lines_in_the_scene_lie_on_the_ground(frames: list[RecordedFrame], drive: MemorySequence) -> None:
+def test_lines_in_the_scene_lie_on_the_ground(frames: list[RecordedFrame], drive: MemoryDrive) -> None:
     (line,) = strips(frames[0], f"{entities.WORLD}/map_lines")
     origin = frames[0].array(entities.WORLD, "origin", 3)[0]
     in_bev = apply(bev_from_world(drive.load(0)), line + origin)
@@ -78,7 +78,7 @@ def test_lines_in_the_scene_lie_on_the_ground(frames: list[RecordedFrame], drive
     np.testing.assert_allclose(in_bev[:, 2], -drive.rig.ego_from_bev[2, 3], atol=0.05)
 
 
-def test_a_line_in_the_image_is_where_opencv_projects_it(frames: list[RecordedFrame], drive: MemorySequence) -> None:
+def test_a_line_in_the_image_is_where_opencv_projects_it(frames: list[RecordedFrame], drive: MemoryDrive) -> None:
     camera, height = drive.rig["CAM_FRONT"], drive.rig.ego_from_bev[2, 3]
     far = np.array([[-2.0, 25.0, -height]])
     in_camera = apply(np.linalg.inv(camera.ego_from_camera) @ drive.rig.ego_from_bev, far)

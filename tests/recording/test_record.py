@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.errors import InputError
@@ -28,20 +28,20 @@ CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS
 
 
-class Labelled(MemorySequence):
+class Labelled(MemoryDrive):
     """A drive with a car, and with a bicycle that `boxes_of` does not have."""
 
-    def load(self, place: int) -> Frame:
-        return replace(with_truth(super().load(place)), sample_token=f"token-{place}")
+    def load(self, index: int) -> Frame:
+        return replace(with_truth(super().load(index)), sample_token=f"token-{index}")
 
 
-def boxes_of(drive: MemorySequence, place: int) -> Boxes3D:
+def boxes_of(drive: MemoryDrive, index: int) -> Boxes3D:
     """The boxes of `recorded_drive` in the world frame."""
-    frame = drive.load(place)
+    frame = drive.load(index)
     return boxes_ahead().transformed(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
 
 
-def boxes_file(drive: MemorySequence, places: range) -> BoxesFile:
+def boxes_file(drive: MemoryDrive, places: range) -> BoxesFile:
     stamped = [(drive.load(place), boxes_of(drive, place)) for place in places]
     frames = [FrameBoxes(f.stamp, f.world_from_ego, b, {"sample_token": f.sample_token}) for f, b in stamped]
     return BoxesFile("world", tuple(frames))
@@ -188,7 +188,7 @@ def test_the_summary_and_the_video_name_both_models(two):
 
 def test_the_legend_names_what_is_drawn():
     def legend(boxes):
-        return [text for text, _ in legend_entries(Recorded(MemorySequence(1), boxes, RecordingOptions()))]
+        return [text for text, _ in legend_entries(Recorded(MemoryDrive(1), boxes, RecordingOptions()))]
 
     assert legend(RecordedBoxes(("a", "b"))) == ["a", "b", "ground truth"]
     assert {"car", "ground truth", "missed, false"} <= set(legend(RecordedBoxes(("a",))))

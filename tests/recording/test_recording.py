@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.cli.run import _frame_warnings
@@ -29,7 +29,7 @@ from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 def standard(tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     options = RecordingOptions(probes=((0.0, 10.0),))
-    frames = record(path, MemorySequence(3), options)
+    frames = record(path, MemoryDrive(3), options)
     return frames, list(RecordingReader(path).frames()), path
 
 
@@ -55,12 +55,12 @@ def test_boxes_come_back_in_the_world(standard):
 
 
 def test_boxes_far_from_the_origin_keep_millimetres(tmp_path):
-    class UtmSequence(MemorySequence):
-        def pose(self, place: int) -> Pose:
-            near = super().pose(place)
+    class UtmDrive(MemoryDrive):
+        def pose(self, index: int) -> Pose:
+            near = super().pose(index)
             return Pose(near.translation + [654321.0, 5345678.0, 512.0], near.quaternion)
 
-    frames = record(tmp_path / "utm.rrd", UtmSequence(2))
+    frames = record(tmp_path / "utm.rrd", UtmDrive(2))
     last = list(RecordingReader(tmp_path / "utm.rrd").frames())[-1]
     back = recorded_boxes(last).boxes.transformed(bev_from_world(frames[-1]))
     np.testing.assert_allclose(back.centers, boxes_ahead()[:2].centers, atol=1e-3)
@@ -110,7 +110,7 @@ def test_static_entities_are_written_once(standard):
 
 def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
     """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its image."""
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame = drive.load(0)
     earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
     frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": earlier})
@@ -128,7 +128,7 @@ def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
 
 
 def test_the_encoded_bytes_of_an_image_file_are_kept(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame = drive.load(0)
     image = frame.images["CAM_FRONT"]
     jpeg = cv2.imencode(".jpg", image.pixels_bgr)[1].tobytes()
@@ -149,7 +149,7 @@ def test_a_dropped_image_clears_the_view_and_logs_an_event(tmp_path):
 
 
 def test_a_recording_of_an_untrained_model_is_labelled(tmp_path):
-    record(tmp_path / "r.rrd", MemorySequence(1), untrained=True)
+    record(tmp_path / "r.rrd", MemoryDrive(1), untrained=True)
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert frame.values(entities.RUN, "untrained") == [True]
     assert "untrained" in frame.values(entities.RUN, "TextDocument:text")[0]
@@ -163,7 +163,7 @@ def events(path: Path) -> list[str]:
 
 
 def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
-    drive = MemorySequence(4, scenes="aabb")
+    drive = MemoryDrive(4, scenes="aabb")
     first, new = NewStart(StartReason.FIRST_FRAME), NewStart(StartReason.NEW_SCENE)
     reasons = (first, None, new, NewStart(StartReason.GAP, 9.0))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
@@ -179,7 +179,7 @@ def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
 
 @pytest.mark.parametrize("changes", [{"skipped": True}, {"not_finite": "neck"}], ids=["skipped", "not finite"])
 def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes):
-    drive = MemorySequence(1, scenes=[""])
+    drive = MemoryDrive(1, scenes=[""])
     frame = drive.load(0)
     gap = NewStart(StartReason.GAP, 2.5)
     failed = replace(predict(frame), boxes=Boxes3D.empty(), bev=None, started_anew=gap, **changes)
@@ -189,7 +189,7 @@ def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes)
 
 
 def test_a_minimal_recording_has_no_internals(tmp_path):
-    record(tmp_path / "r.rrd", MemorySequence(2), RecordingOptions(level="minimal"))
+    record(tmp_path / "r.rrd", MemoryDrive(2), RecordingOptions(level="minimal"))
     *_, last = RecordingReader(tmp_path / "r.rrd").frames()
     assert not {entities.BEV_FEATURES, entities.BEV_ON_GROUND, entities.PILLARS, entities.BEV_HISTORY} & set(last.rows)
     assert last.has(entities.BOXES, "Boxes3D:centers")
@@ -201,7 +201,7 @@ def test_a_frame_adds_at_most_400_kb(standard):
     images = sum(
         len(frame.blob(entities.image(name), "EncodedImage:blob"))
         for frame in RecordingReader(path).frames()
-        for name in MemorySequence(1).rig.names
+        for name in MemoryDrive(1).rig.names
     )
     assert path.stat().st_size < 1.05 * images + 3 * 400_000
 
@@ -209,7 +209,7 @@ def test_a_frame_adds_at_most_400_kb(standard):
 @pytest.mark.filterwarnings("error")
 def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN_STRICT", "1")
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     first, second = (with_truth(drive.load(place)) for place in range(2))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(first, predict(first))
@@ -222,7 +222,7 @@ def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
 
 
 def test_events_before_the_first_frame_are_kept(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame = with_truth(drive.load(0))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.event("a note", "WARN")
@@ -233,7 +233,7 @@ def test_events_before_the_first_frame_are_kept(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     recording = Recording(tmp_path / "no" / "r.rrd", drive, NamedModel())
     with pytest.raises(OutputError, match=r"r\.rrd"), recording:
         pass
@@ -261,7 +261,7 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
 
 def test_a_resumed_recording_can_be_read_before_it_is_closed(tmp_path, monkeypatch):
     """Its last stream has an index that does not fit the file: a kill before the index was cut off left it there."""
-    drive, path, close, read = MemorySequence(2), tmp_path / "r.rrd", RrdFile.close, []
+    drive, path, close, read = MemoryDrive(2), tmp_path / "r.rrd", RrdFile.close, []
     frames, options = [drive.load(place) for place in range(2)], RecordingOptions(level="minimal")
     with Recording(path, drive, NamedModel(), options) as recording:
         recording.log(frames[0], predict(frames[0]))
@@ -302,7 +302,7 @@ def test_the_threads_of_earlier_recordings_end(tmp_path):
 
     counts = []
     for number in range(5):
-        record(tmp_path / f"{number}.rrd", MemorySequence(1))
+        record(tmp_path / f"{number}.rrd", MemoryDrive(1))
         gc.collect()
         counts.append(streams())
     # Those of the last recording and of its blueprint end when the next one begins, in a thread.

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rerun as rr
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.recording import entities
@@ -19,7 +19,7 @@ CAR, PEDESTRIAN = entities.track("car", "7"), entities.track("pedestrian", "8")
 
 def record_tracks(path, count: int, instances, scenes: str = "a" * 30):
     """A recording whose three boxes have these instances, by frame; returns its frames as read."""
-    drive = MemorySequence(count, scenes=scenes)
+    drive = MemoryDrive(count, scenes=scenes)
     with Recording(path, drive, NamedModel()) as recording:
         for place in range(count):
             frame = drive.load(place)
@@ -78,7 +78,7 @@ def test_boxes_of_a_recording_keep_their_identity(tmp_path):
 
 
 def test_a_recording_without_a_tracker_has_no_tracks(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(drive.load(0), predict(drive.load(0)))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
@@ -113,7 +113,7 @@ def test_the_marks_of_the_tracker_count_unless_the_box_is_true():
 
 @pytest.mark.parametrize("entity", [entities.DUPLICATES, entities.BEV_DUPLICATES])
 def test_duplicates_are_marked_in_both_views(tmp_path, entity):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame = with_truth(drive.load(0))
     twice = boxes_ahead()[[0, 0, 1]]
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:

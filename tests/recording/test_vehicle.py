@@ -8,7 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import trimesh
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import record
 
 from bevcli.errors import InputError
@@ -96,7 +96,7 @@ def test_colours_are_taken_from_a_texture(tmp_path, in_this_process):
 
 def test_a_recording_has_the_mesh_of_the_file(tmp_path, in_this_process):
     van().export(tmp_path / "van.ply")
-    record(tmp_path / "r.rrd", MemorySequence(1), RecordingOptions(vehicle_mesh=tmp_path / "van.ply"))
+    record(tmp_path / "r.rrd", MemoryDrive(1), RecordingOptions(vehicle_mesh=tmp_path / "van.ply"))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     vertices = frame.array(entities.VEHICLE, "Mesh3D:vertex_positions", 3)
     np.testing.assert_allclose((vertices.min(0), vertices.max(0)), [(-1, -1, 0.3), (4, 1, 2.3)], atol=1e-6)

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 from recorded_drive import record
 
 from bevcli.errors import BevcliError
@@ -40,7 +40,7 @@ def test_each_image_is_complete_when_it_was_encoded(size):
 
 @with_av
 def test_the_images_of_a_recording_come_back(tmp_path):
-    class Street(MemorySequence):
+    class Street(MemoryDrive):
         def load(self, place):
             frame = super().load(place)
             for image in frame.images.values():

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, make_camera, make_rig
+from memory_drive import MemoryDrive, make_camera, make_rig
 from recorded_drive import GRID, TINY, NamedModel, predict, record
 
 from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
@@ -31,7 +31,7 @@ from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 
 
-class Drive(MemorySequence):
+class MadeDrive(MemoryDrive):
     """A drive that states facts."""
 
     def __init__(self, count: int = 2, rendered: bool = False, geo_origin: GeoOrigin | None = None):
@@ -68,7 +68,9 @@ def test_map_classes_of_any_name_have_different_colours():
 
 def test_the_legend_names_every_class_and_map_class():
     def legend(config):
-        return [text for text, _ in legend_entries(Recorded(Drive(), NamedModel(config=config), RecordingOptions()))]
+        return [
+            text for text, _ in legend_entries(Recorded(MadeDrive(), NamedModel(config=config), RecordingOptions()))
+        ]
 
     names = legend(replace(TINY, heads=("detection", "segmentation")))
     assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
@@ -77,7 +79,7 @@ def test_the_legend_names_every_class_and_map_class():
 
 
 def test_the_legend_is_in_the_recording(tmp_path):
-    record(tmp_path / "r.rrd", MemorySequence(1))
+    record(tmp_path / "r.rrd", MemoryDrive(1))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert "traffic cone" in frame.values(f"{entities.LEGEND}/texts", "Points2D:labels")
 
@@ -112,7 +114,7 @@ class Weights(NamedModel):
 
 def test_titles_say_when_the_weights_do_not_know_such_images():
     def note(model, rendered):
-        return Recorded(Drive(rendered=rendered), model, RecordingOptions()).note
+        return Recorded(MadeDrive(rendered=rendered), model, RecordingOptions()).note
 
     assert note(Weights(), rendered=False) == FROM_RENDERED
     assert note(Weights(), rendered=True) == ""
@@ -121,7 +123,7 @@ def test_titles_say_when_the_weights_do_not_know_such_images():
 
 
 def test_the_note_is_an_event_and_in_the_file(tmp_path):
-    drive = Drive()
+    drive = MadeDrive()
     with Recording(tmp_path / "r.rrd", drive, Weights()) as recording:
         recording.log(drive.load(0), predict(drive.load(0)))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
@@ -132,14 +134,14 @@ def test_the_note_is_an_event_and_in_the_file(tmp_path):
 
 
 def test_the_speed_is_a_curve_and_a_label(tmp_path):
-    record(tmp_path / "r.rrd", MemorySequence(1))
+    record(tmp_path / "r.rrd", MemoryDrive(1))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert frame.array(entities.SPEED_CURVE, "Scalars:scalars", 1)[0, 0] == pytest.approx(6.0 * 3.6)
     assert frame.values(entities.SPEED, "Points3D:labels") == ["22 km/h"]
 
 
 def test_a_drive_without_poses_shows_no_speed(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     drive.has_ego_motion = False
     record(tmp_path / "r.rrd", drive)
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
@@ -147,7 +149,7 @@ def test_a_drive_without_poses_shows_no_speed(tmp_path):
 
 
 def test_the_segmentation_lies_on_the_ground(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, 0] = MAP_CLASSES["vehicle"]  # the first row has the largest y
     maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m)
@@ -164,7 +166,7 @@ def test_the_segmentation_lies_on_the_ground(tmp_path):
 
 def test_a_map_is_painted_only_where_a_camera_looks(tmp_path):
     """With cameras to the front and the back, none to the sides; and in the second frame, to the front only."""
-    drive = MemorySequence(2, rig=make_rig({"CAM_FRONT": 0, "CAM_BACK": 180}))
+    drive = MemoryDrive(2, rig=make_rig({"CAM_FRONT": 0, "CAM_BACK": 180}))
     maps = BevMap(np.full((20, 20), MAP_CLASSES["vehicle"], np.uint8), GRID.x_range_m, GRID.y_range_m)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         for place in range(2):
@@ -189,7 +191,7 @@ class LaneConfig(ModelConfig):
 
 
 def test_a_model_with_its_own_map_classes_is_drawn_with_a_legend(tmp_path):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, :3] = [1, 1 + 2, 4]
     config = LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
@@ -207,7 +209,7 @@ def test_a_model_with_its_own_map_classes_is_drawn_with_a_legend(tmp_path):
 
 
 def test_a_drive_with_a_place_on_earth_has_a_street_map(tmp_path):
-    drive = Drive(3, geo_origin=GeoOrigin(48.1374, 11.5755, 90.0))
+    drive = MadeDrive(3, geo_origin=GeoOrigin(48.1374, 11.5755, 90.0))
     record(tmp_path / "r.rrd", drive)
     frames = list(RecordingReader(tmp_path / "r.rrd").frames())
     for place, frame in enumerate(frames):
@@ -216,12 +218,12 @@ def test_a_drive_with_a_place_on_earth_has_a_street_map(tmp_path):
         assert (latitude - 48.1374) * 111_200 == pytest.approx(north, abs=0.05)
         assert (longitude - 11.5755) * 111_320 * np.cos(np.radians(48.1374)) == pytest.approx(east, abs=0.1)
         assert len(frame.array(entities.MAP_BOXES, "GeoPoints:positions", 2)) == 2
-    record(tmp_path / "none.rrd", Drive(1))
+    record(tmp_path / "none.rrd", MadeDrive(1))
     (frame,) = RecordingReader(tmp_path / "none.rrd").frames()
     assert not {entities.MAP_EGO, entities.MAP_BOXES} & set(frame.rows)
 
 
 def test_the_rate_of_the_time_panel_is_that_of_the_drive():
-    assert frame_rate_hz(MemorySequence(5, step_s=0.5).stamps) == pytest.approx(2)
-    assert frame_rate_hz(MemorySequence(5, step_s=1 / 12).stamps) == pytest.approx(12)
-    assert frame_rate_hz(MemorySequence(1).stamps) == 2
+    assert frame_rate_hz(MemoryDrive(5, step_s=0.5).stamps) == pytest.approx(2)
+    assert frame_rate_hz(MemoryDrive(5, step_s=1 / 12).stamps) == pytest.approx(12)
+    assert frame_rate_hz(MemoryDrive(1).stamps) == 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import with_truth
 
 from bevcli.errors import BevcliError, InputError, OutputError
@@ -23,7 +23,7 @@ from bevcli.workshop.formats.mcap_writer import Messages
 from bevcli.workshop.formats.output import open_writer
 
 
-class Truthful(MemorySequence):
+class Truthful(MemoryDrive):
     """The drive in memory with ground truth, and a lens of eight coefficients in front."""
 
     def __init__(self):
@@ -138,7 +138,7 @@ def test_an_existing_file_is_replaced_only_with_force(file):
 
 
 def test_the_boxes_of_another_drive_are_refused(file, tmp_path):
-    other = MemorySequence(3, scenes="bbb")
+    other = MemoryDrive(3, scenes="bbb")
     options = WriteOptions("mcap", boxes=file.parent / "predictions.json")
     with pytest.raises(InputError, match="has none of the frames of memory"):
         open_writer(tmp_path / "a.mcap", other, options)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from healthy_rigs import HEALTHY, copy_of
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from mistakes import (
     BEV_MISTAKES,
     FIELD_MISTAKES,
@@ -108,7 +108,7 @@ def motion_codes():
     )  # fmt: skip
     wrong = {code: poses for poses, code, *_ in MISTAKES.values()}
     of_poses = [finding for poses in wrong.values() for finding in compare(poses, SHOWN)]
-    of_calibration = (*findings_of([late]), *motion_findings(MemorySequence(count=1)))
+    of_calibration = (*findings_of([late]), *motion_findings(MemoryDrive(count=1)))
     return {finding.code for finding in (*of_calibration, *of_poses, not_compared(""))}
 
 

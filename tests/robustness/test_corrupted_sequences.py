@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
@@ -28,12 +28,12 @@ from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
 DRAWS = Draws(0, "test")
 
 
-class WithTruth(MemorySequence):
+class WithTruth(MemoryDrive):
     """The noise drive with a parked car, in the world frame; counts how often a frame is read."""
 
     loads = 0
 
-    def load(self, place: int) -> Frame:
+    def load(self, index: int) -> Frame:
         self.loads += 1
         car = Boxes3D(
             np.array([[9.0, 2.0, 0.8]]),
@@ -42,7 +42,7 @@ class WithTruth(MemorySequence):
             np.array([[0.4, 0.1]]),
             np.array(["car"]),
         )
-        return replace(super().load(place), ground_truth=car)
+        return replace(super().load(index), ground_truth=car)
 
 
 def lost_cameras(frame: Frame) -> set[str]:
@@ -50,7 +50,7 @@ def lost_cameras(frame: Frame) -> set[str]:
 
 
 def test_a_crashed_camera_is_black_in_each_frame_also_at_harder():
-    drive = MemorySequence(3)
+    drive = MemoryDrive(3)
     lost = {}
     for level in (2, 4, 5):
         frames = [CameraCrash(drive, level, DRAWS, "black").load(place) for place in range(3)]
@@ -63,20 +63,20 @@ def test_a_crashed_camera_is_black_in_each_frame_also_at_harder():
 
 
 def test_cameras_crash_with_replacement_so_scenes_may_lose_fewer():
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     counts = {len(CameraCrash(drive, 2, Draws(seed, "test"), "black").lost(drive.load(0))) for seed in range(30)}
     assert counts == {1, 2}
 
 
 def test_a_missing_image_is_left_out_and_reported():
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     black, missing = (CameraCrash(drive, 4, DRAWS, kind).load(0) for kind in ("black", "missing"))
     assert set(missing.dropped) == lost_cameras(black) == set(drive.rig.names) - set(missing.images)
 
 
 @pytest.mark.parametrize("level", [2, 4, 5])
 def test_frame_lost_loses_a_share_of_level_sixths(level):
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     frame, sequence = drive.load(0), FrameLost(drive, level, DRAWS, "black")
     frames = [replace(frame, stamp=replace(frame.stamp, index=index)) for index in range(400)]
     lost = sum(len(sequence.lost(each)) for each in frames)
@@ -95,7 +95,7 @@ def test_calibration_noise_has_the_stated_spread_per_axis():
 
 
 def test_calibration_noise_is_one_wrong_rig_a_scene_and_no_more():
-    drive = MemorySequence(4, scenes="aabb")
+    drive = MemoryDrive(4, scenes="aabb")
     noisy = CalibrationNoise(drive, 2, DRAWS)
     frames = [noisy.load(place) for place in range(4)]
     assert frames[0].rig is frames[1].rig  # so that maps of the lens are made once
@@ -109,7 +109,7 @@ def test_calibration_noise_is_one_wrong_rig_a_scene_and_no_more():
 
 
 def test_a_wrong_capture_time_moves_the_camera_along_the_path():
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     clean, wrong = drive.load(1), TimeOffsets(drive, 200, DRAWS).load(1)
     offsets = {name: wrong.images[name].timestamp_ns - clean.images[name].timestamp_ns for name in drive.rig.names}
     assert len(set(offsets.values())) == 6
@@ -158,7 +158,7 @@ def _in_ego(frame: Frame) -> np.ndarray:
 
 
 def test_the_first_frame_of_a_scene_keeps_its_pose():
-    drive = MemorySequence(10, scenes="ababababab")
+    drive = MemoryDrive(10, scenes="ababababab")
     stale = EgoMotionLost(drive, 5, DRAWS)
     for place in range(10):
         assert np.array_equal(stale.load(place).world_from_ego.matrix, drive.pose(place).matrix)
@@ -166,7 +166,7 @@ def test_the_first_frame_of_a_scene_keeps_its_pose():
 
 @pytest.mark.parametrize("step", [2, 3, 4])
 def test_a_lower_rate_has_every_frame_once(step):
-    parts = at_lower_rate(MemorySequence(9), step)
+    parts = at_lower_rate(MemoryDrive(9), step)
     indices = [[stamp.index for stamp in part.stamps] for part in parts]
     assert sorted(index for part in indices for index in part) == list(range(9))
     assert all(later - earlier == step for part in indices for earlier, later in pairwise(part))
@@ -185,5 +185,5 @@ def test_kept_frames_are_read_once_while_the_memory_lasts():
 
 
 def test_scenes_are_run_one_by_one():
-    scenes = split_scenes(MemorySequence(5, scenes="aabbb"))
+    scenes = split_scenes(MemoryDrive(5, scenes="aabbb"))
     assert [[stamp.scene for stamp in scene.stamps] for scene in scenes] == [["a", "a"], ["b", "b", "b"]]

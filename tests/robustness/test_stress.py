@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from typer.testing import CliRunner
 
 from bevcli.cli.bridge import as_flags
@@ -24,16 +24,16 @@ NAMES = ("clean", "frame_lost", "snow", "calibration_noise", "ego_motion_lost", 
 CONDITIONS = [each for each in choose_conditions() if each.severity in ("", "hard", "4") and each.name in NAMES]
 
 
-class SelfLabelledDrive(MemorySequence):
+class SelfLabelledDrive(MemoryDrive):
     """The noise drive; its ground truth is what the model finds in the clean images, so that scores are high."""
 
     def __init__(self, model: Model, name: str = "memory") -> None:
         super().__init__(FRAMES)
         self.name = name
-        self.truth = [p.boxes_world[:6] for _, p in run(model, MemorySequence(FRAMES), track=False)]
+        self.truth = [p.boxes_world[:6] for _, p in run(model, MemoryDrive(FRAMES), track=False)]
 
-    def load(self, place: int) -> Frame:
-        return replace(super().load(place), ground_truth=self.truth[place])
+    def load(self, index: int) -> Frame:
+        return replace(super().load(index), ground_truth=self.truth[index])
 
 
 class DrivesInMemory(list):
@@ -149,7 +149,7 @@ def test_another_seed_gives_other_scores(model, drives, tmp_path):
 
 def test_a_drive_without_ground_truth_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="memory: has no ground truth"):
-        stress(model, [MemorySequence(2)], CONDITIONS[:1], tmp_path)
+        stress(model, [MemoryDrive(2)], CONDITIONS[:1], tmp_path)
 
 
 def test_the_command_needs_one_kind_of_drives():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage
@@ -26,7 +26,7 @@ def test_a_run_without_any_image_is_an_error(mini_model, tmp_path):
     assert with_one.counts.skipped == [0]
 
 
-class BreaksOff(MemorySequence):
+class BreaksOff(MemoryDrive):
     """The second frame cannot be read."""
 
     broken = 1
@@ -48,10 +48,10 @@ def test_a_run_that_fails_at_once_leaves_nothing(mini_model, tmp_path, broken):
             run_into_folder(Model(mini_model), drive, tmp_path / name, MINIMAL)
         assert (tmp_path / name / "summary.json").exists() == (broken == 1)
     assert broken == 1 or list(tmp_path.iterdir()) == [tmp_path / "before"]
-    run_into_folder(Model(mini_model), MemorySequence(3), tmp_path / "before", MINIMAL, resume=broken == 1)
+    run_into_folder(Model(mini_model), MemoryDrive(3), tmp_path / "before", MINIMAL, resume=broken == 1)
 
 
-class TwelveBitsInSixteen(MemorySequence):
+class TwelveBitsInSixteen(MemoryDrive):
     """The images of one camera have 12 bits that are stored in 16, of which a reader keeps the upper 8."""
 
     def load(self, place):

@@ -10,7 +10,7 @@ from statistics import median
 
 import cv2
 import pytest
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemoryDrive, make_camera
 
 from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
@@ -27,7 +27,7 @@ DESCRIPTORS = Path("/proc/self/fd")
 pytestmark = pytest.mark.skipif(not DESCRIPTORS.exists(), reason="the process is measured on Linux")
 
 
-class SmallDrive(MemorySequence):
+class SmallDrive(MemoryDrive):
     """A drive with two cameras, whose images are JPEG files of 96x54 pixels."""
 
     def __init__(self, count):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli import registry
 from bevcli.frame import FrameResult, Ground, GroundLines
@@ -79,7 +79,7 @@ def registered(monkeypatch):
 def test_a_new_result_has_a_file_a_drawing_and_a_legend(registered, mini_config, tmp_path):
     settings = {field.name: getattr(mini_config, field.name) for field in fields(ModelConfig)}
     model = Model(Stopping(StoppingConfig(**settings)).eval())
-    run_into_folder(model, MemorySequence(2), tmp_path / "out")
+    run_into_folder(model, MemoryDrive(2), tmp_path / "out")
     assert (tmp_path / "out/stop_lines.txt").read_text() == "0 10.0\n1 10.0\n"
     for frame in RecordingReader(tmp_path / "out/recording.rrd").frames():
         (line,) = frame.strips(f"{entities.BEV}/stop_line", "LineStrips2D:strips")

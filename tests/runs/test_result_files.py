@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground
@@ -52,7 +52,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> RunOptions:
 @pytest.fixture(scope="module")
 def out(model: Model, options: RunOptions, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planned") / "out"
-    run_into_folder(model, MemorySequence(FRAMES), folder, options)
+    run_into_folder(model, MemoryDrive(FRAMES), folder, options)
     return folder
 
 
@@ -60,7 +60,7 @@ def test_files_hold_the_results_on_the_ground(model: Model, out: Path) -> None:
     lines, plans = read_lines(out / "map_lines.json"), read_plans(out / "plan.csv")
     assert (lines.frame_of_reference, lines.classes, len(plans)) == ("world", ("divider", "kerb"), FRAMES)
     for (frame, prediction), of_frame, planned in zip(
-        run(model, MemorySequence(FRAMES)), lines.frames, plans, strict=True
+        run(model, MemoryDrive(FRAMES)), lines.frames, plans, strict=True
     ):
         found, plan = prediction.results
         assert of_frame.stamp == planned.stamp == frame.stamp
@@ -82,7 +82,7 @@ def test_a_command_stays_until_the_next_one(out: Path) -> None:
 
 def test_futures_are_read_back_in_the_world_frame(model: Model, out: Path) -> None:
     written = read_boxes(out / "predictions.json").frames
-    for (_, prediction), frame in zip(run(model, MemorySequence(FRAMES)), written, strict=True):
+    for (_, prediction), frame in zip(run(model, MemoryDrive(FRAMES)), written, strict=True):
         np.testing.assert_allclose(frame.boxes.futures, prediction.boxes_world.futures, atol=1e-3)
         np.testing.assert_allclose(frame.boxes.future_scores, prediction.boxes.future_scores)
 
@@ -91,8 +91,8 @@ def test_an_interrupted_run_goes_on_with_all_files(
     model: Model, options: RunOptions, out: Path, tmp_path: Path
 ) -> None:
     stopped = tmp_path / "out"
-    run_into_folder(model, MemorySequence(FRAMES), stopped, options, should_stop=lambda: True)
-    run_into_folder(model, MemorySequence(FRAMES), stopped, options, resume=True)
+    run_into_folder(model, MemoryDrive(FRAMES), stopped, options, should_stop=lambda: True)
+    run_into_folder(model, MemoryDrive(FRAMES), stopped, options, resume=True)
     for name in ("map_lines.json", "plan.csv", "predictions.json"):
         assert (stopped / name).read_bytes() == (out / name).read_bytes()
 
@@ -140,7 +140,7 @@ def test_wrong_files_of_lines_are_refused(change: dict, message: str, tmp_path: 
 
 
 def test_a_session_takes_commands_as_a_run_does(model: Model, options: RunOptions, out: Path) -> None:
-    drive = MemorySequence(FRAMES)
+    drive = MemoryDrive(FRAMES)
     ways = {"file": (options.command, {}), "steps": (None, {0: "straight", 1: "left"})}
     plans = {way: list(_session_plans(model, drive, *given)) for way, given in ways.items()}
     for (_, prediction), *others in zip(run(model, drive, command=options.command), *plans.values(), strict=True):
@@ -150,7 +150,7 @@ def test_a_session_takes_commands_as_a_run_does(model: Model, options: RunOption
             assert plan.paths.tobytes() == expected.paths.tobytes()
 
 
-def _session_plans(model: Model, drive: MemorySequence, first: str | None, later: dict[int, str]) -> Iterator[Plan]:
+def _session_plans(model: Model, drive: MemoryDrive, first: str | None, later: dict[int, str]) -> Iterator[Plan]:
     session = Session(model, drive.rig, command=first)
     for place in range(FRAMES):
         frame = drive.load(place)
@@ -167,7 +167,7 @@ def _session_plans(model: Model, drive: MemorySequence, first: str | None, later
 
 
 def test_a_wrong_command_leaves_a_session_as_it_was(model: Model) -> None:
-    drive = MemorySequence(1)
+    drive = MemoryDrive(1)
     session, frame = Session(model, drive.rig, command="left"), drive.load(0)
     images = {name: image.pixels_bgr for name, image in frame.images.items()}
     with pytest.raises(InputError, match="`command=up`: is unknown"):

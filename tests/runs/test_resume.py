@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
@@ -32,7 +32,7 @@ FRAMES, NINE = 6, np.ones(9)
 pytestmark = pytest.mark.usefixtures("unchecked_recordings")
 
 
-class Drive(MemorySequence):
+class MadeDrive(MemoryDrive):
     """A drive with the tokens of nuScenes keyframes; loading the frame `broken` fails."""
 
     broken = FRAMES
@@ -56,7 +56,7 @@ def model(mini_config):
 
 def run_all(model, out, sequence=None, score=0.0, **arguments):
     options = RunOptions(recording=RecordingOptions(score=score), save_bev=out.parent / f"{out.name}-bev")
-    return run_into_folder(model, Drive() if sequence is None else sequence, out, options, **arguments)
+    return run_into_folder(model, MadeDrive() if sequence is None else sequence, out, options, **arguments)
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -87,7 +87,7 @@ def assert_equals(out: Path, whole: Path) -> None:
     "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 3, 4, 5))) for n in range(FRAMES + 1)]
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finished):
-    drive = Drive()
+    drive = MadeDrive()
     drive.broken = finished
     out = tmp_path / "out"
     if finished < FRAMES:
@@ -169,7 +169,7 @@ def interrupted(interrupted_once):
 
 def test_another_run_is_not_resumed_and_the_difference_is_named(model, mini_model, interrupted):
     before = contents(interrupted)
-    shifted = Drive()
+    shifted = MadeDrive()
     shifted.stamps = (FrameStamp(0, "b", 5), *shifted.stamps[1:])
     with pytest.raises(OutputError, match=r"frames of the input: was 6, \w+, is 6, \w+"):
         run_all(model, interrupted, shifted, resume=True)
@@ -250,7 +250,7 @@ def test_force_removes_only_what_a_run_wrote(model, tmp_path):
     for path in kept:
         path.write_text("mine")
     (out / ".bevcli/written").open("a").write("../a.json\n")
-    run_all(model, out, Drive(2), force=True)
+    run_all(model, out, MadeDrive(2), force=True)
     assert all(path.read_text() == "mine" for path in kept)
     assert {path.name for path in out.glob("segmentation/00000*.png")} == {"000000.png", "000001.png"}
 
@@ -352,7 +352,7 @@ def test_a_pipe_in_place_of_the_calibration_is_replaced(model, interrupted):
 
 def test_a_pipe_that_appears_under_way_is_replaced(model, tmp_path):
     summary, state = tmp_path / "out/summary.json", tmp_path / "state.safetensors"
-    run_all(model, tmp_path / "out", Drive(1), after_frame=lambda frame, prediction: os.mkfifo(summary))
+    run_all(model, tmp_path / "out", MadeDrive(1), after_frame=lambda frame, prediction: os.mkfifo(summary))
     assert summary.is_file()
     os.mkfifo(state)
     save_state(state, Counts())
@@ -360,7 +360,7 @@ def test_a_pipe_that_appears_under_way_is_replaced(model, tmp_path):
 
 
 def test_changed_images_are_seen(model, tmp_path):
-    class WithImages(Drive):
+    class WithImages(MadeDrive):
         def image_files(self, place):
             return (tmp_path / f"{place}.jpg",)
 

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages
 
 from bevcli.config import TRACKING, load_config, load_table
 from bevcli.errors import ConfigError
@@ -33,8 +33,8 @@ def predictions(model, sequence, **options):
 
 
 def test_the_tracker_changes_no_number(model):
-    with_tracks = predictions(model, MemorySequence(3))
-    without = predictions(model, MemorySequence(3), track=False)
+    with_tracks = predictions(model, MemoryDrive(3))
+    without = predictions(model, MemoryDrive(3), track=False)
     for one, other in zip(with_tracks, without, strict=True):
         for column in fields(Boxes3D):
             if column.name in TRACK_COLUMNS:
@@ -45,7 +45,7 @@ def test_the_tracker_changes_no_number(model):
 
 
 def test_identities_reach_boxes_of_every_frame_of_reference(model):
-    prediction = predictions(model, MemorySequence(1))[0]
+    prediction = predictions(model, MemoryDrive(1))[0]
     assert (prediction.boxes.instances != "").any()
     for boxes in (prediction.boxes_ego, prediction.boxes_world):
         assert list(boxes.instances) == list(prediction.boxes.instances)
@@ -65,7 +65,7 @@ def test_a_frame_without_images_leaves_the_tracks_alone(model):
 
 
 def test_a_tracked_run_cut_in_two_equals_the_whole(model):
-    results = list(run(model, MemorySequence(4), track=False))
+    results = list(run(model, MemoryDrive(4), track=False))
     first = list(tracked(results[:2]))
     second = list(tracked(results[2:], first[-1][0]))
     for (_, one), (_, other) in zip(tracked(results), first + second, strict=True):
@@ -76,7 +76,7 @@ def test_a_tracked_run_cut_in_two_equals_the_whole(model):
 def test_predictions_and_tracks_files_hold_the_identities(model, tmp_path):
     seen = []
     options = RunOptions(recording=RecordingOptions("minimal", score=0.0))
-    run_into_folder(model, MemorySequence(3), tmp_path, options, after_frame=lambda _, p: seen.append(p))
+    run_into_folder(model, MemoryDrive(3), tmp_path, options, after_frame=lambda _, p: seen.append(p))
     frames = read_boxes(tmp_path / "predictions.json").frames
     for frame, prediction in zip(frames, seen, strict=True):
         assert list(frame.boxes.instances) == list(prediction.boxes.instances)
@@ -99,7 +99,7 @@ def test_predictions_and_tracks_files_hold_the_identities(model, tmp_path):
 
 def test_a_run_without_tracks_writes_none(model, tmp_path):
     options = RunOptions(track=False, recording=RecordingOptions("minimal"))
-    summary = run_into_folder(model, MemorySequence(2), tmp_path, options)
+    summary = run_into_folder(model, MemoryDrive(2), tmp_path, options)
     assert not (tmp_path / "tracks.csv").exists()
     assert all(frame.boxes.instances is None for frame in read_boxes(tmp_path / "predictions.json").frames)
     assert summary.to_dict()["tracks"] is None

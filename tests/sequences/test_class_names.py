@@ -15,8 +15,8 @@ from bevcli.sequences.open import open_sequence
 CLASSES = ("Car", "TRUCK", "Tricycle", "lorry", "pedestrian")
 
 
-def box(name: str, place: int) -> dict:
-    return {"class": name, "center": [10.0 + 6 * place, 0.0, 1.0], "size_lwh": [4.0, 2.0, 1.5], "yaw": 0.0}
+def box(name: str, index: int) -> dict:
+    return {"class": name, "center": [10.0 + 6 * index, 0.0, 1.0], "size_lwh": [4.0, 2.0, 1.5], "yaw": 0.0}
 
 
 @pytest.fixture

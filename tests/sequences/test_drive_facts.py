@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -21,7 +21,7 @@ SAMPLES = Path(__file__).parents[2] / "samples"
 
 
 def written(folder: Path, facts: DriveFacts | None) -> Path:
-    drive = MemorySequence(3)
+    drive = MemoryDrive(3)
     with NativeWriter(folder, with_ego_motion=True, facts=facts) as writer:
         for place in range(3):
             writer.write(replace(drive.load(place), stamp=replace(drive.stamps[place], scene="")))
@@ -42,7 +42,7 @@ def test_a_part_of_a_drive_and_a_converted_drive_state_the_same(tmp_path):
 
 
 def test_a_sequence_of_another_kind_states_nothing():
-    assert MemorySequence(1).facts == DriveFacts()
+    assert MemoryDrive(1).facts == DriveFacts()
 
 
 def test_the_samples_are_rendered():

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 
 def test_stamps_are_the_rows_of_frames_csv(drive):
@@ -133,7 +133,7 @@ def test_missing_image_number_leaves_a_gap_in_time(drive):
     (drive / "frames.csv").unlink()
     for camera in ("CAM_FRONT", "CAM_BACK"):
         (drive / "images" / camera / "1.png").unlink()
-    sequence = FolderSequence(drive, SequenceOptions(ego_motion="static"))
+    sequence = FolderDrive(drive, InputOptions(ego_motion="static"))
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [0, 10**9, 15 * 10**8]
     assert any("assumed" in note for note in sequence.notes)
 

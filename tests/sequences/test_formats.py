@@ -18,7 +18,7 @@ from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.format import GROUP, format_of, formats, option_classes
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 PLUG_IN = '''
 from pathlib import Path
@@ -96,14 +96,14 @@ def strip(tmp_path, drive) -> dict:
 
 
 def test_each_option_is_stated_once():
-    common = {field.name for field in fields(SequenceOptions)}
+    common = {field.name for field in fields(InputOptions)}
     shared = {field.name for field in fields(FolderOptions)}  # of a folder and a video; those of a rig are among them
     own = [{field.name for field in fields(one.options)} for one in formats()]
     assert not common & set().union(*own)
     for number, names in enumerate(own):
         for others in own[number + 1 :]:
             assert names & others <= shared
-    assert all(field.metadata["option"].help for kind in (SequenceOptions, *option_classes()) for field in fields(kind))
+    assert all(field.metadata["option"].help for kind in (InputOptions, *option_classes()) for field in fields(kind))
 
 
 def test_an_option_of_another_format_is_refused_by_name(drive):
@@ -115,7 +115,7 @@ def test_an_option_of_another_format_is_refused_by_name(drive):
 
 
 def test_the_dataclass_and_keywords_mean_the_same(drive):
-    options = SequenceOptions(every=2, frames=slice(1, 2))
+    options = InputOptions(every=2, frames=slice(1, 2))
     by_class = open_sequence(drive, options).stamps
     assert by_class == open_sequence(drive, every=2, frames=slice(1, 2)).stamps
     assert open_sequence(drive, options, frames=None).stamps == open_sequence(drive, every=2).stamps

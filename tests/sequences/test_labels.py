@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -25,14 +25,14 @@ from bevcli.workshop.formats.output import NativeWriter
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 
 
-class Drive(MemorySequence):
+class MadeDrive(MemoryDrive):
     """Four frames on a curve, without ground truth."""
 
-    def load(self, place: int) -> Frame:
-        return replace(super().load(place), ground_truth=None)
+    def load(self, index: int) -> Frame:
+        return replace(super().load(index), ground_truth=None)
 
 
-def boxes_of_drive(drive: Drive) -> BoxesFile:
+def boxes_of_drive(drive: MadeDrive) -> BoxesFile:
     """A parked Lorry and a PKW that drives along the x axis of the world with 4 m/s."""
     frames = []
     for place, stamp in enumerate(drive.stamps):
@@ -61,7 +61,7 @@ def as_spreadsheet(text: str) -> bytes:
 
 @pytest.mark.parametrize("form", ["csv", "spreadsheet"])
 def test_what_bevcli_exports_is_read_again(form: str, tmp_path: Path) -> None:
-    drive, path = Drive(), tmp_path / "labels.csv"
+    drive, path = MadeDrive(), tmp_path / "labels.csv"
     given = boxes_of_drive(drive)
     write_csv(given, path)
     if form == "spreadsheet":
@@ -76,7 +76,7 @@ def test_what_bevcli_exports_is_read_again(form: str, tmp_path: Path) -> None:
 
 
 def test_tracks_give_velocities_over_ground(tmp_path: Path) -> None:
-    drive, path = Drive(), tmp_path / "labels.csv"
+    drive, path = MadeDrive(), tmp_path / "labels.csv"
     rows = [f"{HEAD},instance"]
     for place, frame in enumerate(boxes_of_drive(drive).frames):
         in_ego = frame.boxes.transformed(np.linalg.inv(frame.world_from_ego.matrix))
@@ -103,7 +103,7 @@ def test_tracks_give_velocities_over_ground(tmp_path: Path) -> None:
 def test_frames_without_a_row_are_empty_or_unlabelled(
     listed: tuple[int, ...], unlisted: UnlistedFrames | None, expected: str, note: str, tmp_path: Path
 ) -> None:
-    drive, path = Drive(), tmp_path / "labels.csv"
+    drive, path = MadeDrive(), tmp_path / "labels.csv"
     path.write_text("\n".join([HEAD, *(f"{drive.stamps[place].index},PKW,1,2,0,4,2,1,0" for place in listed)]))
     labelled = WithLabels(drive, path, LabelOptions(unlisted_frames=unlisted))
     truths = [labelled.load(place).ground_truth for place in range(4)]
@@ -113,7 +113,7 @@ def test_frames_without_a_row_are_empty_or_unlabelled(
 
 
 def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
-    stamps = tuple(replace(Drive().stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
+    stamps = tuple(replace(MadeDrive().stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
     assert sorted(_labelled_frames(stamps, {3, 9, 18}, None)) == [3, 9, 18]
     assert sorted(_labelled_frames(stamps, {1, 4, 10}, None)) == [1, 4, 7, 10]
 
@@ -138,7 +138,7 @@ def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
 def test_a_wrong_table_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        WithLabels(Drive(), tmp_path / "labels.csv")
+        WithLabels(MadeDrive(), tmp_path / "labels.csv")
     assert "\n" not in str(caught.value)
 
 
@@ -157,7 +157,7 @@ def cvat_text(**changes: object) -> str:
 
 
 def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
-    path, drive = tmp_path / "default.json", Drive()
+    path, drive = tmp_path / "default.json", MadeDrive()
     path.write_text(cvat_text())
     labelled = WithLabels(drive, path)
     box = labelled.load(0).ground_truth.transformed(np.linalg.inv(drive.load(0).world_from_ego.matrix))
@@ -181,12 +181,12 @@ def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
 def test_a_wrong_export_of_cvat_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "default.json").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        WithLabels(Drive(), tmp_path / "default.json")
+        WithLabels(MadeDrive(), tmp_path / "default.json")
     assert "\n" not in str(caught.value)
 
 
 def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
-    drive = Drive()
+    drive = MadeDrive()
     given = boxes_of_drive(drive)
     camera = drive.rig["CAM_FRONT"]
     write_kitti(given, camera, drive.rig.ego_from_bev, tmp_path / "kitti")
@@ -203,7 +203,7 @@ def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
     line = "Car 0 0 0 0 0 9 9 1.5 2 4 {} 1 20 0"
     others = ["1 -1 DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10", ""]
     path.write_text("\n".join([*(f"{frame} 3 {line.format(0)}" for frame in range(3)), *others]))
-    labelled = WithLabels(Drive(), path)
+    labelled = WithLabels(MadeDrive(), path)
     assert [labelled.load(place).ground_truth.instances.tolist() for place in range(3)] == [["3"]] * 3
     assert np.isfinite(labelled.load(1).ground_truth.velocities).all()
     assert any("those that CAM_FRONT sees" in note for note in labelled.notes)
@@ -220,9 +220,9 @@ def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
 def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "0000.txt").write_text(text)
     with pytest.raises(InputError, match=message):
-        WithLabels(Drive(), tmp_path / "0000.txt")
+        WithLabels(MadeDrive(), tmp_path / "0000.txt")
     with pytest.raises(InputError, match="`labels_camera=roof`: is not in the rig"):
-        WithLabels(Drive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
+        WithLabels(MadeDrive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
 
 
 # As CVAT 2 exports a track of two frames with a gap of one between them: a PKW, 4 m long, 2 m wide and 1.5 m high.
@@ -241,14 +241,14 @@ CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
 def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
     path = tmp_path / "tracklet_labels.xml"
     path.write_text(CVAT_TRACKLETS)
-    labels = read_labels(path, Drive().rig, LabelOptions())
+    labels = read_labels(path, MadeDrive().rig, LabelOptions())
     assert [frame.index for frame in labels.frames] == [1, 3]
     box = labels.frames[1].boxes
     np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [12, 2, 1, 4, 2, 1.5, 0.7])
     assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["0"])
     assert any("CVAT's version" in note for note in labels.notes)
     path.write_text(CVAT_TRACKLETS.replace("<item_version>0", "<item_version>2").replace('"yes"', '"true"'))
-    as_kitti = read_labels(path, Drive().rig, LabelOptions())
+    as_kitti = read_labels(path, MadeDrive().rig, LabelOptions())
     assert [frame.index for frame in as_kitti.frames] == [1, 2, 3]
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.centers[0]], [8, 2, 2])  # 1 m is the bottom
     np.testing.assert_allclose([*as_kitti.frames[0].boxes.sizes_lwh[0]], [1.5, 4, 2])
@@ -267,7 +267,7 @@ def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list,
     height, width, length = hwl
     text = CVAT_TRACKLETS.replace("<h>2.0</h><w>4.0</w><l>1.5</l>", f"<h>{height}</h><w>{width}</w><l>{length}</l>")
     (tmp_path / "tracklet_labels.xml").write_text(text)
-    labels = read_labels(tmp_path / "tracklet_labels.xml", Drive().rig, LabelOptions())
+    labels = read_labels(tmp_path / "tracklet_labels.xml", MadeDrive().rig, LabelOptions())
     assert labels.frames[0].boxes.sizes_lwh[0].tolist() == sizes
 
 
@@ -286,18 +286,18 @@ def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list,
 def test_wrong_tracklets_are_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "labels.xml").write_text(CVAT_TRACKLETS.replace(old, new))
     with pytest.raises(InputError, match=message) as caught:
-        WithLabels(Drive(), tmp_path / "labels.xml")
+        WithLabels(MadeDrive(), tmp_path / "labels.xml")
     assert "\n" not in str(caught.value)
 
 
 def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.xml").write_text("")
     with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or CVAT tracklets"):
-        WithLabels(Drive(), tmp_path / "labels.xml")
+        WithLabels(MadeDrive(), tmp_path / "labels.xml")
 
 
 def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
-    drive = Drive()
+    drive = MadeDrive()
     with NativeWriter(tmp_path / "drive", with_ego_motion=True) as writer:
         for place in range(len(drive.stamps)):
             writer.write(drive.load(place))
@@ -323,7 +323,7 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
 )
 def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, kept: int, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    labelled = WithLabels(Drive(), tmp_path / name)
+    labelled = WithLabels(MadeDrive(), tmp_path / name)
     assert any("left out: a size of 0 or less" in note for note in labelled.notes)
     boxes = [labelled.load(place).ground_truth for place in range(4)]
     assert all((each.sizes_lwh > 0).all() for each in boxes if each is not None)

@@ -16,7 +16,7 @@ from bevcli.evaluation.inputs import open_ground_truth
 from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
 from bevcli.sequences.nuscenes import NuScenesOptions, tables
 from bevcli.sequences.nuscenes.index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
-from bevcli.sequences.nuscenes.sequence import NuScenesSequence, read_can_bus
+from bevcli.sequences.nuscenes.sequence import NuScenesDrive, read_can_bus
 from bevcli.sequences.nuscenes.tables import build_index
 from bevcli.sequences.open import open_sequence
 
@@ -36,7 +36,7 @@ def edit_table(root, name, change):
 
 
 def test_keyframes_of_all_scenes_in_order(root):
-    sequence = NuScenesSequence(root)
+    sequence = NuScenesDrive(root)
     assert [stamp.index for stamp in sequence.stamps] == list(range(12))
     assert [stamp.scene for stamp in sequence.stamps] == [scene_name(s) for s in range(3) for _ in range(4)]
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [
@@ -45,7 +45,7 @@ def test_keyframes_of_all_scenes_in_order(root):
 
 
 def test_poses_are_at_the_times_of_lidar_and_images(root):
-    frame = NuScenesSequence(root).load(6)
+    frame = NuScenesDrive(root).load(6)
     assert frame.world_from_ego.translation[0] == ego_x(1, sample_time(1, 2))
     assert frame.rig.names == CAMERAS
     # The images' files are not there; each camera has its own time between 10 and 40 ms before, on a 5 m/s drive.
@@ -56,7 +56,7 @@ def test_poses_are_at_the_times_of_lidar_and_images(root):
 
 def test_ground_truth_has_the_ten_classes_only(root):
     """Objects 0 to 7 are car, adult, rack, animal, and again; racks and animals are in none of the ten classes."""
-    sequence = NuScenesSequence(root)
+    sequence = NuScenesDrive(root)
     truth = sequence.load(5).ground_truth
     assert truth.classes.tolist() == ["car", "pedestrian"] * 2
     np.testing.assert_allclose(truth.centers, [[1000 + k, 1.0, 1.0] for k in (0, 1, 4, 5)])
@@ -93,7 +93,7 @@ def test_without_annotations_there_is_no_ground_truth(tmp_path, remove):
     if remove:
         for name in ("sample_annotation", "instance", "visibility", "attribute", "category"):
             (tmp_path / "v1.0-test" / f"{name}.json").unlink()
-    sequence = NuScenesSequence(tmp_path)
+    sequence = NuScenesDrive(tmp_path)
     assert sequence.load(0).ground_truth is None
     assert len(sequence.stamps) == 12
 
@@ -128,7 +128,7 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
 
 def test_sweeps_follow_the_front_images_between_keyframes(root):
     """There are six front images per keyframe, so 12 frames per second. Keyframes keep their samples and times."""
-    keyframes, sweeps = NuScenesSequence(root), NuScenesSequence(root, own=NuScenesOptions(sweeps=True))
+    keyframes, sweeps = NuScenesDrive(root), NuScenesDrive(root, own=NuScenesOptions(sweeps=True))
     times = np.array([stamp.timestamp_ns for stamp in sweeps.stamps if stamp.scene == scene_name(1)])
     assert len(times) == 4 * 6
     np.testing.assert_allclose(np.diff(times) / 1e3, SAMPLE_US / 6, atol=5)
@@ -154,8 +154,8 @@ def test_splits_have_their_official_scenes():
 
 def test_split_selects_its_scenes(root):
     """Of scenes 1 to 3, the third is in val."""
-    assert {stamp.scene for stamp in NuScenesSequence(root, own=NuScenesOptions(split="val")).stamps} == {"scene-0003"}
-    assert {stamp.scene for stamp in NuScenesSequence(root, own=NuScenesOptions(split="train")).stamps} == {
+    assert {stamp.scene for stamp in NuScenesDrive(root, own=NuScenesOptions(split="val")).stamps} == {"scene-0003"}
+    assert {stamp.scene for stamp in NuScenesDrive(root, own=NuScenesOptions(split="train")).stamps} == {
         "scene-0001",
         "scene-0002",
     }
@@ -179,8 +179,8 @@ def test_choice_without_scenes_is_an_error(root, options, expected):
 def test_several_versions_require_a_choice(root):
     write_tables(root / "v1.0-mini", SMALL)
     with pytest.raises(InputError, match="`version`"):
-        NuScenesSequence(root)
-    assert NuScenesSequence(root, own=NuScenesOptions(version="v1.0-mini")).stamps
+        NuScenesDrive(root)
+    assert NuScenesDrive(root, own=NuScenesOptions(version="v1.0-mini")).stamps
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_several_versions_require_a_choice(root):
 def test_invalid_or_inconsistent_table_is_named(root, table, change, expected):
     edit_table(root, table, change)
     with pytest.raises(InputError, match=expected):
-        NuScenesSequence(root)
+        NuScenesDrive(root)
 
 
 def test_boxes_of_missing_instances_are_left_out_with_a_number(root):
@@ -295,10 +295,10 @@ def test_missing_or_broken_table_is_named(root):
     path = root / "v1.0-trainval" / "ego_pose.json"
     path.write_text(path.read_text()[:1000])
     with pytest.raises(InputError, match=r"ego_pose.json: line 94, .*broken JSON"):
-        NuScenesSequence(root)
+        NuScenesDrive(root)
     path.unlink()
     with pytest.raises(InputError, match=r"ego_pose.json: the table is missing"):
-        NuScenesSequence(root)
+        NuScenesDrive(root)
 
 
 @pytest.fixture
@@ -349,8 +349,8 @@ def test_large_tables_take_little_memory(tmp_path):
     scenes = int(os.environ.get("BEVCLI_SCENES", "40"))
     write_tables(tmp_path / "v1.0-trainval", Size(scenes=scenes))
     code = (
-        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.sequence import NuScenesSequence\n"
-        "sequence = NuScenesSequence(Path(sys.argv[1]))\n"
+        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.sequence import NuScenesDrive\n"
+        "sequence = NuScenesDrive(Path(sys.argv[1]))\n"
         # Not getrusage: a child's peak there begins with what its parent had.
         "peak = Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0]\n"
         "print(len(sequence.stamps), peak)"

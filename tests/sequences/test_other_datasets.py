@@ -20,7 +20,7 @@ from written_formats import RING, WRITTEN
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -127,26 +127,26 @@ def _pairing(a: Boxes3D, b: Boxes3D) -> np.ndarray:
     return distances.argmin(axis=1)
 
 
-class _Memory(DerivedSequence):
+class _Memory(DerivedDrive):
     """Frames in memory in place of a drive's own."""
 
-    def __init__(self, drive: Sequence, frames: list[Frame]) -> None:
+    def __init__(self, drive: Drive, frames: list[Frame]) -> None:
         super().__init__(drive)
         self.frames, self.rig = frames, frames[0].rig
 
-    def load(self, place: int) -> Frame:
-        return self.frames[place]
+    def load(self, index: int) -> Frame:
+        return self.frames[index]
 
 
-class _WithKinematics(DerivedSequence):
+class _WithKinematics(DerivedDrive):
     """A drive with the kinematics of other frames: these formats derive them from the poses."""
 
-    def __init__(self, drive: Sequence, frames: list[Frame]) -> None:
+    def __init__(self, drive: Drive, frames: list[Frame]) -> None:
         super().__init__(drive)
         self.frames = frames
 
-    def load(self, place: int) -> Frame:
-        return replace(super().load(place), kinematics=self.frames[place].kinematics)
+    def load(self, index: int) -> Frame:
+        return replace(super().load(index), kinematics=self.frames[index].kinematics)
 
 
 def test_a_written_drive_has_the_same_predictions(written, street, mini_model):
@@ -399,7 +399,7 @@ def test_the_document_has_all_class_names(name):
 # Real data.
 
 
-def _rig_has_no_error(drive: Sequence) -> None:
+def _rig_has_no_error(drive: Drive) -> None:
     assert not [finding for finding in check_rig(drive.rig).findings if finding.severity == "error"]
 
 

@@ -30,7 +30,7 @@ from bags import (
 )
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, Sequence
+from bevcli.frame import CameraImage, Drive
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose, rotation_about_z
@@ -50,7 +50,7 @@ def message_types_compiled_once() -> Iterator[None]:
 
 
 @pytest.fixture
-def native(drive: Path) -> Sequence:
+def native(drive: Path) -> Drive:
     """The small drive as the native folder that the bags are written from."""
     return open_sequence(drive)
 
@@ -61,7 +61,7 @@ def motion(drive: Path) -> EgoMotion:
     return read_ego_motion(drive / "ego_motion.csv")
 
 
-def messages_of(native: Sequence, motion: EgoMotion | None, **options) -> list[Message]:
+def messages_of(native: Drive, motion: EgoMotion | None, **options) -> list[Message]:
     return list(drive_messages(native, motion, **options))
 
 
@@ -74,7 +74,7 @@ def write(folder: Path, form: str, messages: list[Message]) -> Path:
 @pytest.mark.parametrize("form", ["mcap", "rosbag2 sqlite3", "rosbag2 mcap"])
 @pytest.mark.parametrize("poses_in", ["odometry", "tf"])
 def test_a_bag_gives_the_frames_it_was_written_from(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, form: str, poses_in: str
+    tmp_path: Path, native: Drive, motion: EgoMotion, form: str, poses_in: str
 ) -> None:
     sequence = open_sequence(write(tmp_path, form, messages_of(native, motion, poses_in=poses_in)))
     assert set(sequence.rig.names) == set(native.rig.names)
@@ -94,9 +94,7 @@ def test_a_bag_gives_the_frames_it_was_written_from(
         np.testing.assert_allclose(found.kinematics.velocity, [10, 0, 0], atol=1e-6)
 
 
-def test_the_time_of_an_image_is_stated_not_that_of_recording(
-    tmp_path: Path, native: Sequence, motion: EgoMotion
-) -> None:
+def test_the_time_of_an_image_is_stated_not_that_of_recording(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion, delay_ns=180_000_000))
     sequence = open_sequence(path)
     times = [stamp.timestamp_ns for stamp in sequence.stamps]
@@ -105,7 +103,7 @@ def test_the_time_of_an_image_is_stated_not_that_of_recording(
 
 
 def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
-    tmp_path: Path, native: Sequence, motion: EgoMotion
+    tmp_path: Path, native: Drive, motion: EgoMotion
 ) -> None:
     messages = [
         (topic, kind, time + 3 * (time - 10**9), fields) for topic, kind, time, fields in messages_of(native, motion)
@@ -118,7 +116,7 @@ def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
 
 
 def test_opening_a_large_bag_reads_few_images(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bevcli.workshop.formats.ros.storage import McapFile
 
@@ -143,7 +141,7 @@ def test_opening_a_large_bag_reads_few_images(
 
 
 def test_of_chunks_without_compression_messages_are_read(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bevcli.workshop.formats.ros.storage import McapFile
 
@@ -158,7 +156,7 @@ def test_of_chunks_without_compression_messages_are_read(
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.999])
 def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, share: float
+    tmp_path: Path, native: Drive, motion: EgoMotion, share: float
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion), chunk_size=1_000)
     data = path.read_bytes()
@@ -172,7 +170,7 @@ def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
         assert any("is cut off" in note for note in sequence.notes)
 
 
-def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     others = [("/chatter", "std_msgs/String", 1, {"data": "hello"})]
     path = write_mcap(tmp_path / "bag.mcap", others)
     with pytest.raises(InputError, match=r"has no image topic \(topics: /chatter \(std_msgs/String\)\)"):
@@ -182,7 +180,7 @@ def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, nativ
         open_sequence(path)
 
 
-def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, None))
     with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*`ego_motion_file=FILE`"):
         open_sequence(path)
@@ -207,7 +205,7 @@ NO_POSES = {
 
 @pytest.mark.parametrize("poses_in", ["odometry", "tf"])
 def test_poses_that_are_none_are_left_out_with_their_number(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, poses_in: str
+    tmp_path: Path, native: Drive, motion: EgoMotion, poses_in: str
 ) -> None:
     messages = messages_of(native, motion, poses_in=poses_in)
     topic = {"odometry": "/odom", "tf": "/tf"}[poses_in]
@@ -226,7 +224,7 @@ def test_poses_that_are_none_are_left_out_with_their_number(
     )
 
 
-def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
     with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
         (number,) = database.execute("SELECT id FROM topics WHERE name = '/odom'").fetchone()
@@ -237,7 +235,7 @@ def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Sequen
     assert len(sequence.stamps) == 4
 
 
-def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     messages = messages_of(native, motion)
     bad = [transform(1, "base_link", f"{name}_optical", NO_POSES["zero"]) for name in native.rig.names]
     early = [("/tf_static", "tf2_msgs/TFMessage", time, {"transforms": bad}) for time in range(1, 300)]
@@ -248,7 +246,7 @@ def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native
     assert any("/tf_static: 598 of 600 poses are left out" in note for note in sequence.notes)
 
 
-def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     messages = [message for message in messages_of(native, motion) if message[0] != "/odom"]
     bad = [
         ("/odom", "nav_msgs/Odometry", time, odometry(time, "map", "base_link", NO_POSES["NaN"]))
@@ -258,7 +256,7 @@ def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Seque
         open_sequence(write_mcap(tmp_path / "bag.mcap", messages + bad))
 
 
-def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     messages = messages_of(native, motion)
     for time, zero in enumerate((0.0, np.nan), start=1):
         unset = {**camera_info(native.rig["CAM_FRONT"], time, ""), "k": [zero] * 9}
@@ -269,7 +267,7 @@ def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: 
 
 @pytest.mark.parametrize(("k", "size", "message"), [(0.01, 64, "implausible focal length"), (50, 0, "image size")])
 def test_a_camera_that_no_calibration_may_hold_is_refused(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, k: float, size: int, message: str
+    tmp_path: Path, native: Drive, motion: EgoMotion, k: float, size: int, message: str
 ) -> None:
     info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
     info |= {"width": size, "k": [k, 0.0, 32, 0, 50.0, 18, 0, 0, 1]}
@@ -283,7 +281,7 @@ def test_a_camera_that_no_calibration_may_hold_is_refused(
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_the_intrinsics_are_those_of_the_region_of_interest(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, rectified: bool
+    tmp_path: Path, native: Drive, motion: EgoMotion, rectified: bool
 ) -> None:
     info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
     info |= {"width": 200, "height": 100, "k": [80.0, 0, 100, 0, 80, 50, 0, 0, 1], "binning_x": 2, "binning_y": 2}
@@ -302,7 +300,7 @@ def test_the_intrinsics_are_those_of_the_region_of_interest(
 
 @pytest.mark.parametrize("topic", ["/CAM_FRONT/image/compressed", "/CAM_BACK/image/compressed", "/odom"])
 def test_messages_in_any_order_give_the_same_frames(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, topic: str
+    tmp_path: Path, native: Drive, motion: EgoMotion, topic: str
 ) -> None:
     messages = messages_of(native, motion)
     times = [time for name, _, time, _ in messages if name == topic]
@@ -321,7 +319,7 @@ def test_messages_in_any_order_give_the_same_frames(
 
 
 def test_files_beside_the_bag_replace_its_calibration_and_poses(
-    tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion
+    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
 ) -> None:
     messages = [message for message in messages_of(native, None) if "image" in message[0]]
     path = write_mcap(tmp_path / "bag.mcap", messages)
@@ -352,7 +350,7 @@ AUTOWARE = {
 }
 
 
-def test_autoware_topics_are_found(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_autoware_topics_are_found(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     messages = renamed(messages_of(native, motion), AUTOWARE)
     wrong = [("/sensing/gnss/pose", "geometry_msgs/PoseStamped", 1, pose_stamped(1))]
     path = write_mcap(tmp_path / "bag.mcap", messages + wrong)
@@ -368,7 +366,7 @@ def pose_stamped(time: int) -> dict:
     return {"header": header(time, "map"), "pose": pose}
 
 
-def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     names = {
         "/CAM_FRONT/image/compressed": "/a/first",
         "/CAM_FRONT/camera_info": "/b/one",
@@ -395,7 +393,7 @@ def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: S
 
 
 def test_a_calibration_with_cameras_not_found_names_the_option(
-    tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion
+    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", renamed(messages_of(native, motion), AUTOWARE))
     with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*`topics=\{'CAM_FRONT': '/TOPIC'\}`"):
@@ -405,7 +403,7 @@ def test_a_calibration_with_cameras_not_found_names_the_option(
     assert sequence.rig.names == native.rig.names
 
 
-def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     late = 1_400_000_000
     messages = [m for m in messages_of(native, motion) if m[0] != "/odom" or m[2] >= late]
     sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
@@ -413,9 +411,7 @@ def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Seque
     assert any("1 of 4 frames are left out" in note for note in sequence.notes)
 
 
-def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(
-    tmp_path: Path, native: Sequence, motion: EgoMotion
-) -> None:
+def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     base_from_imu = Pose.from_matrix(np.eye(4))
     base_from_imu = replace(base_from_imu, translation=np.array([1.0, 2.0, 3.0]))
     messages = [m for m in messages_of(native, None) if m[0] != "/odom"]
@@ -434,7 +430,7 @@ def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(
     )
 
 
-def test_a_chain_of_moving_transforms_is_multiplied(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_chain_of_moving_transforms_is_multiplied(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     map_from_odom = Pose(np.array([5.0, 0.0, 0.0]), Pose.from_matrix(np.eye(4)).quaternion)
     messages = messages_of(native, None)
     for time in motion.timestamps_ns.tolist():
@@ -460,7 +456,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Sequence, motion: EgoMotion, model: str) -> None:
+def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Drive, motion: EgoMotion, model: str) -> None:
     camera = replace(native.rig["CAM_FRONT"], distortion=LENSES[model])
     info = camera_info(camera, 10**9, "CAM_FRONT_optical")
     assert info["distortion_model"] == model
@@ -472,9 +468,7 @@ def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Sequence, 
     assert sequence.rig["CAM_BACK"].distortion is None
 
 
-def test_a_rectified_image_has_the_rectifications_intrinsics(
-    tmp_path: Path, native: Sequence, motion: EgoMotion
-) -> None:
+def test_a_rectified_image_has_the_rectifications_intrinsics(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     camera = replace(native.rig["CAM_FRONT"], distortion=LENSES["plumb_bob"])
     info = camera_info(camera, 10**9, "CAM_FRONT_optical")
     projection = np.array([[40.0, 0, 30, 0], [0, 41, 16, 0], [0, 0, 1, 0]])
@@ -507,7 +501,7 @@ def encode(pixels: np.ndarray, encoding: str) -> tuple[np.ndarray, int]:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "mono8"])
-def test_raw_images(tmp_path: Path, native: Sequence, motion: EgoMotion, encoding: str) -> None:
+def test_raw_images(tmp_path: Path, native: Drive, motion: EgoMotion, encoding: str) -> None:
     messages = raw_messages(native, motion, lambda pixels: encode(pixels, encoding), encoding)
     frame = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(1)
     for name, image in native.load(1).images.items():
@@ -517,7 +511,7 @@ def test_raw_images(tmp_path: Path, native: Sequence, motion: EgoMotion, encodin
         np.testing.assert_array_equal(frame.images[name].pixels_bgr, true)
 
 
-def raw_messages(native: Sequence, motion: EgoMotion, encoded, encoding: str) -> list[Message]:
+def raw_messages(native: Drive, motion: EgoMotion, encoded, encoding: str) -> list[Message]:
     messages = []
     for topic, kind, time, fields in messages_of(native, motion):
         if kind == "sensor_msgs/CompressedImage":
@@ -534,7 +528,7 @@ def raw_messages(native: Sequence, motion: EgoMotion, encoded, encoding: str) ->
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_a_bayer_image_of_one_colour_has_that_colour(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, pattern: str
+    tmp_path: Path, native: Drive, motion: EgoMotion, pattern: str
 ) -> None:
     levels = {"r": 200, "g": 120, "b": 40}
 
@@ -550,7 +544,7 @@ def test_a_bayer_image_of_one_colour_has_that_colour(
 
 
 def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(
-    tmp_path: Path, native: Sequence, motion: EgoMotion
+    tmp_path: Path, native: Drive, motion: EgoMotion
 ) -> None:
     messages = raw_messages(native, motion, lambda pixels: encode(pixels, "bgr8"), "32FC1")
     with pytest.raises(InputError, match="encoding 32FC1 is not supported"):
@@ -565,7 +559,7 @@ def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(
         open_sequence(path, strict=True).load(0)
 
 
-def compressed_bag(folder: Path, native: Sequence, images: list[tuple[str, bytes]]) -> Path:
+def compressed_bag(folder: Path, native: Drive, images: list[tuple[str, bytes]]) -> Path:
     """The small drive with these images in turn: their formats and bytes."""
     messages, left = [], cycle(images)
     for topic, kind, time, fields in messages_of(native, None):
@@ -588,7 +582,7 @@ def encoded_as(suffix: str, pixels: np.ndarray) -> bytes:
     return cv2.imencode(suffix, pixels, quality)[1].tobytes()
 
 
-def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Sequence) -> None:
+def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Drive) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (36, 64, 3), dtype=np.uint8)  # OpenCV's WebP is without loss
     images = [(f"bgr8; {kind} compressed bgr8", encoded_as(f".{kind}", pixels)) for kind in ("webp", "tiff", "bmp")]
     images.append(("rgb8; png compressed rgb8", encoded_as(".png", pixels[..., ::-1])))
@@ -597,7 +591,7 @@ def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Sequence) -
         assert image.encoded is None  # other files are not handed on
 
 
-def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: Sequence) -> None:
+def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: Drive) -> None:
     tile = np.array([[200, 120], [120, 40]])  # red top left
     small, wide = (np.tile(tile << shift, (18, 32)).astype(kind) for shift, kind in ((0, np.uint8), (8, np.uint16)))
     coloured = np.full((36, 64, 3), (40, 120, 200), dtype=np.uint8)
@@ -611,7 +605,7 @@ def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: S
         np.testing.assert_allclose(image.pixels_bgr[10, 10].astype(int), [40, 120, 200], atol=4)
 
 
-def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path: Path, native: Sequence) -> None:
+def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path: Path, native: Drive) -> None:
     path = compressed_bag(tmp_path, native, [("h264", b"\0\0\0\1" * 20)])
     with pytest.raises(
         InputError, match=r"/CAM_BACK/image/compressed: images of format h264 are not read \(expected JP"
@@ -619,7 +613,7 @@ def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path: Path, nativ
         open_sequence(path, ego_motion="static").load(0)
 
 
-def foxglove_messages(native: Sequence, motion: EgoMotion, time_of) -> list[Message]:
+def foxglove_messages(native: Drive, motion: EgoMotion, time_of) -> list[Message]:
     """The drive in Foxglove's schemas. time_of: nanoseconds -> the schema's time."""
     messages: list[Message] = []
     for topic, kind, time, fields in messages_of(native, motion, poses_in="tf"):
@@ -678,7 +672,7 @@ def foxglove_files():
 
 
 @pytest.mark.parametrize("form", ["json", "protobuf"])
-def test_foxglove_schemas(tmp_path: Path, native: Sequence, motion: EgoMotion, form: str) -> None:
+def test_foxglove_schemas(tmp_path: Path, native: Drive, motion: EgoMotion, form: str) -> None:
     path = tmp_path / "bag.mcap"
     if form == "json":
         write_json_mcap(path, foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9}))
@@ -706,7 +700,7 @@ def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path: Path, native, moti
     assert found.load(0).images["CAM_BACK"].timestamp_ns == native.load(0).images["CAM_BACK"].timestamp_ns
 
 
-def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
     (bag / "metadata.yaml").unlink()  # a recording that was cut off has none
     assert len(open_sequence(bag).stamps) == 4
@@ -738,7 +732,7 @@ def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path: Path) 
         open_sequence(path)
 
 
-def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion) -> None:
+def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
     with pytest.raises(InputError, match='has no scene "one"'):
         open_sequence(path, scene="one")
@@ -746,7 +740,7 @@ def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, nativ
         open_sequence(drive, topics={"CAM_FRONT": "/a"})
 
 
-def video_bag(folder: Path, native: Sequence, packets: list[bytes], video_format: str) -> Path:
+def video_bag(folder: Path, native: Drive, packets: list[bytes], video_format: str) -> Path:
     """The small drive with CAM_FRONT as a video of ten images per second."""
     messages = [m for m in messages_of(native, None) if m[0] != "/CAM_FRONT/image/compressed"]
     camera = replace(native.rig["CAM_FRONT"], width=64, height=48)
@@ -763,7 +757,7 @@ def video_bag(folder: Path, native: Sequence, packets: list[bytes], video_format
 
 
 @pytest.mark.parametrize("video_format", ["h264", "h265"])
-def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Sequence, video_format: str) -> None:
+def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Drive, video_format: str) -> None:
     stored = json.loads((Path(__file__).parents[1] / "data/video_packets.json").read_text())
     packets = [base64.b64decode(text) for text in stored[video_format]]
     sequence = open_sequence(video_bag(tmp_path, native, packets, video_format), ego_motion="static")
@@ -774,14 +768,14 @@ def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Sequence
         assert image.pixels_bgr.mean() == pytest.approx(10 + 20 * 5 * place, abs=5)
 
 
-def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Sequence) -> None:
+def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Drive) -> None:
     path = video_bag(tmp_path, native, [b"abc"], "theora")
     with pytest.raises(InputError, match="video format theora is not supported"):
         open_sequence(path, ego_motion="static")
 
 
 def test_without_the_extra_the_error_names_it(
-    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
     monkeypatch.setattr("bevcli.workshop.formats.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp, Sequence
+from bevcli.frame import Drive, FrameStamp
 from bevcli.sequences.open import open_sequence, select_every, select_range, select_rate
 
 START_NS = 1_533_151_603_000_000_000
 
 
-class Drive(Sequence):
+class MadeDrive(Drive):
     """A sequence of frames at given seconds. `load` returns the frame's position."""
 
     name, rig, has_ego_motion = "drive", None, True
@@ -33,14 +33,14 @@ def kept(sequence):
 
 @pytest.mark.parametrize(("rate", "step"), [(12, 6), (10, 5), (4, 2), (30, 15)])
 def test_multiple_of_the_rate_is_thinned_evenly(rate, step):
-    thinned = select_rate(Drive(np.arange(10 * rate) / rate), 2.0)
+    thinned = select_rate(MadeDrive(np.arange(10 * rate) / rate), 2.0)
     assert kept(thinned) == list(range(0, 10 * rate, step))
     assert f"{len(thinned.stamps)} of {10 * rate} frames" in thinned.notes[0]
 
 
 def test_jittering_keyframes_are_all_kept():
     rng = np.random.default_rng(1)
-    drive = Drive(np.arange(40) * 0.5 + rng.uniform(-0.05, 0.05, 40))
+    drive = MadeDrive(np.arange(40) * 0.5 + rng.uniform(-0.05, 0.05, 40))
     assert select_rate(drive, 2.0) is drive
 
 
@@ -48,37 +48,37 @@ def test_each_kept_frame_is_the_nearest_to_a_tick():
     rng = np.random.default_rng(2)
     times = np.cumsum(rng.uniform(0.02, 0.2, 300))
     times -= times[0]
-    chosen = times[kept(select_rate(Drive(times), 2.0))]
+    chosen = times[kept(select_rate(MadeDrive(times), 2.0))]
     nearest = {float(times[np.argmin(np.abs(times - tick))]) for tick in np.arange(0, times[-1] + 0.25, 0.5)}
     assert set(chosen.tolist()) <= nearest
     assert len(chosen) >= len(nearest) - 1
 
 
 def test_rate_that_does_not_divide_is_met_on_average():
-    thinned = select_rate(Drive(np.arange(300) / 7.0), 2.0)
+    thinned = select_rate(MadeDrive(np.arange(300) / 7.0), 2.0)
     assert len(thinned.stamps) == pytest.approx(300 / 7 * 2, abs=1.5)
 
 
 def test_hole_in_the_recording_gives_no_extra_frames():
     times = [*np.arange(24) / 12, *(10 + np.arange(24) / 12)]
-    chosen = [times[place] for place in kept(select_rate(Drive(times), 2.0))]
+    chosen = [times[place] for place in kept(select_rate(MadeDrive(times), 2.0))]
     assert chosen == [0, 0.5, 1, 1.5, 10, 10.5, 11, 11.5]
 
 
 def test_slower_input_is_kept_whole_with_a_warning():
-    thinned = select_rate(Drive(np.arange(5.0)), 2.0)
+    thinned = select_rate(MadeDrive(np.arange(5.0)), 2.0)
     assert kept(thinned) == [0, 1, 2, 3, 4]
     assert "1 frames per second" in thinned.notes[0]
 
 
 def test_each_scene_is_thinned_from_its_first_frame():
-    drive = Drive(np.arange(13) / 12, np.arange(13) / 12 + 100.3)
+    drive = MadeDrive(np.arange(13) / 12, np.arange(13) / 12 + 100.3)
     assert kept(select_rate(drive, 2.0)) == [0, 6, 12, 13, 19, 25]
     assert kept(select_every(drive, 5)) == [0, 5, 10, 13, 18, 23]
 
 
 def test_single_frame_is_kept():
-    assert kept(select_rate(Drive([0.0]), 2.0)) == [0]
+    assert kept(select_rate(MadeDrive([0.0]), 2.0)) == [0]
 
 
 @pytest.mark.parametrize(
@@ -86,13 +86,13 @@ def test_single_frame_is_kept():
     [(slice(None), [0, 1, 2, 3, 4]), (slice(1, 3), [1, 2]), (slice(3, 99), [3, 4]), (slice(-2, None), [3, 4])],
 )
 def test_range_of_frames(frames, expected):
-    assert kept(select_range(Drive(np.arange(5)), frames)) == expected
+    assert kept(select_range(MadeDrive(np.arange(5)), frames)) == expected
 
 
 @pytest.mark.parametrize("frames", [slice(5, 9), slice(2, 2)])
 def test_range_without_frames_is_an_error(frames):
     with pytest.raises(InputError, match=r"`frames=\d:\d`: .*has 5: 0:5"):
-        select_range(Drive(np.arange(5)), frames)
+        select_range(MadeDrive(np.arange(5)), frames)
 
 
 def test_range_counts_the_frames_that_are_left_after_thinning(drive):

@@ -9,9 +9,9 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.sequences.native.camera_names import match_names
-from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 START_S = 1_772_366_400  # 2026-03-01 12:00:00 in UTC
 
@@ -189,7 +189,7 @@ def test_cameras_that_do_not_fire_together_are_matched(drive, lost):
     names = {camera: [f"{camera}_{START_S * 10**6 + round(time * 1e6)}" for time in of] for camera, of in times.items()}
     if lost:
         del names[lost][7]
-    sequence = FolderSequence(images(drive, names), SequenceOptions(ego_motion="static"))
+    sequence = FolderDrive(images(drive, names), InputOptions(ego_motion="static"))
     (line,) = (note for note in sequence.notes if "frames.csv is missing" in note)
     farthest = max(abs(a - b) for a, b in zip(*times.values(), strict=True))
     assert "times are microseconds since 1970, 2 cameras at 10.0 Hz, matched to CAM_FRONT within" in line

@@ -10,7 +10,7 @@ import pytest
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.files.boxes_file import count_classes
-from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.output import NativeWriter
 
@@ -87,7 +87,7 @@ def test_lossless_videos_give_the_same_frames(real_drive, tmp_path, suffix):
     write_videos(real_drive, tmp_path / "videos_in", suffix)
     table = (real_drive / "frames.csv").read_text()
     for number in range(4):
-        for camera in FolderSequence(real_drive).rig.names:
+        for camera in FolderDrive(real_drive).rig.names:
             table = table.replace(f"images/{camera}/{number:06d}.jpg", f"videos/{camera}{suffix}#{number}")
     (tmp_path / "videos_in" / "frames.csv").write_text(table)
     assert_same_frames(open_sequence(real_drive), open_sequence(tmp_path / "videos_in"), same_bytes=False)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.registry import load
 from bevcli.sequences.open import open_sequence
@@ -15,12 +15,12 @@ from bevcli.workshop.formats.output import GROUP, open_writer
 LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
 
 
-def with_lines(drive: MemorySequence, place: int):
-    return replace(drive.load(place), ground_truth_results=(MapLines((LINE,), np.array(["divider"])),))
+def with_lines(drive: MemoryDrive, index: int):
+    return replace(drive.load(index), ground_truth_results=(MapLines((LINE,), np.array(["divider"])),))
 
 
 def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
-    drive = MemorySequence(2)
+    drive = MemoryDrive(2)
     for source, target in ((None, "one"), ("one", "two")):
         read = None if source is None else open_sequence(tmp_path / source)
         with open_writer(tmp_path / target, drive, WriteOptions()) as writer:
@@ -35,4 +35,4 @@ def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
 
 @pytest.mark.parametrize(("form", "expected"), [("native", set()), ("nuscenes", {"lines of the map"})])
 def test_a_format_names_the_truth_that_it_leaves_out(form, expected):
-    assert load(GROUP, form).left_out(with_lines(MemorySequence(1), 0)) == expected
+    assert load(GROUP, form).left_out(with_lines(MemoryDrive(1), 0)) == expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.synth.catalog import Assets
@@ -77,7 +77,7 @@ def test_a_wrong_distribution_is_rejected(wrong, message):
 
 
 @pytest.fixture(scope="module")
-def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Sequence]:
+def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Drive]:
     """A drive whose left front camera takes its images 50 ms late."""
     folder = tmp_path_factory.mktemp("delayed") / "drive"
     delays = {"CAM_FRONT_LEFT": 0.05}
@@ -86,7 +86,7 @@ def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[R
     return drive, open_sequence(folder)
 
 
-def test_a_late_camera_has_its_own_time_and_pose(delayed: tuple[RenderedDrive, Sequence]):
+def test_a_late_camera_has_its_own_time_and_pose(delayed: tuple[RenderedDrive, Drive]):
     drive, sequence = delayed
     frame = sequence.load(1)
     assert frame.images["CAM_FRONT_LEFT"].timestamp_ns - frame.stamp.timestamp_ns == 50_000_000
@@ -95,7 +95,7 @@ def test_a_late_camera_has_its_own_time_and_pose(delayed: tuple[RenderedDrive, S
     np.testing.assert_allclose(frame.world_from_ego_at["CAM_FRONT_LEFT"].translation, expected.translation, atol=2e-3)
 
 
-def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedDrive, Sequence]):
+def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedDrive, Drive]):
     drive, _ = delayed
     rendered = drive.frame(1)
     camera, boxes = drive.rig["CAM_FRONT_LEFT"], rendered.boxes

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from memory_drive import make_rig
 
-from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import BevMap, CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
@@ -39,7 +39,7 @@ CONFIG = ModelConfig(
 )
 
 
-class PaintedDrive(Sequence):
+class PaintedDrive(Drive):
     """Two frames half a second apart, with three cars and two pedestrians.
 
     all_labelled: whether both frames have ground truth, or only the second.

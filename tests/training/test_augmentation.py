@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.workshop.training.augmentation import (
     AugmentationConfig,
@@ -23,7 +23,7 @@ NONE = AugmentationConfig(photometric=0, grid_mask=0)
 
 
 def test_probability_zero_leaves_images_unchanged() -> None:
-    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
     assert distorted(frame, {}) is frame
     images = torch.ones(1, 2, 3, 8, 8)
     mask_images(images, 0.0, random)
@@ -62,14 +62,14 @@ def test_the_grid_mask_covers_about_a_quarter() -> None:
 
 
 def test_images_and_calibration_stay_unless_the_config_says_so() -> None:
-    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
     assert ImageVariation(NONE, random)(frame) is frame
     assert CalibrationVariation(NONE, random)(frame) is frame
     assert BadConditions(NONE, random)(frame) is frame
 
 
 def test_exposure_and_white_balance_last_a_clip_by_camera() -> None:
-    sequence, config = MemorySequence(2), AugmentationConfig(0, 0, exposure=1.0, white_balance=0.2)
+    sequence, config = MemoryDrive(2), AugmentationConfig(0, 0, exposure=1.0, white_balance=0.2)
     vary = ImageVariation(config, np.random.default_rng(0))
     gains = []
     for frame in (sequence.load(0), sequence.load(1)):
@@ -86,14 +86,14 @@ def test_exposure_and_white_balance_last_a_clip_by_camera() -> None:
 
 
 def test_some_images_are_dropped_but_never_all_of_a_frame() -> None:
-    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
     counts = [len(ImageVariation(AugmentationConfig(drop_image=0.5), random)(frame).images) for _ in range(100)]
     assert 2.5 < np.mean(counts) < 3.5
     assert len(ImageVariation(AugmentationConfig(drop_image=1.0), random)(frame).images) == 1
 
 
 def test_camera_poses_have_one_noise_in_all_frames_of_a_clip() -> None:
-    sequence, config = MemorySequence(2), AugmentationConfig(calibration_share=1.0, calibration_noise=2.0)
+    sequence, config = MemoryDrive(2), AugmentationConfig(calibration_share=1.0, calibration_noise=2.0)
     vary = CalibrationVariation(config, np.random.default_rng(0))
     first, second = vary(sequence.load(0)), vary(sequence.load(1))
     assert first.rig is second.rig
@@ -105,14 +105,14 @@ def test_camera_poses_have_one_noise_in_all_frames_of_a_clip() -> None:
 
 
 def test_a_share_of_the_clips_has_calibration_noise() -> None:
-    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
     config = AugmentationConfig(calibration_share=0.25)
     noisy = [CalibrationVariation(config, random)(frame) is not frame for _ in range(200)]
     assert np.mean(noisy) == pytest.approx(0.25, abs=0.08)
 
 
 def test_all_images_of_a_clip_have_the_same_corruption() -> None:
-    sequence = MemorySequence(2)
+    sequence = MemoryDrive(2)
     kinds = set()
     for seed in range(8):
         worsen = BadConditions(AugmentationConfig(corrupted_share=1.0), np.random.default_rng(seed))
@@ -127,7 +127,7 @@ def test_all_images_of_a_clip_have_the_same_corruption() -> None:
 
 
 def test_lost_cameras_stay_lost_and_one_is_left() -> None:
-    sequence = MemorySequence(2)
+    sequence = MemoryDrive(2)
     counts, black = set(), set()
     for seed in range(40):
         worsen = BadConditions(AugmentationConfig(lost_cameras_share=1.0), np.random.default_rng(seed))

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 
 from bevcli.errors import InputError
 from bevcli.workshop.training.samples import Clip, ClipConfig, draw_clip, draw_frames
@@ -17,17 +17,17 @@ class Drives:
 
     input_shapes: tuple[tuple[int, int, int], ...] | None = None
 
-    def __init__(self, sequence: MemorySequence, count: int = 2) -> None:
+    def __init__(self, sequence: MemoryDrive, count: int = 2) -> None:
         self._sequence, self._count = sequence, count
 
     def __len__(self) -> int:
         return self._count
 
-    def open(self, index: int) -> MemorySequence:
+    def open(self, index: int) -> MemoryDrive:
         return self._sequence
 
 
-def drawn(sequence: MemorySequence, frames: int, times: int = 200) -> Counter[tuple[int, ...]]:
+def drawn(sequence: MemoryDrive, frames: int, times: int = 200) -> Counter[tuple[int, ...]]:
     random = np.random.default_rng(0)
     return Counter(draw_frames(sequence, frames, random) for _ in range(times))
 
@@ -39,33 +39,33 @@ def clips_of(drives: Drives, config: ClipConfig, seed: int = 0) -> list[Clip]:
 
 def test_one_earlier_frame_is_left_out_and_the_order_is_kept() -> None:
     expected = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}  # frame 1 has one frame before it, the others two
-    assert set(drawn(MemorySequence(4), frames=2)) == expected
-    assert all(places[-1] - places[0] <= 3 for places in drawn(MemorySequence(10), frames=3))
+    assert set(drawn(MemoryDrive(4), frames=2)) == expected
+    assert all(places[-1] - places[0] <= 3 for places in drawn(MemoryDrive(10), frames=3))
 
 
 def test_clips_trained_on_as_a_whole_have_no_gap() -> None:
     config = ClipConfig(frames=3, batch=50, short_share=0.0, learn="all")
-    found = {clip.frames for clip in clips_of(Drives(MemorySequence(5)), config)}
+    found = {clip.frames for clip in clips_of(Drives(MemoryDrive(5)), config)}
     assert found == {(0, 1, 2), (1, 2, 3), (2, 3, 4)}
 
 
 def test_a_clip_stays_in_its_scene() -> None:
-    assert set(drawn(MemorySequence(6, scenes="aaabbb"), frames=3)) == {(0, 1, 2), (3, 4, 5)}
+    assert set(drawn(MemoryDrive(6, scenes="aaabbb"), frames=3)) == {(0, 1, 2), (3, 4, 5)}
 
 
 def test_a_clip_of_one_frame_has_no_history() -> None:
-    assert set(drawn(MemorySequence(3), frames=1)) == {(0,), (1,), (2,)}
+    assert set(drawn(MemoryDrive(3), frames=1)) == {(0,), (1,), (2,)}
 
 
 def test_a_drive_too_short_for_a_clip_is_rejected() -> None:
     with pytest.raises(InputError, match="memory: no scene has 4 frames or more"):
-        drawn(MemorySequence(6, scenes="aaabbb"), frames=4)
+        drawn(MemoryDrive(6, scenes="aaabbb"), frames=4)
 
 
 def test_clips_of_a_batch_have_one_length_and_some_are_short() -> None:
     lengths = Counter()
     for seed in range(300):
-        clips = clips_of(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), seed)
+        clips = clips_of(Drives(MemoryDrive(8)), ClipConfig(frames=3, batch=4, short_share=0.3), seed)
         assert len({len(clip.frames) for clip in clips}) == 1
         lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
@@ -73,7 +73,7 @@ def test_clips_of_a_batch_have_one_length_and_some_are_short() -> None:
 
 
 def test_clips_of_a_batch_share_camera_count_and_image_sizes() -> None:
-    drives = Drives(MemorySequence(5), 40)
+    drives = Drives(MemoryDrive(5), 40)
     sizes = [(4 + index % 2, 96 + 32 * (index // 2), 160) for index in range(40)]
     drives.input_shapes = tuple(sizes)
     for seed in range(50):

@@ -11,7 +11,7 @@ import torch
 from bevcli.checkpoints import bundled_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
@@ -79,7 +79,7 @@ def test_the_model_follows_from_the_weights() -> None:
 
 
 class EightFrames(FolderDrives):
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         return select_range(super().open(index), slice(0, 8))
 
 

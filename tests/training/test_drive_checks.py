@@ -15,7 +15,7 @@ from small_fleet import write_fleet
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
-from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.folder import FolderDrive
 from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
@@ -127,7 +127,7 @@ def test_boxes_of_a_format_without_a_table_are_counted(fleet: Path, monkeypatch:
     config, data = load_config(fleet / "mini.toml"), DriveOptions(data=(fleet / "d000",))
     config = replace(config, classes=("car", "Rad"))
     expected = check_scored_drives(data, scored_drives(data, config), config)
-    monkeypatch.setattr(FolderSequence, "class_counts", {})
+    monkeypatch.setattr(FolderDrive, "class_counts", {})
     assert check_scored_drives(data, scored_drives(data, config), config) == expected
 
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from bevcli.config import load_config
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply
@@ -38,7 +38,7 @@ LINES = MapLines((np.array([[-3.0, -10], [-3, 10]]),), np.array(["divider"]))
 RIG = make_rig({"CAM_FRONT": 0.0})
 
 
-class MovingDrive(Sequence):
+class MovingDrive(Drive):
     """Four frames half a second apart; the vehicle drives 4 m a frame to the north. Two cars start beside it.
 
     One drives along at the same speed, the other stands and is gone from the third frame on.
@@ -47,17 +47,17 @@ class MovingDrive(Sequence):
     name, rig, has_ego_motion = "moving", RIG, True
     stamps = tuple(FrameStamp(index, "", 10**18 + index * 500_000_000) for index in range(4))
 
-    def load(self, place: int) -> Frame:
-        pose = Pose(np.array([0.0, 4.0 * place, 0]), np.array([0.5**0.5, 0, 0, 0.5**0.5]))
-        count = 2 if place < 2 else 1
-        centers = np.array([[3.0, 4.0 * place, 1], [5.0, 0.0, 1]])[:count]
+    def load(self, index: int) -> Frame:
+        pose = Pose(np.array([0.0, 4.0 * index, 0]), np.array([0.5**0.5, 0, 0, 0.5**0.5]))
+        count = 2 if index < 2 else 1
+        centers = np.array([[3.0, 4.0 * index, 1], [5.0, 0.0, 1]])[:count]
         boxes = Boxes3D(
             centers, np.ones((count, 3)), np.zeros(count), np.zeros((count, 2)), np.array(["car"] * count),
             instances=np.array(["a", "b"])[:count],
         )  # fmt: skip
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.zeros(3))
         at = dict.fromkeys(RIG.names, pose)
-        return Frame(self.stamps[place], RIG, {}, pose, at, still, ground_truth=boxes, ground_truth_results=(LINES,))
+        return Frame(self.stamps[index], RIG, {}, pose, at, still, ground_truth=boxes, ground_truth_results=(LINES,))
 
 
 def test_futures_and_the_driven_path_are_in_the_bev_frame() -> None:

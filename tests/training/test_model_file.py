@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import command
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import with_truth
 from small_fleet import write_fleet
 
@@ -34,7 +34,7 @@ CPU = torch.device("cpu")
 FRAME = BevFrameConfig()
 
 
-class TrueDrive(MemorySequence):
+class TrueDrive(MemoryDrive):
     """Frames with a car 12 m ahead and a bicycle at (5, 21) m, in the bev frame."""
 
     def load(self, place):
@@ -92,7 +92,7 @@ def test_toml_keeps_texts_numbers_and_names_with_dots() -> None:
 
 def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="memory: has no ground truth boxes"):
-        look_at([MemorySequence(2)], FRAME)
+        look_at([MemoryDrive(2)], FRAME)
     for data, message in (
         (DriveOptions(), "give either `data=DIR`"),
         (DriveOptions(rendered=(1,)), "rendered drives are trained with demo"),

@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from bevcli.config import load_config
-from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
+from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
 from bevcli.inference.load import Model
@@ -21,15 +21,15 @@ from bevcli.workshop.odometry import check_motion, frames
 from bevcli.workshop.robustness.conditions import choose_conditions
 
 
-class Planted(DerivedSequence):
+class Planted(DerivedDrive):
     """A drive whose frames are changed when they are loaded."""
 
-    def __init__(self, drive: Sequence, change: Callable[[Sequence, int, Frame], Frame], rig: CameraRig | None = None):
+    def __init__(self, drive: Drive, change: Callable[[Drive, int, Frame], Frame], rig: CameraRig | None = None):
         super().__init__(drive)
         self.change, self.rig = change, rig or drive.rig
 
-    def load(self, place: int) -> Frame:
-        return replace(self.change(self.sequence, place, self.sequence.load(place)), rig=self.rig)
+    def load(self, index: int) -> Frame:
+        return replace(self.change(self.sequence, index, self.sequence.load(index)), rig=self.rig)
 
 
 def with_pixels(image: CameraImage, pixels) -> CameraImage:
@@ -39,7 +39,7 @@ def with_pixels(image: CameraImage, pixels) -> CameraImage:
 def _image(change):
     """Changes the image of one camera. change: (drive, place, camera, image) -> image."""
 
-    def plant(drive: Sequence, camera: str) -> Sequence:
+    def plant(drive: Drive, camera: str) -> Drive:
         def changed(sequence, place, frame):
             return replace(
                 frame, images={**frame.images, camera: change(sequence, place, camera, frame.images[camera])}
@@ -53,7 +53,7 @@ def _image(change):
 def _turned(axis_deg):
     """One camera states another rotation. axis_deg: about its right, down and forward axes."""
 
-    def plant(drive: Sequence, camera: str) -> Sequence:
+    def plant(drive: Drive, camera: str) -> Drive:
         from scipy.spatial.transform import Rotation
 
         turn = rigid(rotation=Rotation.from_rotvec(axis_deg, degrees=True).as_matrix())
@@ -62,18 +62,18 @@ def _turned(axis_deg):
     return plant
 
 
-def with_camera(drive: Sequence, camera: str, change) -> Sequence:
+def with_camera(drive: Drive, camera: str, change) -> Drive:
     cameras = tuple(change(one) if one.name == camera else one for one in drive.rig.cameras)
     return Planted(drive, lambda sequence, place, frame: frame, replace(drive.rig, cameras=cameras))
 
 
-def longer_focal(drive: Sequence, camera: str, factor: float = 1.15) -> Sequence:
+def longer_focal(drive: Drive, camera: str, factor: float = 1.15) -> Drive:
     """One camera states a focal length that is too long."""
     scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
     return with_camera(drive, camera, lambda one: replace(one, intrinsics=one.intrinsics * scale))
 
 
-def exchanged(drive: Sequence, camera: str, other: str) -> Sequence:
+def exchanged(drive: Drive, camera: str, other: str) -> Drive:
     """The images of two cameras are exchanged."""
 
     def change(sequence, place, frame):
@@ -84,7 +84,7 @@ def exchanged(drive: Sequence, camera: str, other: str) -> Sequence:
     return Planted(drive, change)
 
 
-def late(drive: Sequence, camera: str) -> Sequence:
+def late(drive: Drive, camera: str) -> Drive:
     """The images of one camera are those of the frame before."""
 
     def change(sequence, place, frame):
@@ -101,7 +101,7 @@ mirrored = _image(lambda drive, place, camera, image: with_pixels(image, image.p
 yawed, pitched = _turned((0, 2.0, 0)), _turned((2.0, 0, 0))
 
 
-def wrong_channels(drive: Sequence) -> Sequence:
+def wrong_channels(drive: Drive) -> Drive:
     """All images have the channels of RGB in place of BGR."""
 
     def change(sequence, place, frame):
@@ -111,10 +111,10 @@ def wrong_channels(drive: Sequence) -> Sequence:
     return Planted(drive, change)
 
 
-class OtherPoses(DerivedSequence):
+class OtherPoses(DerivedDrive):
     """A drive whose poses are changed. change: positions (T, 3) and rotations (T, 3, 3) -> the same of other poses."""
 
-    def __init__(self, drive: Sequence, change) -> None:
+    def __init__(self, drive: Drive, change) -> None:
         super().__init__(drive)
         motion = drive.ego_motion
         assert motion is not None
@@ -130,29 +130,29 @@ class OtherPoses(DerivedSequence):
     def _changed(self, matrix) -> Pose:
         return Pose.from_matrix(self._change(self._start, matrix))
 
-    def load(self, place: int) -> Frame:
-        frame = self.sequence.load(place)
+    def load(self, index: int) -> Frame:
+        frame = self.sequence.load(index)
         at = {name: self._changed(pose.matrix) for name, pose in frame.world_from_ego_at.items()}
         return replace(frame, world_from_ego=self._changed(frame.world_from_ego.matrix), world_from_ego_at=at)
 
 
-def scaled_poses(drive: Sequence, factor: float = 3.6) -> Sequence:
+def scaled_poses(drive: Drive, factor: float = 3.6) -> Drive:
     """Positions from speeds in km/h that were taken for m/s."""
     return OtherPoses(drive, lambda start, pose: rigid(start + factor * (pose[:3, 3] - start), pose[:3, :3]))
 
 
-def mirrored_poses(drive: Sequence) -> Sequence:
+def mirrored_poses(drive: Drive) -> Drive:
     """Poses of a left-handed world: y is mirrored."""
     flip = np.diag([1.0, -1, 1])
     return OtherPoses(drive, lambda start, pose: rigid(flip @ pose[:3, 3], flip @ pose[:3, :3] @ flip))
 
 
-def lost_poses(drive: Sequence) -> Sequence:
+def lost_poses(drive: Drive) -> Drive:
     """Poses that stand still."""
     return OtherPoses(drive, lambda start, pose: rigid(start))
 
 
-def beside(drive: Sequence, camera: str) -> str:
+def beside(drive: Drive, camera: str) -> str:
     """The next camera in the rig."""
     names = drive.rig.names
     return names[(names.index(camera) + 1) % len(names)]
@@ -211,7 +211,7 @@ MOST_KEPT = 150  # features of images, and motions
 MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives
 
 
-def sound_drive(drive: Sequence, number: int) -> Sequence:
+def sound_drive(drive: Drive, number: int) -> Drive:
     """Every second sound drive has images in mild fog, snow, bad light and so on."""
     name = MILD[number // 2 % len(MILD)] if number % 2 else ""
     if not name:
@@ -220,10 +220,10 @@ def sound_drive(drive: Sequence, number: int) -> Sequence:
     return condition.sequences(drive, number, "black")[0]
 
 
-class Standing(DerivedSequence):
+class Standing(DerivedDrive):
     """A drive whose vehicle stands: every frame shows the first one, at later times, with the noise of a camera."""
 
-    def __init__(self, drive: Sequence) -> None:
+    def __init__(self, drive: Drive) -> None:
         super().__init__(drive)
         motion, first = drive.ego_motion, drive.load(0).world_from_ego
         count = len(motion.timestamps_ns)
@@ -235,9 +235,9 @@ class Standing(DerivedSequence):
         }
         self.ego_motion = replace(motion, **poses, **still)
 
-    def load(self, place: int) -> Frame:
-        frame, first = self.sequence.load(place), self.sequence.load(0)
-        random = np.random.default_rng(place)
+    def load(self, index: int) -> Frame:
+        frame, first = self.sequence.load(index), self.sequence.load(0)
+        random = np.random.default_rng(index)
         images = {}
         for name, image in first.images.items():
             noise = random.normal(0, 2, image.pixels_bgr.shape)
@@ -263,7 +263,7 @@ def without_repetition() -> None:
 
         return kept
 
-    def images_of(drive: Sequence, *_) -> bytes:
+    def images_of(drive: Drive, *_) -> bytes:
         frames = [drive.load(place) for place in range(len(drive.stamps))]
         pixels = b"".join(image.pixels_bgr.tobytes() for frame in frames for image in frame.images.values())
         rig = [(one.intrinsics.tolist(), one.ego_from_camera.tolist()) for one in drive.rig.cameras]

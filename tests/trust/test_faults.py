@@ -161,13 +161,13 @@ def test_boxes_agree_that_have_one_class_and_place():
     assert agreement([wanted], [given]) == (3, 1 / 3)
 
 
-class OneFrame(planted_faults.DerivedSequence):
+class OneFrame(planted_faults.DerivedDrive):
     """A drive of one frame with one image."""
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels, self.name, self.rig, self.stamps, self.has_ego_motion = pixels, "one", RIG, (), False
 
-    def load(self, place: int) -> planted_faults.Frame:
+    def load(self, index: int) -> planted_faults.Frame:
         image = planted_faults.CameraImage(0, self.pixels)
         return planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
 

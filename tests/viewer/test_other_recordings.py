@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
-from memory_drive import MemorySequence, make_rig
+from memory_drive import MemoryDrive, make_rig
 from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
@@ -22,7 +22,7 @@ from bevcli.viewer.video import CameraImages, draw_frame, tiles
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "recording.rrd"
-    record(path, MemorySequence(3, make_rig({"CAM_FRONT": 0.0})))
+    record(path, MemoryDrive(3, make_rig({"CAM_FRONT": 0.0})))
     return path
 
 

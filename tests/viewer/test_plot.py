@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import GRID, boxes_ahead, predict
 
 from bevcli.errors import InputError
@@ -13,7 +13,7 @@ from bevcli.frame import BevMap, CameraImage
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import apply, inverse
 
-SEQUENCE = MemorySequence(1)
+SEQUENCE = MemoryDrive(1)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import warnings
 from functools import partial
 
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, predict, record
 from rerun.chunk import RrdReader
 
@@ -22,7 +22,7 @@ from bevcli.viewer.recording_reader import RecordingReader
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "recording.rrd"
-    record(path, MemorySequence(3))
+    record(path, MemoryDrive(3))
     return path
 
 
@@ -62,7 +62,7 @@ def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, conten
 
 @pytest.mark.parametrize("bev", ["pca", "none"])
 def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
-    path, sequence, options = tmp_path / "recording.rrd", MemorySequence(6), RecordingOptions(bev=bev)
+    path, sequence, options = tmp_path / "recording.rrd", MemoryDrive(6), RecordingOptions(bev=bev)
     frames = [sequence.load(place) for place in range(6)]
     with Recording(path, sequence, NamedModel(), options) as first:
         for frame in frames[:3]:
@@ -97,7 +97,7 @@ def assert_same_frames(path, expected):
 
 @pytest.mark.slow
 def test_a_long_recording_of_several_streams_is_one_recording(tmp_path, monkeypatch):
-    sequence, finished = MemorySequence(6), 5
+    sequence, finished = MemoryDrive(6), 5
     record(tmp_path / "whole.rrd", sequence, truth=False)
     monkeypatch.setattr(writer, "INDEXED_FRAMES", 2)
     path = tmp_path / "long.rrd"

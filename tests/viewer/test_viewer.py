@@ -10,7 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 
 from bevcli.errors import InputError, OutputError
@@ -31,7 +31,7 @@ VIEWS = {
 @pytest.fixture(scope="module")
 def screenshot(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
-    record(folder / "recording.rrd", MemorySequence(3))
+    record(folder / "recording.rrd", MemoryDrive(3))
     views = screenshot_or_skip(folder / "recording.rrd", folder / "image.png", 1)
     return views, cv2.imread(str(folder / "image.png")), folder
 
@@ -55,7 +55,7 @@ def test_a_screenshot_can_be_a_jpeg_of_a_video_recording(screenshot):
     if not has_av():
         pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
     *_, folder = screenshot
-    record(folder / "av1.rrd", MemorySequence(3), RecordingOptions(images="av1"))
+    record(folder / "av1.rrd", MemoryDrive(3), RecordingOptions(images="av1"))
     take_screenshot(folder / "av1.rrd", folder / "image.jpg", 2)
     assert (folder / "image.jpg").read_bytes().startswith(b"\xff\xd8\xff")
     image = cv2.imread(str(folder / "image.jpg"))
@@ -93,7 +93,7 @@ def test_without_vulkan_an_early_answer_changes_nothing(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the viewer draws with Vulkan on Linux only")
 def test_without_vulkan_each_try_names_the_driver(tmp_path, monkeypatch):
-    record(tmp_path / "recording.rrd", MemorySequence(1))
+    record(tmp_path / "recording.rrd", MemoryDrive(1))
     for variable in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):  # where the Vulkan loader looks for drivers
         monkeypatch.setenv(variable, str(tmp_path / "none.json"))
     for _ in range(10):
@@ -128,7 +128,7 @@ def test_a_viewer_that_dies_or_hangs_does_not_disturb_the_run(tmp_path, monkeypa
 
     monkeypatch.setattr(web, "display_is_there", lambda: True)
     monkeypatch.setattr(web, "start_viewer", start_headless)
-    drive = MemorySequence(8)
+    drive = MemoryDrive(8)
     path = tmp_path / "recording.rrd"
     try:
         view = LiveView()

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import bev_from_world, boxes_ahead, record
 from typer.testing import CliRunner
 
@@ -25,7 +25,7 @@ from bevcli.viewer.video import write_video
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "recording.rrd"
-    return record(path, MemorySequence(3)), path
+    return record(path, MemoryDrive(3)), path
 
 
 def viz(*arguments) -> str:
@@ -117,7 +117,7 @@ def test_a_video_of_av1_images_shows_them(tmp_path):
     if not video.has_av():
         pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
     for images in ("jpeg", "av1"):
-        record(tmp_path / f"{images}.rrd", MemorySequence(2), RecordingOptions(images=images))
+        record(tmp_path / f"{images}.rrd", MemoryDrive(2), RecordingOptions(images=images))
         viz(tmp_path / f"{images}.rrd", "--video", tmp_path / f"{images}.mp4")
     first = [cv2.VideoCapture(str(tmp_path / f"{name}.mp4")).read()[1][30:200, 20:400] for name in ("jpeg", "av1")]
     assert first[1].std() > 0.5 * first[0].std()

@@ -19,7 +19,7 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import record
 
 from bevcli.errors import OutputError
@@ -229,7 +229,7 @@ def test_a_browser_shows_the_recording(tmp_path):
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no browser to drive")
     if CHROMIUM is None:
         pytest.skip("no chromium here: apt-get install chromium")
-    record(tmp_path / "recording.rrd", MemorySequence(3))
+    record(tmp_path / "recording.rrd", MemoryDrive(3))
     command = [sys.executable, "-m", "bevcli", "viz"]
     server = subprocess.Popen(
         [*command, str(tmp_path / "recording.rrd"), "--web"], stdout=subprocess.PIPE, text=True, bufsize=1

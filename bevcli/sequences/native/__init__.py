@@ -1,6 +1,6 @@
 """The native sequence folder: one drive with calibration, images or videos, ego-motion and ground truth.
 
-folder: FolderSequence, the folder as a Sequence. unlisted: its frames where it has no frames.csv, from the times that
+folder: FolderDrive, the folder as a drive. unlisted: its frames where it has no frames.csv, from the times that
 name_times finds and matching puts together; camera_names: whose folders these are.
 """
 
@@ -15,7 +15,7 @@ FORMAT = Format(
     name="a sequence folder",
     expected="calibration.json, frames.csv, ego_motion.csv, images or videos",
     recognises=lambda path: any((path / part).exists() for part in MARKERS) or has_camera_folders(path),
-    opener="bevcli.sequences.native.folder:FolderSequence",
+    opener="bevcli.sequences.native.folder:FolderDrive",
     options=FolderOptions,
     precedence=-10,
 )

@@ -1,4 +1,4 @@
-"""The native sequence folder as a Sequence."""
+"""The native sequence folder as a drive."""
 
 import re
 from collections.abc import Mapping
@@ -23,9 +23,9 @@ from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded,
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import true_results
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
 from bevcli.sequences.native.options import FolderOptions
-from bevcli.sequences.options import EgoMotionUse, SequenceOptions
+from bevcli.sequences.options import EgoMotionUse, InputOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -33,8 +33,8 @@ VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
 NO_IMAGE = "no image in frames.csv"
 
 
-class FolderSequence(ListedSequence):
-    """A native sequence folder as a `Sequence`.
+class FolderDrive(ListedDrive):
+    """A native sequence folder as a `Drive`.
 
     rig: used in place of the rig of `own` and of calibration.json, if given.
     Attribute understood: how the images were understood without frames.csv, "" with it.
@@ -44,7 +44,7 @@ class FolderSequence(ListedSequence):
     def __init__(
         self,
         path: Path,
-        common: SequenceOptions = SequenceOptions(),
+        common: InputOptions = InputOptions(),
         own: FolderOptions = FolderOptions(),
         rig: CameraRig | None = None,
     ) -> None:

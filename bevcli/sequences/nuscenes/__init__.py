@@ -1,6 +1,6 @@
 """nuScenes datasets, read without the official devkit (which needs an old NumPy).
 
-sequence: NuScenesSequence, the dataset as a Sequence, and TableSequence, for formats with the same tables.
+sequence: NuScenesDrive, the dataset as a drive, and TableDrive, for formats with the same tables.
 index: the contents of tables as arrays, dialects, splits and frames. tables: reads and caches them.
 """
 
@@ -45,7 +45,7 @@ FORMAT = Format(
     name="a nuScenes root",
     expected="v1.0-*/scene.json",
     recognises=is_nuscenes_root,
-    opener="bevcli.sequences.nuscenes.sequence:NuScenesSequence",
+    opener="bevcli.sequences.nuscenes.sequence:NuScenesDrive",
     options=NuScenesOptions,
     annotated=True,
     precedence=20,

@@ -1,4 +1,4 @@
-"""A nuScenes dataset root as a Sequence, with the rig, the poses and the CAN bus data of each scene."""
+"""A nuScenes dataset root as a drive, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
@@ -32,7 +32,7 @@ from bevcli.sequences.nuscenes.index import (
     tables_of,
 )
 from bevcli.sequences.nuscenes.tables import open_index, read_rows
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
@@ -70,7 +70,7 @@ class _FrameEntry:
     rows: Ints
 
 
-class TableSequence(Sequence):
+class TableDrive(Drive):
     """Frames of a folder with nuScenes' tables, scene after scene, numbered from 0.
 
     Args:
@@ -85,9 +85,7 @@ class TableSequence(Sequence):
 
     has_ego_motion = True
 
-    def __init__(
-        self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
-    ) -> None:
+    def __init__(self, root: Path, tables: Path, common: InputOptions, dialect: Dialect, own: NuScenesOptions) -> None:
         common.refuse_static(root)
         self.name = root.resolve().name
         self.root, self.tables, self.dialect = root, tables, dialect
@@ -131,14 +129,14 @@ class TableSequence(Sequence):
                 counts[name] += count
         return counts
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return tuple(self._source(int(row)).path for row in self._frames[place].rows)
+    def image_files(self, index: int) -> tuple[Path, ...]:
+        return tuple(self._source(int(row)).path for row in self._frames[index].rows)
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._frame(self._frames[place], with_images=False)
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._frame(self._frames[index], with_images=False)
 
-    def load(self, place: int) -> Frame:
-        return self._frame(self._frames[place], with_images=True)
+    def load(self, index: int) -> Frame:
+        return self._frame(self._frames[index], with_images=True)
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
         rig, motion, kinematics = self._scene(entry.scene)
@@ -180,16 +178,16 @@ class TableSequence(Sequence):
         return ImageSource(self.root / images.files[row].decode(), int(images.times_us[row]) * 1000)
 
 
-class NuScenesSequence(TableSequence):
+class NuScenesDrive(TableDrive):
     """Frames of a nuScenes root: keyframes, and sweeps if they are chosen.
 
     The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map. Keyframes have true lines of
     the map where the root has the map expansion.
-    Raises InputError as `TableSequence`.
+    Raises InputError as `TableDrive`.
     """
 
     def __init__(
-        self, root: Path, common: SequenceOptions = SequenceOptions(), own: NuScenesOptions = NuScenesOptions()
+        self, root: Path, common: InputOptions = InputOptions(), own: NuScenesOptions = NuScenesOptions()
     ) -> None:
         tables = tables_of(root, own.version)
         super().__init__(root, tables, common, NUSCENES, own)

@@ -13,9 +13,17 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, Workers
-from bevcli.workshop.batch.job import Drive, Job, Record, all_own_options, find_drives, read_list, with_absolute_paths
+from bevcli.workshop.batch.job import (
+    BatchDrive,
+    Job,
+    Record,
+    all_own_options,
+    find_drives,
+    read_list,
+    with_absolute_paths,
+)
 from bevcli.workshop.batch.run_batch import BatchSummary, run_batch
 from bevcli.workshop.batch.storage import is_url
 from bevcli.workshop.batch.worker import use_threads
@@ -37,7 +45,7 @@ class PreparedBatch:
 
     job: Job
     model: Model
-    drives: list[Drive]
+    drives: list[BatchDrive]
     notes: tuple[str, ...]
 
 
@@ -64,11 +72,11 @@ def batch(
         after_drive: called with the record of each drive that is done or has failed.
         should_stop: asked after each frame in this process; True ends the batch, which `resume` continues.
         options: those of `BatchOptions` (`resume`, `evaluate`, …), `Workers` (`count`, `gpus`, …), `ModelOptions`,
-            `RunOptions`, `RecordingOptions` and `SequenceOptions`, and those of the formats.
+            `RunOptions`, `RecordingOptions` and `InputOptions`, and those of the formats.
 
     Raises BevcliError: see `run_batch`.
     """
-    kinds = (BatchOptions, Workers, ModelOptions, RunOptions, RecordingOptions, SequenceOptions)
+    kinds = (BatchOptions, Workers, ModelOptions, RunOptions, RecordingOptions, InputOptions)
     chosen, workers, model, run_options, recording, source, own = spread(options | {"out": str(out)}, *kinds)
     names = {name for kind in option_classes() for name in kind.__dataclass_fields__}
     if own.keys() - names:
@@ -99,7 +107,7 @@ def prepare_batch(
     workers: Workers,
     model: ModelOptions,
     run_options: RunOptions,
-    source: SequenceOptions,
+    source: InputOptions,
     own: dict[str, Any],
     load: Load = lambda options: load_model(options=options),
 ) -> PreparedBatch:

@@ -16,13 +16,13 @@ from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model
     from bevcli.published import NamedWeights
-    from bevcli.workshop.batch.job import Drive, Job
+    from bevcli.workshop.batch.job import BatchDrive, Job
     from bevcli.workshop.batch.run_batch import BatchSummary
 
 
@@ -45,7 +45,7 @@ def batch(
     model: ModelOptions,
     run_options: Annotated[RunOptions, Part(without=("save_bev",))],
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
-    source: Annotated[SequenceOptions, Part(without=("scene",))],
+    source: Annotated[InputOptions, Part(without=("scene",))],
     format_options: Annotated[
         FormatValues,
         Part(without=("intrinsics", "extrinsics", "ego_motion_file", "pose_times", "pose_angles", "poses_of")),
@@ -82,7 +82,7 @@ def batch(
 def run_with_progress(
     job: "Job",
     model: "Model",
-    drives: "list[Drive]",
+    drives: "list[BatchDrive]",
     notes: tuple[str, ...],
     workers: Workers,
     *,
@@ -176,7 +176,7 @@ def reproduce(
         retries=workers.retries,
     )
     loaded = model_for_batch(job, workers, load_with_bar)
-    job = replace(job, source=SequenceOptions().for_model(loaded.config, temporal=run_options.temporal))
+    job = replace(job, source=InputOptions().for_model(loaded.config, temporal=run_options.temporal))
     summary = run_with_progress(job, loaded, drives, notes, workers, resume=options.resume, retry_failed=options.resume)
     if not any(record.get("scores") for record in summary.records):
         why = next(

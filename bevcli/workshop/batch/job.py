@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from bevcli._version import __version__
 from bevcli.errors import BevcliError, InputError
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
@@ -34,7 +34,7 @@ from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.sequences.options import FormatOptions, InputOptions
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 from bevcli.writing import user_cache
 
@@ -44,7 +44,7 @@ _KEY_DIGITS = 12
 
 
 @dataclass(frozen=True)
-class Drive:
+class BatchDrive:
     """One drive of a batch.
 
     Attributes:
@@ -78,7 +78,7 @@ def read_list(path: Path) -> list[str]:
 
 def find_drives(
     texts: Iterable[str], options: NuScenesOptions = NuScenesOptions()
-) -> tuple[list[Drive], tuple[str, ...]]:
+) -> tuple[list[BatchDrive], tuple[str, ...]]:
     """All drives of arguments in order, each input once, and notes for the user.
 
     A drive whose input cannot be listed has its `problem`.
@@ -98,10 +98,10 @@ def find_drives(
     return _without_copies(drives)
 
 
-def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterator[Drive]:
+def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterator[BatchDrive]:
     """The drives of a path or URL. name: of a drive that is one of several in a folder; "" for the path's own."""
     path = source if is_url(source) else str(Path(source.removeprefix("file://")).absolute())
-    drive = Drive(path, _safe_name(name or path))
+    drive = BatchDrive(path, _safe_name(name or path))
     try:
         storage = open_storage(path)
         if _versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
@@ -115,7 +115,7 @@ def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterato
         yield replace(drive, problem=str(error))
 
 
-def _scenes(root: Drive, options: NuScenesOptions) -> Iterator[Drive]:
+def _scenes(root: BatchDrive, options: NuScenesOptions) -> Iterator[BatchDrive]:
     """A drive per scene. Of the input, the tables count."""
     if is_url(root.source):
         tables, files = _copy_tables(root.source, options.version)
@@ -125,7 +125,7 @@ def _scenes(root: Drive, options: NuScenesOptions) -> Iterator[Drive]:
     index, _ = open_index(tables)
     for number in chosen_scenes(index, tables, options.split):
         scene = str(index.scenes.names[number])
-        yield Drive(root.source, _safe_name(scene), scene, _hash(tables.name, scene, files))
+        yield BatchDrive(root.source, _safe_name(scene), scene, _hash(tables.name, scene, files))
 
 
 def _hash(name: str, scene: str | None, files: list[StoredFile]) -> str:
@@ -138,9 +138,9 @@ def _safe_name(source: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[:LONGEST_NAME] or "drive"
 
 
-def _without_copies(drives: list[Drive]) -> tuple[list[Drive], tuple[str, ...]]:
+def _without_copies(drives: list[BatchDrive]) -> tuple[list[BatchDrive], tuple[str, ...]]:
     """Each input once; an input that cannot be listed is known by its source."""
-    kept: dict[str, Drive] = {}
+    kept: dict[str, BatchDrive] = {}
     notes = []
     for drive in drives:
         first = kept.setdefault(drive.input_hash or drive.source, drive)
@@ -218,7 +218,7 @@ class Job:
 
     out: str
     model: ModelOptions = field(default_factory=ModelOptions)
-    source: SequenceOptions = field(default_factory=SequenceOptions)
+    source: InputOptions = field(default_factory=InputOptions)
     own: tuple[FormatOptions, ...] = ()
     run: RunOptions = field(default_factory=RunOptions)
     evaluate: bool = False
@@ -232,12 +232,12 @@ class Job:
         """The own options of a format. kind: their dataclass."""
         return next((each for each in self.own if type(each) is kind), kind())
 
-    def open(self, path: Path, scene: str | None) -> Sequence:
+    def open(self, path: Path, scene: str | None) -> Drive:
         """A drive, or a scene of it. Raises InputError."""
         own = self.own_of(format_of(path).options)
         return open_sequence(path, replace(self.source, scene=scene), **vars(own))
 
-    def check_options(self, drives: Iterable[Drive]) -> None:
+    def check_options(self, drives: Iterable[BatchDrive]) -> None:
         """Raise InputError for an option that no format of the drives has. One at a URL may have any format."""
         if any(is_url(drive.source) for drive in drives):
             return

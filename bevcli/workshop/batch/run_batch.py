@@ -12,7 +12,7 @@ from bevcli.inference.load import Model
 from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
 from bevcli.workshop.batch import Workers, storage
-from bevcli.workshop.batch.job import Drive, Job, Record, read_record
+from bevcli.workshop.batch.job import BatchDrive, Job, Record, read_record
 from bevcli.workshop.batch.report import write_results
 from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray
 
@@ -62,7 +62,7 @@ class BatchSummary:
 def run_batch(
     job: Job,
     model: Model,
-    drives: Sequence[Drive],
+    drives: Sequence[BatchDrive],
     workers: Workers | None = None,
     *,
     resume: bool = False,
@@ -126,7 +126,7 @@ def _run(
     job: Job,
     job_hash: str,
     model: Model,
-    drives: Sequence[Drive],
+    drives: Sequence[BatchDrive],
     workers: Workers | None,
     should_stop: Callable[[], bool],
 ) -> Generator[Record, None, None]:
@@ -153,7 +153,7 @@ def _check_folder(out: storage.Storage, resume: bool) -> None:
 
 
 def _known_records(
-    out: storage.Storage, drives: Sequence[Drive], job_hash: str, retry_failed: bool
+    out: storage.Storage, drives: Sequence[BatchDrive], job_hash: str, retry_failed: bool
 ) -> dict[str, Record]:
     """The records of drives that are done or have failed, by the name of their results."""
     done, failed = out.names(storage.RESULTS), out.names(storage.FAILED)

@@ -38,7 +38,7 @@ from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage
-from bevcli.workshop.batch.job import SCORE_BINS, Drive, Job, Record, fetch_scene, read_record
+from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
 from bevcli.workshop.trust.estimate import estimate_of_run, fits
 
@@ -58,7 +58,7 @@ class Worker:
         self._model = job.load_model() if model is None else model
         _remove_scratch_of_dead_workers()
 
-    def run(self, drive: Drive, should_stop: Callable[[], bool] = lambda: False) -> Record:
+    def run(self, drive: BatchDrive, should_stop: Callable[[], bool] = lambda: False) -> Record:
         """Run a drive until it is done or has failed too often, and returns its record, which is also stored.
 
         An attempt is counted before it starts, so that a drive that kills its worker is not tried for ever.
@@ -94,7 +94,7 @@ class Worker:
         self._out.remove(marker)
         return record
 
-    def _attempt(self, drive: Drive, result: str, attempt: int, should_stop: Callable[[], bool]) -> Record:
+    def _attempt(self, drive: BatchDrive, result: str, attempt: int, should_stop: Callable[[], bool]) -> Record:
         if drive.problem:
             raise BevcliError(drive.problem)
         job, began = self._job, time.perf_counter()
@@ -144,7 +144,7 @@ class Worker:
             self._out.land(aside, f"{storage.RESULTS}/{result}", storage.RECORD)
             return record
 
-    def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
+    def _score(self, drive: BatchDrive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
         chosen = format_of(path)
         if not self._job.evaluate or not (chosen.annotated or is_there(path / "ground_truth.json")):
@@ -203,7 +203,7 @@ def use_threads(count: int) -> None:
     cv2.setNumThreads(count)
 
 
-def _about(drive: Drive, result: str) -> Record:
+def _about(drive: BatchDrive, result: str) -> Record:
     return {"drive": drive.name, "source": valid_text(drive.source), "scene": drive.scene, "result": result}
 
 
@@ -223,7 +223,7 @@ def _score_columns(scores: Scores) -> Record:
     return {**defined, "ground_truth_boxes": scores.detection.overall.ground_truth_count}
 
 
-def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:
+def _fetched(drive: BatchDrive, job: Job, inputs: Path) -> Path:
     """A local path of a drive's input; of a URL, a copy with the same name."""
     if not storage.is_url(drive.source):
         return Path(drive.source)
@@ -278,7 +278,7 @@ _ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS_SKIP_REGEX": ".*
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
-def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Workers) -> Iterator[Record]:
+def run_on_ray(job: Job, job_hash: str, drives: Sequence[BatchDrive], workers: Workers) -> Iterator[Record]:
     """Run drives on Ray and yield their records as they are done.
 
     A worker that dies is replaced, and its drive is run again.
@@ -326,7 +326,7 @@ class _RayWorker:
         self._make_worker = partial(Worker, job, job_hash)
         self._worker: Worker | None = None
 
-    def run(self, drive: Drive | None) -> Record | None:
+    def run(self, drive: BatchDrive | None) -> Record | None:
         """See `Worker.run`; None only loads the model."""
         try:  # not above: an exception there would make Ray start the worker again and again
             self._worker = self._worker or self._make_worker()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
@@ -29,7 +29,7 @@ RESIDUAL_GAIN = 0.25  # of the backbone's blocks, whose initial gain is zero
 USUAL_DEVIATION = 57.0  # standard deviation of images, grey levels; other values of `image.std` scale the first layer
 
 
-class MadeUpDrive(Sequence):
+class MadeUpDrive(Drive):
     """A drive of any length with moving vehicle and JPEG images.
 
     The cameras' directions and lenses are those of nuScenes, so that the cameras see as many BEV cells.

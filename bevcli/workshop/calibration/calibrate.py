@@ -5,7 +5,7 @@ In this order: the rounds of the measurement, rotations from matched points and 
 """
 
 import json
-from collections.abc import Callable, Sequence as Items
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import DerivedSequence, DriveFacts, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, DriveFacts, Frame
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
@@ -236,10 +236,10 @@ class CalibrationResult:
         return [rig, report]
 
 
-class DriveWithRig(DerivedSequence):
+class DriveWithRig(DerivedDrive):
     """A drive with another rig in every frame."""
 
-    def __init__(self, sequence: Sequence, rig: CameraRig) -> None:
+    def __init__(self, sequence: Drive, rig: CameraRig) -> None:
         super().__init__(sequence)
         self.rig = rig
 
@@ -248,7 +248,7 @@ class DriveWithRig(DerivedSequence):
 
 
 def calibrate(
-    drive: Sequence,
+    drive: Drive,
     options: CalibrateOptions | None = None,
     *,
     after_step: Callable[[], None] = lambda: None,
@@ -285,7 +285,7 @@ def calibrate(
     return judge(drive, measure(views, matches, chosen, after_step))
 
 
-def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
+def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
     """The result of a measurement: what is observed, with a verdict for each camera."""
     changes, covariances, whole = observed(measurement)
     stated, unknowns, pairs = measurement.views.stated, measurement.unknowns, len(measurement.views.pairs)
@@ -302,7 +302,7 @@ def judge(drive: Sequence, measurement: Measurement) -> CalibrationResult:
     return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
 
 
-def _even_interval_ms(drive: Sequence) -> float | None:
+def _even_interval_ms(drive: Drive) -> float | None:
     """The time from each frame to the next one, if all are the same but for rounding; else None."""
     steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps]) / 1e6
     return float(np.median(steps)) if len(steps) and np.ptp(steps) < EVEN_MS else None
@@ -426,7 +426,7 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
     return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
 
 
-def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
+def motion_findings(drive: Drive) -> tuple[Finding, ...]:
     """Findings about the cameras whose calibration does not fit how the vehicle moves, measured from a few frames."""
     try:
         result = calibrate(drive, pairs=SHORT_PAIRS)
@@ -435,7 +435,7 @@ def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
     return findings_of(result.cameras, result.interval_ms)
 
 
-def findings_of(cameras: Items[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:
+def findings_of(cameras: Sequence[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:
     """A finding for each camera that is corrected, and for each whose capture times are off, or one for all.
 
     interval_ms: see `CalibrationResult`.

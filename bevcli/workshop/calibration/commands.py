@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions, CheckMotionOptions
 
 if TYPE_CHECKING:
     from bevcli.findings import Finding
-    from bevcli.frame import Sequence
+    from bevcli.frame import Drive
 
 PANEL = "Look"
 
@@ -23,7 +23,7 @@ PANEL = "Look"
 def calibrate(
     sequence: InputDrive,
     options: CalibrateOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "odometry", "allow_outside"))],
+    source: Annotated[InputOptions, Part(only=("frames", "scene", "rate_hz", "every", "odometry", "allow_outside"))],
     format_options: FormatValues,
     output: CalibrateOutputOptions,
     as_json: Json = False,
@@ -53,7 +53,7 @@ def calibrate(
     say("Written: " + ", ".join(map(str, written)), err=as_json)
 
 
-def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Sequence"]) -> "tuple[Finding, ...]":
+def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Drive"]) -> "tuple[Finding, ...]":
     """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone."""
     if not options.motion:
         return ()

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
@@ -28,10 +28,10 @@ AfterStep = Callable[[int, int], None]  # steps that are done, and of how many
 
 
 def calibrate_in_turn(
-    drive: Sequence,
+    drive: Drive,
     options: CalibrateOptions | None = None,
     *,
-    with_motion: Callable[[Sequence, AfterStep], Sequence] | None = None,
+    with_motion: Callable[[Drive, AfterStep], Drive] | None = None,
     after_step: Callable[[], None] = lambda: None,
     **changes: Any,
 ) -> CalibrationResult:

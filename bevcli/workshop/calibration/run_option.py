@@ -7,7 +7,7 @@ from bevcli.options import option, options
 from bevcli.printing import say
 
 if TYPE_CHECKING:
-    from bevcli.frame import Sequence
+    from bevcli.frame import Drive
 
 
 @options("Input")
@@ -20,7 +20,7 @@ class CalibrateFirstOptions:
     )
 
 
-def _corrected(options: CalibrateFirstOptions, drive: "Sequence") -> "Sequence":
+def _corrected(options: CalibrateFirstOptions, drive: "Drive") -> "Drive":
     """The drive with the rig that it shows, where this is asked for; what is corrected is printed."""
     if not options.calibrate:
         return drive

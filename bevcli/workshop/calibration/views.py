@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
@@ -74,7 +74,7 @@ class Views:
         return self.of[a, first], self.of[b if moves else a, second]
 
 
-def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = lambda: None) -> Views:
+def read_views(drive: Drive, most_pairs: int, progress: Callable[[], None] = lambda: None) -> Views:
     """The views of a drive. progress: called READING_STEPS times.
 
     Raises InputError where the drive does not show how its cameras move.
@@ -103,7 +103,7 @@ def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = 
     return Views(stated, rig, tuple(pairs), views)
 
 
-def _check(drive: Sequence) -> None:
+def _check(drive: Drive) -> None:
     if not drive.has_ego_motion:
         raise InputError(
             f"{drive.name}: has no ego-motion (expected the vehicle's poses, since a calibration is measured from "
@@ -116,7 +116,7 @@ def _check(drive: Sequence) -> None:
         raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one, since rigs differ): choose a `scene`")
 
 
-def _positions(drive: Sequence) -> tuple[list[int], Array]:
+def _positions(drive: Drive) -> tuple[list[int], Array]:
     """Indices of frames, and their positions with headings (F, 3): x, y in metres, yaw in radians."""
     count = len(drive.stamps)
     if drive.ego_motion is not None:

@@ -24,7 +24,7 @@ import torch
 
 from bevcli._version import __version__
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model, tracker_of_table
@@ -144,7 +144,7 @@ class Engine(LoadedFile):
         export_form(config, len(config.cameras))
 
     @classmethod
-    def export(cls, model: Model, rig: CameraRig, drive: Sequence | None, report: Callable[[str], None]) -> Model:
+    def export(cls, model: Model, rig: CameraRig, drive: Drive | None, report: Callable[[str], None]) -> Model:
         """A model that is loaded for this engine, as an exported file for a rig: see `Model.in_engine`."""
         sized = model.for_rig(rig)
         options = _options(sized, rig, cls.deformable_convolution)
@@ -295,7 +295,7 @@ def _cannot_load(file: Path, program: str, error: Exception) -> WeightsError:
     return WeightsError(f"{file}: {program} cannot load it: {lines[-1] if lines else type(error).__name__}")
 
 
-def _calibration_frames(model: Model, drive: Sequence | None) -> Sequence:
+def _calibration_frames(model: Model, drive: Drive | None) -> Drive:
     if model.calibrate_with is not None:
         drive = open_sequence(model.calibrate_with, rate_hz=model.config.rate_hz, ground_truth=False)
     if drive is None:

@@ -11,7 +11,7 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,7 +23,7 @@ import torch
 from bevcli._version import __version__
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import BevcliError, InputError, WeightsError
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
@@ -348,7 +348,7 @@ def check_size(file: Path) -> None:
         raise ValueError(f"it has {size} bytes (expected at most {LARGEST_BYTES})")
 
 
-def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence], frames: int) -> Iterator[np.ndarray]:
+def calibration_images(config: ModelConfig, cameras: int, drives: Sequence[Drive], frames: int) -> Iterator[np.ndarray]:
     """Yields (1, N, H, W, 3) float32, the input `images` of an exported file, for frames of these drives.
 
     Args:

@@ -2,7 +2,7 @@
 
 import contextlib
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence as Items
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.frame import BevMap, FrameResult, Sequence
+from bevcli.frame import BevMap, Drive, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
@@ -86,7 +86,7 @@ class ExportedModel(TemporalModel):
         return self.engine.input_shapes["images"][1]
 
     def step(
-        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Items[PreparedFrame] = ()
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, Memory]:
         """See `TemporalModel`. Raises WeightsError unless the file was exported for the frame's number of cameras."""
         count = prepared.images.shape[1]
@@ -173,7 +173,7 @@ class FrameDifference:
 
 
 def check_exported(
-    file: Path, reference: Model | Path, sequence: Sequence, engine: str = "onnxruntime"
+    file: Path, reference: Model | Path, sequence: Drive, engine: str = "onnxruntime"
 ) -> Iterator[FrameDifference]:
     """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
 

@@ -1,4 +1,4 @@
-"""An Argoverse 2 log as a Sequence.
+"""An Argoverse 2 log as a drive.
 
 Argoverse's egovehicle frame is at the rear axle, above the ground. The ego frame here is below it, on the ground.
 """
@@ -21,8 +21,8 @@ from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import reason_of
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import Argoverse2Options
 from bevcli.workshop.formats.labels import with_track_velocities
 
@@ -135,7 +135,7 @@ class FeatherTable:
         return InputError(f'{self.path}: column "{name}": expected {expected}, found {found:.80}')
 
 
-def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> ListedSequence:
+def open_log(path: Path, common: InputOptions, own: Argoverse2Options) -> ListedDrive:
     """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
 
     A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
@@ -153,7 +153,7 @@ def open_log(path: Path, common: SequenceOptions, own: Argoverse2Options) -> Lis
     truth = {index: boxes[time] for index, time in enumerate(times) if time in boxes}
     notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
     files = tuple(sorted((*path.glob("*.feather"), *path.glob("calibration/*.feather"))))
-    return ListedSequence(path, common, rig, entries, motion, truth, notes, files)
+    return ListedDrive(path, common, rig, entries, motion, truth, notes, files)
 
 
 def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
 from bevcli.printing import say
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import LabelOptions, WriteOptions
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ CONVERTED = ("strict", "scene", "ground_truth", "allow_outside", "class_map", "o
 def convert(
     input: InputDrive,
     out: Annotated[Path, argument("The folder or file to write.", reads=None)],
-    options: Annotated[SequenceOptions, Part(only=CONVERTED)],
+    options: Annotated[InputOptions, Part(only=CONVERTED)],
     labels: LabelOptions,
     format_options: FormatValues,
     written: WriteOptions,

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import OutputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import IMPOSSIBLE
 from bevcli.options import spread
 from bevcli.printing import counted
 from bevcli.registry import load
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import LabelOptions, WriteOptions
 from bevcli.workshop.formats.labels import WithLabels
 from bevcli.workshop.formats.output import GROUP, open_writer
@@ -61,14 +61,12 @@ def convert(
         InputError: see `open_sequence`; or not one image could be read.
         OutputError: something is there already, or it cannot be written.
     """
-    common, labels, written, own = spread(options, SequenceOptions, LabelOptions, WriteOptions)
+    common, labels, written, own = spread(options, InputOptions, LabelOptions, WriteOptions)
     sequence = drive_to_convert(Path(source), Path(out), common, labels, own)
     return write_drive(sequence, Path(out), written, on_frame)
 
 
-def drive_to_convert(
-    source: Path, out: Path, common: SequenceOptions, labels: LabelOptions, own: dict[str, Any]
-) -> Sequence:
+def drive_to_convert(source: Path, out: Path, common: InputOptions, labels: LabelOptions, own: dict[str, Any]) -> Drive:
     """The drive that is to be written, with its labels. own: options of its format by name."""
     if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
         raise OutputError(f"{out}: contains the input: choose another path")
@@ -77,7 +75,7 @@ def drive_to_convert(
 
 
 def write_drive(
-    sequence: Sequence, out: Path, written: WriteOptions, on_frame: Callable[[Frame], None] = lambda frame: None
+    sequence: Drive, out: Path, written: WriteOptions, on_frame: Callable[[Frame], None] = lambda frame: None
 ) -> Converted:
     """Write a drive, see `convert`."""
     gaps, images, boxes = 0, 0, 0

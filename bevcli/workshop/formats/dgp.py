@@ -1,4 +1,4 @@
-"""A DGP scene as a Sequence: its samples with images and point clouds, each with a pose, calibrations, 3D boxes."""
+"""A DGP scene as a drive: its samples with images and point clouds, each with a pose, calibrations, 3D boxes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, bev_frame_notes, leads_out
-from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
+from bevcli.sequences.options import FormatOptions, InputOptions
 from bevcli.workshop.formats.labels import with_track_velocities
 
 # DDAD's class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as Wheeled
@@ -272,7 +272,7 @@ def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
     return times, np.stack([pose.translation for _, pose in rows]), np.stack([pose.quaternion for _, pose in rows])
 
 
-def open_scene(path: Path, common: SequenceOptions, own: FormatOptions) -> ListedSequence:
+def open_scene(path: Path, common: InputOptions, own: FormatOptions) -> ListedDrive:
     """The samples of a DGP scene. Point clouds are not read, only the boxes that are annotated in them.
 
     The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.
@@ -290,7 +290,7 @@ def open_scene(path: Path, common: SequenceOptions, own: FormatOptions) -> Liste
     truth = _read_truth(path, scene, samples, common.class_map, file_of) if common.ground_truth else {}
     notes = (*bev_frame_notes(rigs[0], "a DGP scene"), *((TENFOLD,) if tenfold else ()))
     files = tuple(sorted((*path.glob("scene_*.json"), *path.glob("calibration/*.json"))))
-    return ListedSequence(path, common, rigs, entries, motion, truth, notes, files)
+    return ListedDrive(path, common, rigs, entries, motion, truth, notes, files)
 
 
 def _entry(path: Path, index: int, sample: Sample, rig: CameraRig, file_of: FileOf) -> FrameEntry:

@@ -7,7 +7,7 @@ import codecs
 import csv
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence as Items
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise, zip_longest
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, velocities_between
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
@@ -95,7 +95,7 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     return replace(labels, frames=frames, notes=(*labels.notes, *note))
 
 
-class WithLabels(DerivedSequence):
+class WithLabels(DerivedDrive):
     """A drive whose boxes are those of a file of labels; a map of the drive is kept.
 
     Labels belong to the frame of the same time, or, where the file has no times, of the same index. Where the file has
@@ -106,7 +106,7 @@ class WithLabels(DerivedSequence):
     Raises InputError where the file cannot be read, or where not all of its frames are in the drive.
     """
 
-    def __init__(self, sequence: Sequence, path: Path, options: LabelOptions = LabelOptions()) -> None:
+    def __init__(self, sequence: Drive, path: Path, options: LabelOptions = LabelOptions()) -> None:
         super().__init__(sequence)
         labels = read_labels(path, sequence.rig, options)
         if labels.frame_of_reference == "world" and not sequence.has_ego_motion:
@@ -122,14 +122,14 @@ class WithLabels(DerivedSequence):
     def class_counts(self) -> Mapping[str, int]:
         return count_classes(self._boxes.values())
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._labelled(self.sequence.ground_truth_frame(place), place)
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._labelled(self.sequence.ground_truth_frame(index), index)
 
-    def load(self, place: int) -> Frame:
-        return self._labelled(self.sequence.load(place), place)
+    def load(self, index: int) -> Frame:
+        return self._labelled(self.sequence.load(index), index)
 
-    def _labelled(self, frame: Frame, place: int) -> Frame:
-        return replace(frame, ground_truth=self._boxes.get(place), impossible_boxes=0)
+    def _labelled(self, frame: Frame, index: int) -> Frame:
+        return replace(frame, ground_truth=self._boxes.get(index), impossible_boxes=0)
 
     def _summary(self) -> str:
         counts = ", ".join(f"{name} ({count})" for name, count in sorted(self.class_counts.items()))
@@ -142,7 +142,9 @@ class WithLabels(DerivedSequence):
         return "; ".join(parts)
 
 
-def _labelled_frames(stamps: Items[FrameStamp], listed: Collection[int], unlisted: UnlistedFrames | None) -> set[int]:
+def _labelled_frames(
+    stamps: Sequence[FrameStamp], listed: Collection[int], unlisted: UnlistedFrames | None
+) -> set[int]:
     """The indices, in the drive, of labelled frames, with or without boxes.
 
     If a file lists no two successive frames, the labelling tool was given every n-th frame of a scene: the largest n
@@ -163,7 +165,7 @@ def _labelled_frames(stamps: Items[FrameStamp], listed: Collection[int], unliste
     return labelled
 
 
-def _in_world(sequence: Sequence, labels: Labels, path: Path) -> dict[int, Boxes3D]:
+def _in_world(sequence: Drive, labels: Labels, path: Path) -> dict[int, Boxes3D]:
     """The boxes in the world frame, by index of the frame in the drive."""
     times = np.array([stamp.timestamp_ns for stamp in sequence.stamps], dtype=np.int64)
     index_of = {stamp.index: index for index, stamp in enumerate(sequence.stamps)}
@@ -186,7 +188,7 @@ def _in_world(sequence: Sequence, labels: Labels, path: Path) -> dict[int, Boxes
     return boxes_of
 
 
-def _with_velocities(sequence: Sequence, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
+def _with_velocities(sequence: Drive, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
     """The boxes by index, with the velocities of their tracks if none is known, and a note."""
     together = Boxes3D.concatenate(boxes.values())
     if not len(together) or np.isfinite(together.velocities).any():
@@ -214,7 +216,7 @@ def _words(labelled: LabelledFrame) -> str:
     return f"the frame{'' if labelled.index is None else f' {labelled.index}'}{time}"
 
 
-def with_track_velocities(frames: Items[Boxes3D], timestamps_ns: Items[int]) -> list[Boxes3D]:
+def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int]) -> list[Boxes3D]:
     """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`; "" is none.
 
     timestamps_ns: (T,) increasing.

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from bevcli.errors import BevcliError, InputError, OutputError
-from bevcli.frame import CameraImage, Frame, Sequence
+from bevcli.frame import CameraImage, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color
@@ -114,7 +114,7 @@ class McapWriter:
     other images become PNG.
     """
 
-    def __init__(self, path: Path, sequence: Sequence, options: WriteOptions) -> None:
+    def __init__(self, path: Path, sequence: Drive, options: WriteOptions) -> None:
         """See `OutputFormat`."""
         if not all(importlib.util.find_spec(name) for name in ("mcap", "rosbags")):
             raise BevcliError('`form="mcap"`: needs mcap and rosbags: pip install "bevcli[ros]"')
@@ -209,7 +209,7 @@ class McapWriter:
         self._writer.add_message(self._channels[topic], log_time=time_ns, publish_time=time_ns, data=data)
 
 
-def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFile:
+def _boxes_of(run: Path, score: float, sequence: Drive, out: Path) -> BoxesFile:
     file = run / "predictions.json" if run.is_dir() else run
     check_output(out, file)
     boxes = above_score(read_boxes(file), score)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import CameraImage, Frame, Sequence
+from bevcli.frame import CameraImage, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
-from bevcli.sequences.nuscenes.sequence import NuScenesSequence
+from bevcli.sequences.nuscenes.sequence import NuScenesDrive
 from bevcli.sequences.nuscenes.tables import Row
 from bevcli.workshop.formats import WriteOptions
 from bevcli.workshop.formats.output import FolderWriter, OutputFormat, same_rig
@@ -51,7 +51,7 @@ class NuScenesWriter(FolderWriter):
     root.
     """
 
-    def __init__(self, root: Path, sequence: Sequence, options: WriteOptions) -> None:
+    def __init__(self, root: Path, sequence: Drive, options: WriteOptions) -> None:
         """See `OutputFormat`."""
         if not sequence.has_ego_motion:
             raise InputError(f"{sequence.name}: has no ego-motion, which a nuScenes root must have: add it")
@@ -89,7 +89,7 @@ class NuScenesWriter(FolderWriter):
             write_whole(self.folder / VERSION / f"{name}.json", _json(rows), parents=True)
 
     def _read_back(self) -> None:
-        NuScenesSequence(self.folder, own=NuScenesOptions(version=VERSION))
+        NuScenesDrive(self.folder, own=NuScenesOptions(version=VERSION))
 
 
 def _message(time_us: int, pose: Pose, kinematics: Kinematics) -> Row:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import CameraImage, DriveFacts, Frame, FrameResult, Ground, Sequence
+from bevcli.frame import CameraImage, Drive, DriveFacts, Frame, FrameResult, Ground
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
@@ -26,8 +26,8 @@ from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.format import true_result_files
-from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderSequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderDrive
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import WriteOptions
 from bevcli.writing import output_errors, remove_parts, whole_file, write_whole
 
@@ -136,7 +136,7 @@ class OutputFormat:
     """
 
     name: str
-    opener: Callable[[Path, Sequence, WriteOptions], DriveWriter]
+    opener: Callable[[Path, Drive, WriteOptions], DriveWriter]
     takes_boxes: bool = False
     keeps_maps: bool = False
 
@@ -146,7 +146,7 @@ class OutputFormat:
         return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 
-def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveWriter:
+def open_writer(path: Path, sequence: Drive, options: WriteOptions) -> DriveWriter:
     """The writer of a path in the format `options.form`.
 
     Raises InputError for an unknown format, an option of another format or a drive that the format cannot hold, and
@@ -219,7 +219,7 @@ class NativeWriter(FolderWriter):
         write_calibration(self.folder / "calibration.json", self._rig, self._facts)
 
     def _read_back(self) -> None:
-        FolderSequence(self.folder, SequenceOptions(ego_motion="optional"))
+        FolderDrive(self.folder, InputOptions(ego_motion="optional"))
 
     def _check(self, frame: Frame) -> None:
         stamp = frame.stamp
@@ -309,7 +309,7 @@ def write_ego_motion(path: Path, motion: EgoMotion) -> None:
             writer.writerow([int(time), *(repr(float(value)) for value in row)])
 
 
-def _native_writer(folder: Path, sequence: Sequence, options: WriteOptions) -> NativeWriter:
+def _native_writer(folder: Path, sequence: Drive, options: WriteOptions) -> NativeWriter:
     return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
 
 

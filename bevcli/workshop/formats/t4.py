@@ -5,8 +5,8 @@ from pathlib import Path
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Dialect
-from bevcli.sequences.nuscenes.sequence import TableSequence
-from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.sequences.nuscenes.sequence import TableDrive
+from bevcli.sequences.options import FormatOptions, InputOptions
 
 LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
 # The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
@@ -46,12 +46,12 @@ CLASS_OF_CATEGORY = {
 }
 
 
-def open_t4(path: Path, common: SequenceOptions, own: FormatOptions) -> TableSequence:
+def open_t4(path: Path, common: InputOptions, own: FormatOptions) -> TableDrive:
     """The keyframes of a T4 dataset.
 
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
-    lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableSequence`.
+    lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableDrive`.
     """
     names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
     dialect = Dialect(LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, bev_is_lidar=False)
-    return TableSequence(path, path / "annotation", common, dialect, NuScenesOptions())
+    return TableDrive(path, path / "annotation", common, dialect, NuScenesOptions())

@@ -7,17 +7,17 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
-from bevcli.sequences.images import FrameEntry, ListedSequence, bev_frame_notes
+from bevcli.sequences.images import FrameEntry, ListedDrive, bev_frame_notes
 from bevcli.sequences.native.folder import check_covered
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.native.unlisted import covered, video_images
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import rotation_notes
 from bevcli.workshop.formats.calibrations import SEVERAL
 
 
-def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> ListedSequence:
-    """A video as a `Sequence`. Raises InputError."""
+def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDrive:
+    """A video as a `Drive`. Raises InputError."""
     video = video_images(path, own.start_ns or 0, own.image_rate_hz)
     given = own.draft(path)
     if given is None:
@@ -54,7 +54,7 @@ def open_video(path: Path, common: SequenceOptions, own: FolderOptions) -> Liste
     if motion is None and common.ego_motion != "measured":
         without = "no history is used, and boxes are in the ego frame"
         notes += (f"a video has no poses: {without} (`odometry=True` measures them from the images)",)
-    sequence = ListedSequence(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
+    sequence = ListedDrive(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
     sequence.facts = replace(given.facts, geo_origin=given.facts.geo_origin or poses.geo_origin)
     return sequence

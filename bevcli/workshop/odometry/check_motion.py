@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.open import Selection
@@ -23,12 +23,12 @@ MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to
 class SomeFrames(Selection):
     """Some frames of a drive. It keeps the poses of those that were loaded, by their times."""
 
-    def __init__(self, drive: Sequence, places: list[int]) -> None:
+    def __init__(self, drive: Drive, places: list[int]) -> None:
         super().__init__(drive, places)
         self.poses: dict[int, Pose] = {}
 
-    def load(self, place: int) -> Frame:
-        frame = super().load(place)
+    def load(self, index: int) -> Frame:
+        frame = super().load(index)
         self.poses[frame.stamp.timestamp_ns] = frame.world_from_ego
         return frame
 
@@ -42,7 +42,7 @@ class SomeFrames(Selection):
         return EgoMotion(*rows, *derive_kinematics(*rows), velocities_are_stated=False)
 
 
-def stated_motion_findings(drive: Sequence, steps: int = STEPS) -> tuple[Finding, ...]:
+def stated_motion_findings(drive: Drive, steps: int = STEPS) -> tuple[Finding, ...]:
     """Findings about the stated poses of a drive, from a few measured steps; none for a drive without poses."""
     if not drive.has_ego_motion:
         return ()
@@ -54,7 +54,7 @@ def stated_motion_findings(drive: Sequence, steps: int = STEPS) -> tuple[Finding
     return compare(part.stated, measured, [stamp.index for stamp in part.stamps])
 
 
-def chosen_places(drive: Sequence, steps: int = STEPS) -> list[int]:
+def chosen_places(drive: Drive, steps: int = STEPS) -> list[int]:
     """The places of at most steps + 1 frames of the longest scene, those between which the poses turn most."""
     scenes = [list(places) for _, places in groupby(range(len(drive.stamps)), lambda place: drive.stamps[place].scene)]
     places: list[int] = []

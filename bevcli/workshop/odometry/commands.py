@@ -6,7 +6,7 @@ from typing import Annotated
 
 from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
 from bevcli.printing import say
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.odometry import OdometryOptions, OdometryOutputOptions
 
 PANEL = "Look"
@@ -15,7 +15,7 @@ PANEL = "Look"
 def odometry(
     sequence: InputDrive,
     options: OdometryOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
+    source: Annotated[InputOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
     format_options: FormatValues,
     output: OdometryOutputOptions,
     as_json: Json = False,

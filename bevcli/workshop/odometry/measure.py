@@ -1,6 +1,6 @@
 """The measured motion of a drive, and the drive with it."""
 
-from collections.abc import Callable, Sequence as Items
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.workshop.odometry import OdometryOptions
@@ -181,7 +181,7 @@ class MotionMeter:
 
 
 def measure_motion(
-    drive: Sequence, options: OdometryOptions | None = None, after_step: Callable[[], None] = lambda: None
+    drive: Drive, options: OdometryOptions | None = None, after_step: Callable[[], None] = lambda: None
 ) -> MeasuredMotion:
     """Measure the motion of a drive from its images and its calibration.
 
@@ -212,7 +212,7 @@ def measure_motion(
     return MeasuredMotion(drive.name, times, tuple(steps))
 
 
-def _table(poses: Items[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
+def _table(poses: Sequence[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
     """Times, translations and quaternions of N poses, as `motion_of_keyframes` takes them."""
     matrices = [Pose.from_matrix(matrix) for _, matrix in poses]
     translations = np.array([pose.translation for pose in matrices]).reshape(-1, 3)
@@ -220,22 +220,22 @@ def _table(poses: Items[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, A
     return np.array([time for time, _ in poses], dtype=np.int64), translations, quaternions
 
 
-class MeasuredDrive(DerivedSequence):
+class MeasuredDrive(DerivedDrive):
     """A drive with its measured motion: poses and kinematics of every frame, and poses at each camera's own time.
 
     Ground truth in the world frame is moved with the vehicle.
     """
 
-    def __init__(self, sequence: Sequence, motion: MeasuredMotion) -> None:
+    def __init__(self, sequence: Drive, motion: MeasuredMotion) -> None:
         super().__init__(sequence)
         self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
         self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
 
-    def load(self, place: int) -> Frame:
-        return self._moved(self.sequence.load(place))
+    def load(self, index: int) -> Frame:
+        return self._moved(self.sequence.load(index))
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._moved(self.sequence.ground_truth_frame(place))
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._moved(self.sequence.ground_truth_frame(index))
 
     def _moved(self, frame: Frame) -> Frame:
         motion, time = self.motion.ego_motion, frame.stamp.timestamp_ns

@@ -4,7 +4,7 @@ The road is stitched of what each frame shows of it near the vehicle, by the mea
 show an error of the motion or of the calibration.
 """
 
-from collections.abc import Sequence as Items
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.road import sampled
@@ -74,7 +74,7 @@ def _small(image: Pixels) -> bytes:
     return cv2.imencode(".jpg", small, JPEG)[1].tobytes()
 
 
-class WatchedDrive(DerivedSequence):
+class WatchedDrive(DerivedDrive):
     """A drive that keeps what is drawn of each frame that is loaded: the road from above, and its stated pose.
 
     Attributes:
@@ -84,7 +84,7 @@ class WatchedDrive(DerivedSequence):
         view: the cells of the road in the images of the rig; None before a frame is loaded.
     """
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: Drive) -> None:
         super().__init__(sequence)
         self.road: dict[int, bytes] = {}
         self.images: dict[int, dict[str, bytes]] = {}
@@ -92,15 +92,15 @@ class WatchedDrive(DerivedSequence):
         self.view: GroundView | None = None
         self._every = -(-len(sequence.stamps) // MOST_SHOWN)
 
-    def load(self, place: int) -> Frame:
-        frame = super().load(place)
+    def load(self, index: int) -> Frame:
+        frame = super().load(index)
         if self.view is None or self.view.rig is not frame.rig:
             self.view = GroundView(frame.rig)
-        self.road[place] = cv2.imencode(".jpg", self.view.of(frame), JPEG)[1].tobytes()
-        if place % self._every == 0:
-            self.images[place] = {name: _small(image.pixels_bgr) for name, image in frame.images.items()}
+        self.road[index] = cv2.imencode(".jpg", self.view.of(frame), JPEG)[1].tobytes()
+        if index % self._every == 0:
+            self.images[index] = {name: _small(image.pixels_bgr) for name, image in frame.images.items()}
         if self.has_ego_motion:
-            self.stated[place] = frame.world_from_ego.matrix
+            self.stated[index] = frame.world_from_ego.matrix
         return frame
 
     @property
@@ -164,14 +164,14 @@ def _world_from_patch(world_from_ego: Array) -> Array:
     return flat @ ego_from_patch
 
 
-def write_picture(path: Path, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> None:
+def write_picture(path: Path, motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> None:
     """Write odometry.png. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
     figure = draw(motion, road, stated)
     with whole_file(path, parents=True) as unfinished:
         figure.savefig(unfinished, dpi=110, format="png")
 
 
-def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> Figure:
+def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> Figure:
     """The figure: the way on the road, beside or above the curves."""
     height, width = road.image.shape[:2]
     wide = width > 1.6 * height
@@ -191,7 +191,7 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
     return figure
 
 
-def _motion_of(motion: MeasuredMotion, stated: Items[Array]) -> MeasuredMotion:
+def _motion_of(motion: MeasuredMotion, stated: Sequence[Array]) -> MeasuredMotion:
     """Stated poses as a motion, for the curves."""
     steps = [
         replace(step, ego_a_from_ego_b=inverse(a) @ b)
@@ -200,7 +200,7 @@ def _motion_of(motion: MeasuredMotion, stated: Items[Array]) -> MeasuredMotion:
     return replace(motion, steps=tuple(steps))
 
 
-def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None) -> None:
+def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> None:
     axes.imshow(road.image, extent=(*road.x_range_m, *road.y_range_m), interpolation="bilinear")
     places = motion.poses[:, :2, 3]
     if stated is not None:

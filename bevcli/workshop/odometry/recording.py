@@ -80,30 +80,30 @@ def _log_way(
 
 
 def _log_frame(
-    stream: rr.RecordingStream, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, place: int
+    stream: rr.RecordingStream, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, index: int
 ) -> None:
     """The road around the vehicle, the vehicle on its way, and the curves of the step that ends here."""
-    pose = motion.poses[place]
+    pose = motion.poses[index]
     ahead = pose @ np.array([[1, 0, 0, 3.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     start, end = road.pixels(np.stack([pose, ahead]))
     radii = rr.Radius.ui_points(3.0)
     vehicle = rr.Arrows2D(origins=[start], vectors=[end - start], colors=entities.EGO_COLOR, radii=radii)
     stream.log(f"{WAY}/vehicle", vehicle)
-    stream.log(f"{ROAD}/image", rr.EncodedImage(contents=drive.road[place], media_type="image/jpeg"))
-    for name, encoded in drive.images.get(place, {}).items():
+    stream.log(f"{ROAD}/image", rr.EncodedImage(contents=drive.road[index], media_type="image/jpeg"))
+    for name, encoded in drive.images.get(index, {}).items():
         stream.log(f"{CAMERAS}/{name}/image", rr.EncodedImage(contents=encoded, media_type="image/jpeg"))
-    if place == 0:
+    if index == 0:
         return
     for name, (values, deviations) in zip(CURVES, (speeds(motion), yaw_rates_deg(motion)), strict=True):
-        value, deviation = float(values[place - 1]), float(deviations[place - 1])
+        value, deviation = float(values[index - 1]), float(deviations[index - 1])
         parts = {"measured": value, "low": value - deviation, "high": value + deviation}
         for part, number in parts.items():
             stream.log(f"curves/{name}/{part}", rr.Scalars(number))
-    if place in drive.images:
-        _log_points(stream, motion.steps[place - 1].seen, drive.rig)
-    reason = motion.steps[place - 1].reason
+    if index in drive.images:
+        _log_points(stream, motion.steps[index - 1].seen, drive.rig)
+    reason = motion.steps[index - 1].reason
     if reason:
-        stream.log(entities.EVENTS, rr.TextLog(f"frame {drive.stamps[place].index}: {reason}", level="WARN"))
+        stream.log(entities.EVENTS, rr.TextLog(f"frame {drive.stamps[index].index}: {reason}", level="WARN"))
 
 
 def _log_points(stream: rr.RecordingStream, seen: SeenPoints | None, rig: CameraRig) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.sequences.open import select, select_rate
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion
@@ -14,7 +14,7 @@ MOST_RATE_HZ = 10.0  # a faster drive is measured at this rate: shorter steps co
 FASTER = 1.5  # times this rate is thinned to it
 
 
-class MeasuredScenes(DerivedSequence):
+class MeasuredScenes(DerivedDrive):
     """A drive of several scenes, each with a measured motion of its own, which begins at its first frame."""
 
     def __init__(self, scenes: Mapping[str, MeasuredDrive]) -> None:
@@ -22,15 +22,15 @@ class MeasuredScenes(DerivedSequence):
         super().__init__(first.sequence)
         self.has_ego_motion, self.facts, self._scenes, self.ego_motion = True, first.facts, scenes, None
 
-    def load(self, place: int) -> Frame:
-        return self._scenes[self.stamps[place].scene].load(place)
+    def load(self, index: int) -> Frame:
+        return self._scenes[self.stamps[index].scene].load(index)
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._scenes[self.stamps[place].scene].ground_truth_frame(place)
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._scenes[self.stamps[index].scene].ground_truth_frame(index)
 
 
 def with_measured_motion(
-    drive: Sequence, whole: Sequence, after_step: Callable[[int, int], None] | None = None
+    drive: Drive, whole: Drive, after_step: Callable[[int, int], None] | None = None
 ) -> MeasuredDrive | MeasuredScenes:
     """The drive with its measured motion, which a note of each scene states.
 
@@ -51,7 +51,7 @@ def with_measured_motion(
     return result
 
 
-def frames_between(drive: Sequence, whole: Sequence, scene: str) -> Sequence:
+def frames_between(drive: Drive, whole: Drive, scene: str) -> Drive:
     """The frames of `whole` from the first to the last frame of `drive` in a scene."""
     times = [stamp.timestamp_ns for stamp in drive.stamps if stamp.scene == scene]
     return select(
@@ -64,7 +64,7 @@ def frames_between(drive: Sequence, whole: Sequence, scene: str) -> Sequence:
     )
 
 
-def at_most_rate(drive: Sequence) -> Sequence:
+def at_most_rate(drive: Drive) -> Drive:
     """The drive, thinned to MOST_RATE_HZ where its frames follow each other faster."""
     steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps])
     if not len(steps) or np.median(steps) * FASTER * MOST_RATE_HZ > 1e9:
@@ -72,7 +72,7 @@ def at_most_rate(drive: Sequence) -> Sequence:
     return select_rate(drive, MOST_RATE_HZ)
 
 
-def measured(drive: Sequence, after_step: Callable[[int, int], None] | None = None) -> MeasuredMotion:
+def measured(drive: Drive, after_step: Callable[[int, int], None] | None = None) -> MeasuredMotion:
     """The motion of a drive. after_step: as in `with_measured_motion`. Raises InputError where no step is measured."""
     total, done = len(drive.stamps) - 1, 0
 

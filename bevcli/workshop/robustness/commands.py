@@ -9,7 +9,7 @@ import typer
 from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.robustness.options import StressOptions, StressOutputOptions
 from bevcli.workshop.synth.options import DriveOptions
 
@@ -23,7 +23,7 @@ def stress(
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
     options: StressOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
+    source: Annotated[InputOptions, Part(only=("frames", "scene", "class_map"))],
     format_options: Annotated[FormatValues, Part(only=("version", "split"))],
     drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
     output: StressOutputOptions,

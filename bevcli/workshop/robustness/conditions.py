@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence as Items
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import Enum, auto
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics, motion_during
 from bevcli.geometry.transforms import Pose, inverse
@@ -42,13 +42,13 @@ class Draws:
         return np.random.default_rng([self.seed, *np.frombuffer(digest, dtype="<u4").tolist()])
 
 
-class ChangedSequence(DerivedSequence):
+class ChangedDrive(DerivedDrive):
     """A sequence whose frames are changed when they are loaded. A subclass overrides `change`.
 
     level: of the change; its meaning depends on the subclass. lost_images: what the model gets for a lost image.
     """
 
-    def __init__(self, sequence: Sequence, level: Level, draws: Draws, lost_images: LostImage = "black") -> None:
+    def __init__(self, sequence: Drive, level: Level, draws: Draws, lost_images: LostImage = "black") -> None:
         super().__init__(sequence)
         self._level, self._draws, self._lost_images = level, draws, lost_images
 
@@ -64,7 +64,7 @@ class ChangedSequence(DerivedSequence):
         return self._draws.generator(f"{self.name}/{stamp.scene}", *keys)
 
 
-class CorruptedImages(ChangedSequence):
+class CorruptedImages(ChangedDrive):
     """A sequence with every image corrupted by `corrupt`. Each frame and camera has its own random numbers."""
 
     def __init__(self, *arguments: Any, corrupt: ImageCorruption) -> None:
@@ -85,7 +85,7 @@ def _with_pixels(image: CameraImage, pixels_bgr: Pixels) -> CameraImage:
     return replace(image, pixels_bgr=pixels_bgr, encoded=None, media_type=None)
 
 
-def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:
+def at_lower_rate(sequence: Drive, step: int) -> tuple[Drive, ...]:
     """The frames of one scene at 1/step of its rate, as `step` sequences that start one frame after another.
 
     Together they have every frame once, so that the score covers the same ground truth as at the full rate.
@@ -94,7 +94,7 @@ def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:
     return tuple(select(sequence, range(start, count, step)) for start in range(min(step, count)))
 
 
-class LostImages(ChangedSequence):
+class LostImages(ChangedDrive):
     """A sequence that loses images: they are missing or black. A subclass overrides `lost`."""
 
     def lost(self, frame: Frame) -> Collection[str]:
@@ -129,7 +129,7 @@ class FrameLost(LostImages):
         return {name for name in frame.rig.names if self.random(stamp, stamp.index, name).random() < limit}
 
 
-class CalibrationNoise(ChangedSequence):
+class CalibrationNoise(ChangedDrive):
     """A sequence whose cameras state wrong poses, the same ones for a whole scene; levels of `camera_pose_noise`."""
 
     # A rig, its scene and the noisy rig, which the frames of a scene with one rig share.
@@ -147,7 +147,7 @@ class CalibrationNoise(ChangedSequence):
         return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
 
 
-class TimeOffsets(ChangedSequence):
+class TimeOffsets(ChangedDrive):
     """A sequence whose cameras state wrong capture times: each camera is off by its own constant, for a whole scene.
 
     Level L draws each offset uniformly from -L to L milliseconds. The pose of the vehicle at the camera's time is then
@@ -168,7 +168,7 @@ class TimeOffsets(ChangedSequence):
         return replace(frame, world_from_ego_at=poses, images=images)
 
 
-class EgoMotionLost(ChangedSequence):
+class EgoMotionLost(ChangedDrive):
     """A sequence in which poses do not arrive: the last pose and kinematics that arrived are used instead.
 
     Level L loses the pose of a frame with a probability of L/6; the first frame of a scene keeps its pose. The ground
@@ -207,7 +207,7 @@ class EgoMotionLost(ChangedSequence):
 
 
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.
-Apply = Callable[[Sequence, int, Draws, LostImage], Sequence | tuple[Sequence, ...]]
+Apply = Callable[[Drive, int, Draws, LostImage], Drive | tuple[Drive, ...]]
 
 
 class Group(Enum):
@@ -239,7 +239,7 @@ class Condition:
     def name(self) -> str:
         return self.corruption.name
 
-    def sequences(self, scene: Sequence, seed: int, kind: LostImage) -> tuple[Sequence, ...]:
+    def sequences(self, scene: Drive, seed: int, kind: LostImage) -> tuple[Drive, ...]:
         """The sequences that are run in place of a scene."""
         changed = self.corruption.apply(scene, self.corruption.levels[self.severity], Draws(seed, self.name), kind)
         return changed if isinstance(changed, tuple) else (changed,)
@@ -279,7 +279,7 @@ NAMES = tuple(corruption.name for corruption in CORRUPTIONS)
 _GROUP_OF_LEVEL = {"1": "easy", "2": "mid", "3": "mid", "4": "hard"}  # of corruptions with numbered levels
 
 
-def choose_conditions(severity: SeverityChoice = "all", only: Items[str] = ()) -> tuple[Condition, ...]:
+def choose_conditions(severity: SeverityChoice = "all", only: Sequence[str] = ()) -> tuple[Condition, ...]:
     """The conditions of a test: clean first, then the corruptions in the order of CORRUPTIONS.
 
     severity: only conditions of this severity; of the numbered levels, 1 is easy, 2 and 3 are mid, 4 is hard.

@@ -3,7 +3,7 @@
 import contextlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +14,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.detection import evaluate_detections, known_mean
 from bevcli.evaluation.evaluate import finite
 from bevcli.evaluation.matching import DetectionConfig
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
@@ -150,8 +150,8 @@ class _Stopped(Exception):
 
 def stress(
     model: Model,
-    drives: Items[Sequence],
-    conditions: Items[Condition],
+    drives: Sequence[Drive],
+    conditions: Sequence[Condition],
     out: Path,
     options: StressOptions = StressOptions(),
     *,
@@ -220,7 +220,7 @@ class _StressRun:
     """One model, its scenes, and the folder in which finished scenes of the current condition are kept."""
 
     model: Model
-    scenes: Items[Sequence]
+    scenes: Sequence[Drive]
     options: StressOptions
     folder: RunFolder
     after_frame: Callable[[], None]
@@ -245,7 +245,7 @@ class _StressRun:
             "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self.scenes],
         }
 
-    def kept_frames(self, left: Items[Condition]) -> int:
+    def kept_frames(self, left: Sequence[Condition]) -> int:
         """The number of frames of the first condition that is left whose boxes are stored."""
         scenes = [scene for n, scene in enumerate(self.scenes) if left and self._boxes_path(left[0], n).exists()]
         return sum(len(scene.stamps) for scene in scenes)
@@ -281,7 +281,7 @@ class _StressRun:
         save_state(path, boxes)
         return boxes
 
-    def _run_sequence(self, sequence: Sequence) -> Iterator[tuple[Boxes3D, Boxes3D]]:
+    def _run_sequence(self, sequence: Drive) -> Iterator[tuple[Boxes3D, Boxes3D]]:
         model = self.model
         if self.runner is None:
             self.runner = model.runner(track=False, temporal=self.options.temporal)
@@ -296,7 +296,7 @@ class _StressRun:
                 raise _Stopped
 
 
-def _calibrated(sequence: Sequence) -> Sequence:
+def _calibrated(sequence: Drive) -> Drive:
     """The sequence with the rig that it shows; itself where it shows none."""
     try:
         return DriveWithRig(sequence, calibrate(sequence).rig)
@@ -304,7 +304,7 @@ def _calibrated(sequence: Sequence) -> Sequence:
         return sequence
 
 
-def split_scenes(drive: Sequence) -> list[Sequence]:
+def split_scenes(drive: Drive) -> list[Drive]:
     """One sequence per scene. Raises InputError if the drive has no frames."""
     if not drive.stamps:
         raise InputError(f"{drive.name}: has no frames")
@@ -317,7 +317,7 @@ def _order(scores: ConditionScores) -> int:
     return conditions.index((scores.corruption, scores.severity))
 
 
-def _facts(model: Model, drives: Items[Sequence], options: StressOptions) -> dict[str, str]:
+def _facts(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:
     """The facts that the results depend on, apart from the conditions."""
     of_drives = [run_facts(model, drive, options) for drive in drives]
     facts = dict(of_drives[0])

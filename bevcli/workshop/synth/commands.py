@@ -8,7 +8,7 @@ from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.workshop.synth.options import DemoOptions, RenderOptions
 
@@ -40,7 +40,7 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), (), (), results, {})
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), InputOptions(), (), (), results, {})
     if options.view:
         show(options.out / "results/recording.rrd", ViewOptions())
 

@@ -10,20 +10,20 @@ import os
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence as Items
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive
 from bevcli.workshop.synth.material import MaterialFolder
@@ -46,7 +46,7 @@ class Drives(Protocol):
 
     def __len__(self) -> int: ...
 
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         """The drive at an index (0 to len - 1), at the model's frame rate. Raises InputError."""
         ...
 
@@ -56,13 +56,15 @@ class FolderDrives:
 
     input_shapes: tuple[InputShape, ...] | None = None
 
-    def __init__(self, folders: Items[Path], config: ModelConfig, class_map: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, folders: Sequence[Path], config: ModelConfig, class_map: Mapping[str, str] | None = None
+    ) -> None:
         self.folders = tuple(folders)
-        self._options = SequenceOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
-        self._of_thread = threading.local()  # a Sequence must be read from one thread
+        self._options = InputOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
+        self._of_thread = threading.local()  # a Drive must be read from one thread
 
     def measure_motion(self, after_step: Callable[[int, int], None]) -> None:
-        """Open every drive with the motion that its images show. after_step: of `SequenceOptions`."""
+        """Open every drive with the motion that its images show. after_step: of `InputOptions`."""
         self._options = replace(self._options, odometry=True, after_step=after_step)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -75,9 +77,9 @@ class FolderDrives:
     def __len__(self) -> int:
         return len(self.folders)
 
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         """The drive at an index, thinned to the model's frame rate. Raises InputError."""
-        opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
+        opened: dict[int, Drive] = vars(self._of_thread).setdefault("opened", {})
         if index not in opened:
             opened[index] = open_sequence(self.folders[index], self._options)
         return opened[index]
@@ -95,7 +97,7 @@ class RenderedDrives(FolderDrives):
 
     def __init__(
         self,
-        seeds: Items[int],
+        seeds: Sequence[int],
         cache: Path,
         config: ModelConfig,
         rig: CameraRig | RigDistribution | None = None,
@@ -127,7 +129,7 @@ class RenderedDrives(FolderDrives):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_rendering": threading.Lock()})
 
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         """The drive at an index. It is rendered first, which takes seconds, if the cache does not hold it."""
         folder = self.folders[index]
         with self._rendering:
@@ -302,32 +304,32 @@ class FrameMemory:
     def __reduce__(self) -> tuple[type["FrameMemory"], tuple[int]]:
         return FrameMemory, (self._most_bytes,)
 
-    def load(self, sequence: Sequence, key: int, place: int) -> Frame:
-        """The frame at a place of a sequence, whose number is `key`."""
-        if (key, place) in self._frames:
-            return self._frames[key, place]
-        frame = sequence.load(place)
+    def load(self, sequence: Drive, key: int, index: int) -> Frame:
+        """The frame at an index of a sequence, whose number is `key`."""
+        if (key, index) in self._frames:
+            return self._frames[key, index]
+        frame = sequence.load(index)
         images = {name: replace(image, encoded=None, media_type=None) for name, image in frame.images.items()}
         frame = replace(frame, images=images)
         size = sum(image.pixels_bgr.nbytes for image in images.values())
         if size <= self._left_bytes:
             self._left_bytes -= size
-            self._frames[key, place] = frame
+            self._frames[key, index] = frame
         return frame
 
 
-class KeptFrames(DerivedSequence):
+class KeptFrames(DerivedDrive):
     """A sequence whose frames come from a `FrameMemory`, in which its number is `key`."""
 
-    def __init__(self, sequence: Sequence, memory: FrameMemory, key: int) -> None:
+    def __init__(self, sequence: Drive, memory: FrameMemory, key: int) -> None:
         super().__init__(sequence)
         self._memory, self._key = memory, key
 
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self.sequence.ground_truth_frame(place)
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self.sequence.ground_truth_frame(index)
 
-    def load(self, place: int) -> Frame:
-        return self._memory.load(self.sequence, self._key, place)
+    def load(self, index: int) -> Frame:
+        return self._memory.load(self.sequence, self._key, index)
 
 
 class KeptDrives:
@@ -339,5 +341,5 @@ class KeptDrives:
     def __len__(self) -> int:
         return len(self._drives)
 
-    def open(self, index: int) -> Sequence:
+    def open(self, index: int) -> Drive:
         return KeptFrames(self._drives.open(index), self._memory, index)

@@ -7,7 +7,7 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 
 from bevcli.config import TRAINING, as_toml, load_config, read_model_file
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -28,7 +28,7 @@ from bevcli.inference.training_rigs import fov_deg, tilt_deg
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
@@ -71,7 +71,7 @@ class DataFacts:
         map_reach_m: distance that all ground-truth maps cover to each side, metres; 0 without maps.
     """
 
-    drives: tuple[Sequence, ...]
+    drives: tuple[Drive, ...]
     frames: int
     class_counts: dict[str, int]
     class_sizes: dict[str, tuple[float, float, float]]
@@ -101,7 +101,7 @@ class DataFacts:
         return min(longest_scene(select_rate(drive, rate_hz)) for drive in self.drives)
 
 
-def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
+def look_at(drives: Sequence[Drive], bev_frame: BevFrameConfig) -> DataFacts:
     """Read the ground truth of all frames of some drives. Raises InputError where there is none, or no box.
 
     bev_frame: of the model, for the centres of the boxes.
@@ -292,7 +292,7 @@ def fitting_batch(batch: int, used_bytes: int, card_bytes: int, most: int) -> in
     return max(batch, min(most, int(MEMORY_SHARE * card_bytes * batch / used_bytes)))
 
 
-def _open_drives(data: DriveOptions) -> list[Sequence]:
+def _open_drives(data: DriveOptions) -> list[Drive]:
     """All drives, at their own frame rate. Raises InputError."""
     if data.rendered is not None:
         raise InputError("`init` needs drives in folders (`data` or `split`): rendered drives are trained with demo")
@@ -301,7 +301,7 @@ def _open_drives(data: DriveOptions) -> list[Sequence]:
     if not folders or (split is not None and data.data):
         raise InputError("`init`: choose the drives: give either `data=DIR` (repeatable) or `split=FILE`")
     classes = tuple(dict.fromkeys([*NUSCENES_CLASSES, *data.class_map.values()]))
-    options = SequenceOptions(data.class_map, rate_hz="all", classes=classes)
+    options = InputOptions(data.class_map, rate_hz="all", classes=classes)
     return [open_sequence(folder, options) for folder in folders]
 
 

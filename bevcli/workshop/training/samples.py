@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence as Items
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import Drive, Frame
 from bevcli.inference.pipeline import read_ahead
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -114,7 +114,7 @@ class Clip:
 
 
 def draw_clip(
-    drives: Drives, config: ClipConfig, seed: Items[int], index: int, *, with_gap: bool = True
+    drives: Drives, config: ClipConfig, seed: Sequence[int], index: int, *, with_gap: bool = True
 ) -> tuple[Clip, np.random.Generator]:
     """The clip at an index of a batch, and a generator for its augmentation. Raises InputError if a drive is too short.
 
@@ -147,9 +147,7 @@ def _similar_drives(shapes: tuple[InputShape, ...], drive: int) -> NDArray[np.in
     return np.flatnonzero(alike & (differences <= nearest[-1]))
 
 
-def draw_frames(
-    sequence: Sequence, count: int, random: np.random.Generator, *, with_gap: bool = True
-) -> tuple[int, ...]:
+def draw_frames(sequence: Drive, count: int, random: np.random.Generator, *, with_gap: bool = True) -> tuple[int, ...]:
     """Indices of a random frame and of `count` - 1 frames before it in its scene. Raises InputError if there are none.
 
     with_gap: as published, take the `count` frames before it and leave out a random one.
@@ -248,7 +246,7 @@ def load_batch(
     return joined([load_clip(clip) for clip in clips])
 
 
-def joined(batches: Items[Batch]) -> Batch:
+def joined(batches: Sequence[Batch]) -> Batch:
     """Batches with as many frames and cameras as one batch. Raises InputError where their cameras differ in number."""
     if len(batches) == 1:
         return batches[0]

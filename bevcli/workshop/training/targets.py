@@ -3,7 +3,7 @@
 The boxes and masks of one frame are made on the CPU; a batch has them padded, so that one copy moves them to a GPU.
 """
 
-from collections.abc import Callable, Mapping, Sequence as Items
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, Frame, Sequence
+from bevcli.frame import BevMap, Drive, Frame
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
@@ -65,7 +65,7 @@ class PaddedTargets:
         return DetectionTargets(self.labels[frame, :count], self.codes[frame, :count])
 
 
-AnyTargets = Items[DetectionTargets] | PaddedTargets  # of B frames
+AnyTargets = Sequence[DetectionTargets] | PaddedTargets  # of B frames
 
 
 def padded(targets: AnyTargets) -> PaddedTargets:
@@ -78,7 +78,7 @@ def padded(targets: AnyTargets) -> PaddedTargets:
     return PaddedTargets(labels, codes, exists, counts)
 
 
-def pad_rows(tensors: Items[Tensor]) -> Tensor:
+def pad_rows(tensors: Sequence[Tensor]) -> Tensor:
     """(B, G, ...) of B tensors (G_i, ...), padded with zeros to the largest of G_i, at least 1."""
     rows = max(1, *map(len, tensors))
     out = tensors[0].new_zeros(len(tensors), rows, *tensors[0].shape[1:])
@@ -162,7 +162,7 @@ class PaddedMasks:
         return SegmentationTargets(stuff, self.things[frame, :count], self.locations[frame, :count])
 
 
-AnyMasks = Items[SegmentationTargets] | PaddedMasks  # of B frames
+AnyMasks = Sequence[SegmentationTargets] | PaddedMasks  # of B frames
 
 
 def padded_masks(targets: AnyMasks) -> PaddedMasks:
@@ -267,8 +267,8 @@ class OwnHeads:
     """
 
     missing: Callable[[Frame, Any], tuple[str, str] | None]
-    truth: Callable[[Frame, Sequence, int, Any], Any]
-    losses: Callable[[Any, Items[Any], Items[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
+    truth: Callable[[Frame, Drive, int, Any], Any]
+    losses: Callable[[Any, Sequence[Any], Sequence[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
 
 
 def own_heads(config: ModelConfig) -> OwnHeads | None:
@@ -306,7 +306,7 @@ class Targets:
         return Targets(boxes, all_boxes, masks, self.truths)
 
 
-def joined_targets(parts: Items[Targets]) -> Targets:
+def joined_targets(parts: Sequence[Targets]) -> Targets:
     masks = [part.segmentation[frame] for part in parts if part.segmentation for frame in range(len(part.segmentation))]
     return Targets(
         padded([part.detection[frame] for part in parts for frame in range(len(part.detection))]),
@@ -326,7 +326,7 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def frame_targets(frame: Frame, drive: Sequence, index: int, config: ModelConfig) -> Targets:
+def frame_targets(frame: Frame, drive: Drive, index: int, config: ModelConfig) -> Targets:
     """index: of the frame in the drive."""
     boxes = ground_truth_boxes(frame)
     detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])

@@ -116,7 +116,7 @@ def drives_to_score(
 ) -> tuple[Drives, tuple[str, ...], Model]:
     """The drives of a validation, notes on them, and the model in its engine.
 
-    name: of the model, or its file. after_step: called after each step that `odometry` measures, see `SequenceOptions`.
+    name: of the model, or its file. after_step: called after each step that `odometry` measures, see `InputOptions`.
     """
     rig = None if options.rig is None else rig_for_drives(options.rig, name)
     drives = scored_drives(drive_options, model.config, rig)

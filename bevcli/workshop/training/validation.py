@@ -9,7 +9,7 @@ import importlib.util
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -22,7 +22,7 @@ from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite, score_results
 from bevcli.evaluation.inputs import Compared, FramePairs
 from bevcli.evaluation.matching import DetectionConfig
-from bevcli.frame import MAP_CLASSES, Frame, Prediction, Sequence
+from bevcli.frame import MAP_CLASSES, Drive, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
@@ -121,7 +121,7 @@ def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) 
                 )
 
 
-def longest_scene(drive: Sequence) -> int:
+def longest_scene(drive: Drive) -> int:
     """The number of frames of the longest scene of a drive."""
     return max(map(len, scenes_of(drive.stamps)), default=0)
 
@@ -250,7 +250,7 @@ def validate(
     )
 
 
-def drives_table(drives: Items[DriveScores]) -> str:
+def drives_table(drives: Sequence[DriveScores]) -> str:
     """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
     width = max(len("drive"), *(len(drive.name) for drive in drives))
     lines = [f"{'drive':{width}}  cameras    mAP    NDS"]

@@ -3,7 +3,7 @@
 `estimate_of_boxes` takes the boxes of a run that is done.
 """
 
-from collections.abc import Callable, Mapping, Sequence as Items
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
@@ -16,7 +16,7 @@ from bevcli.config import settings_of_table
 from bevcli.evaluation.evaluate import finite, number
 from bevcli.evaluation.matching import DetectionConfig
 from bevcli.findings import Finding, errors_of
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import Model
@@ -110,7 +110,7 @@ class EstimatedScore:
 
 
 def estimate_score(
-    model: Model, drive: Sequence, *, temporal: bool = True, after_frame: Callable[[], None] = lambda: None
+    model: Model, drive: Drive, *, temporal: bool = True, after_frame: Callable[[], None] = lambda: None
 ) -> EstimatedScore:
     """The score that a model is likely to have on a drive, which needs no ground truth, and faults that show.
 
@@ -129,7 +129,7 @@ def estimate_score(
     return estimate_of_boxes(model, frames, drive.rig).with_faults(find_faults(model, drive))
 
 
-def as_document(scores: Items[tuple[str, EstimatedScore]], reference: EstimatedScore | None) -> dict[str, Any]:
+def as_document(scores: Sequence[tuple[str, EstimatedScore]], reference: EstimatedScore | None) -> dict[str, Any]:
     """The scores of drives with their names, for JSON: the mean as "estimated", and each of them in its "drives"."""
     of_all: dict[str, Any] = {"nd_score": None, "low": None, "high": None}
     if all(score.nd_score is not None for _, score in scores):
@@ -145,7 +145,7 @@ def estimate_of_run(model: Model, folder: Path, rig: CameraRig) -> EstimatedScor
     return estimate_of_boxes(model, frames, rig)
 
 
-def estimate_of_boxes(model: Model, frames: Items[FrameBoxes], rig: CameraRig) -> EstimatedScore:
+def estimate_of_boxes(model: Model, frames: Sequence[FrameBoxes], rig: CameraRig) -> EstimatedScore:
     """The score from the boxes of a run, all of them, in the ego frame. rig: of the drive."""
     range_m = model.config.bev_grid.nearest_side_m
     figures, fit = figures_of(frames, rig, range_m), fits().get(model.weights_hash)
@@ -180,7 +180,7 @@ def estimate_of_boxes(model: Model, frames: Items[FrameBoxes], rig: CameraRig) -
 class _Parts:
     """The boxes of all frames that are shown, and the expected precision of some of them."""
 
-    def __init__(self, frames: Items[FrameBoxes], range_m: float, fit: Fit | None) -> None:
+    def __init__(self, frames: Sequence[FrameBoxes], range_m: float, fit: Fit | None) -> None:
         self.boxes = Boxes3D.concatenate([within(frame.boxes, range_m).scored(SHOWN) for frame in frames])
         self.distances = np.linalg.norm(self.boxes.centers[:, :2], axis=1)
         self._frames = max(1, len(frames))

@@ -5,7 +5,7 @@ images; the order of colours, by the model's scores with the order reversed; an 
 that find little, by rendered streets.
 """
 
-from collections.abc import Callable, Iterable, Sequence as Items
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.findings import Finding, errors_of, rig_error
-from bevcli.frame import CameraImage, DerivedSequence, Frame, Sequence
+from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
@@ -44,11 +44,11 @@ LEAST_CONFIDENCE, LEAST_PERSISTENCE = 0.35, 0.2  # figures of weights that need 
 BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
 
 
-class ReversedColors(DerivedSequence):
+class ReversedColors(DerivedDrive):
     """A drive whose images have their colour channels in reverse order."""
 
-    def load(self, place: int) -> Frame:
-        frame = self.sequence.load(place)
+    def load(self, index: int) -> Frame:
+        frame = self.sequence.load(index)
         return replace(frame, images={name: _reversed(image) for name, image in frame.images.items()})
 
 
@@ -57,7 +57,7 @@ def _reversed(image: CameraImage) -> CameraImage:
     return replace(image, pixels_bgr=pixels, encoded=None, media_type=None)
 
 
-def find_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
+def find_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
     """The faults of a drive that show without labels; none where all is sound.
 
     Findings of severity "info" say what could not be checked. A six-camera drive takes about ten seconds on one core.
@@ -71,7 +71,7 @@ def find_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
     return (*input_faults(drive), *model_faults(model, drive))
 
 
-def input_faults(drive: Sequence) -> tuple[Finding, ...]:
+def input_faults(drive: Drive) -> tuple[Finding, ...]:
     """Faults of cameras and poses, which need no model."""
     part, viewer = SomeFrames(drive, chosen_places(drive, STEPS)), Viewer()
     views, small = [], list[dict[str, Array]]()
@@ -105,7 +105,7 @@ def small_grey(pixels_bgr: NDArray[np.uint8]) -> Array:
     return cv2.cvtColor(cv2.resize(pixels_bgr, SMALL, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY).astype(float)
 
 
-def image_findings(names: Iterable[str], frames: Items[dict[str, Array]]) -> tuple[Finding, ...]:
+def image_findings(names: Iterable[str], frames: Sequence[dict[str, Array]]) -> tuple[Finding, ...]:
     """Cameras that show nothing, and those that stand still while the others move.
 
     frames: grey images (h, w) by camera, of successive frames.
@@ -130,7 +130,7 @@ def image_findings(names: Iterable[str], frames: Items[dict[str, Array]]) -> tup
     return tuple(findings)
 
 
-def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
+def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
     """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
     first = max(0, (len(drive.stamps) - TRIED) // 2)
     some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
@@ -140,7 +140,7 @@ def model_faults(model: Model, drive: Sequence) -> tuple[Finding, ...]:
 
 
 def frame_boxes(
-    model: Model, drive: Sequence, *, temporal: bool = False, after_frame: Callable[[], None] = lambda: None
+    model: Model, drive: Drive, *, temporal: bool = False, after_frame: Callable[[], None] = lambda: None
 ) -> list[FrameBoxes]:
     """The boxes of each frame, in the ego frame; by default of each frame alone, without history."""
     frames = []
@@ -150,7 +150,7 @@ def frame_boxes(
     return frames
 
 
-def color_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+def color_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
     """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
     range_m = model.config.bev_grid.nearest_side_m
     reversed_boxes = frame_boxes(model, ReversedColors(drive))
@@ -162,7 +162,7 @@ def color_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> t
     return (rig_error("color-order", message, found, "", advice),)
 
 
-def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> tuple[Finding, ...]:
+def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
     """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine."""
     if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
         return ()
@@ -175,7 +175,7 @@ def engine_findings(model: Model, drive: Sequence, boxes: Items[FrameBoxes]) -> 
     return (rig_error("engine-broken", message, f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more", advice),)
 
 
-def weights_findings(model: Model, boxes: Items[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
+def weights_findings(model: Model, boxes: Sequence[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
     """The finding about weights that find little, here and on rendered streets of the rig that they know."""
     figures = figures_of(boxes, rig, model.config.bev_grid.nearest_side_m)
     is_low = figures.confidence < LEAST_CONFIDENCE or figures.persistence < LEAST_PERSISTENCE
@@ -193,7 +193,7 @@ def weights_findings(model: Model, boxes: Items[FrameBoxes], rig: CameraRig) -> 
     return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
 
 
-def agreement(wanted: Items[Boxes3D], given: Items[Boxes3D]) -> tuple[int, float]:
+def agreement(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, float]:
     """Number of boxes with a score of 0.3 or more, or without one, and the share of them that others repeat.
 
     A box is repeated by one of its class that is at most 2 m away and has a score of 0.15 or more.

@@ -16,7 +16,7 @@ from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import finite
-from bevcli.frame import Sequence
+from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import load_model
 from bevcli.model.config import ModelConfig
@@ -56,7 +56,7 @@ SLOWER = 1.5  # an image rate that is lower by this factor than the model's is a
 
 
 def gap_of_rigs(
-    check: CalibrationCheck, model: str, against: Path | None, open_drive: Callable[..., Sequence]
+    check: CalibrationCheck, model: str, against: Path | None, open_drive: Callable[..., Drive]
 ) -> "MeasuredGap | RuledGap":
     """The gap between a rig, or two, and the rigs that a model's weights know.
 
@@ -81,7 +81,7 @@ def gap_of_rigs(
     return _measured(model, rigs, found, known)
 
 
-def of_drive(open_drive: Callable[..., Sequence], config: ModelConfig) -> Iterator[RigDifference]:
+def of_drive(open_drive: Callable[..., Drive], config: ModelConfig) -> Iterator[RigDifference]:
     """The differences of a drive's images from rendered ones: rate and light; none of a calibration alone."""
     try:
         drive = open_drive(ego_motion="optional")

@@ -17,7 +17,7 @@ from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.detection import DetectionScores, evaluate_detections
 from bevcli.evaluation.matching import DetectionConfig
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ObjectClass
@@ -99,7 +99,7 @@ def boxes_of(model: Model, shot: Shot, after_frame: Callable[[], None] = lambda:
     return tuple(boxes)
 
 
-def _run(runner: Runner, street: Sequence) -> Iterator[tuple[Boxes3D, Boxes3D]]:
+def _run(runner: Runner, street: Drive) -> Iterator[tuple[Boxes3D, Boxes3D]]:
     for frame, prediction, _ in runner.run(street, range(len(street.stamps)), runner.preprocessor()):
         assert frame.ground_truth is not None
         yield prediction.boxes_ego, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))
@@ -133,7 +133,7 @@ def comparable(a: tuple[Shot, RigBoxes], b: tuple[Shot, RigBoxes]) -> tuple[RigB
     return common(*a), common(*b)
 
 
-class _Street(Sequence):
+class _Street(Drive):
     """A rendered drive in memory, with images as large as the network takes them, or as the camera gives them."""
 
     def __init__(self, seed: int, shot: Shot, image: ImageConfig, rate_hz: float, assets: Assets) -> None:

@@ -8,7 +8,7 @@ from bevcli.options import option, options
 from bevcli.printing import say
 
 if TYPE_CHECKING:
-    from bevcli.frame import Sequence
+    from bevcli.frame import Drive
     from bevcli.inference.load import Model
 
 
@@ -22,7 +22,7 @@ class ScoreWithoutLabelsOptions:
     )
 
 
-def _print_estimate(options: ScoreWithoutLabelsOptions, done: "tuple[Model, Sequence, Path]") -> None:
+def _print_estimate(options: ScoreWithoutLabelsOptions, done: "tuple[Model, Drive, Path]") -> None:
     """Print the estimated score of a run, where this is asked for. done: the model, the drive and the run's folder."""
     if not options.score_without_labels:
         return

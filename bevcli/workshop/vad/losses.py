@@ -4,7 +4,7 @@ Each predicted line is matched to a true one in that order of points that fits b
 scene from the model's own lines and futures, which they do not change.
 """
 
-from collections.abc import Iterator, Sequence as Items
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from shapely import LineString, box, get_coordinates, get_parts, line_interpolat
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, Sequence, result_of
+from bevcli.frame import Drive, Frame, result_of
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply, inverse
@@ -59,7 +59,7 @@ def missing_truth(frame: Frame, config: VADConfig) -> tuple[str, str] | None:
     return ("lines", TRUE_LINES) if result_of(MapLines, frame.ground_truth_results) is None else None
 
 
-def frame_truth(frame: Frame, sequence: Sequence, index: int, config: VADConfig) -> FrameTruth:
+def frame_truth(frame: Frame, sequence: Drive, index: int, config: VADConfig) -> FrameTruth:
     """The truth of a frame that a model trains on.
 
     frame: with ground truth boxes, and the rig that the model sees; at `index` of its drive, `sequence`.
@@ -86,7 +86,7 @@ def frame_truth(frame: Frame, sequence: Sequence, index: int, config: VADConfig)
     return FrameTruth(boxes, lines, driven, followed(known, config.commands) if len(known) else "")
 
 
-def _frames_until(sequence: Sequence, index: int, seconds: float) -> Iterator[FrameBoxes]:
+def _frames_until(sequence: Drive, index: int, seconds: float) -> Iterator[FrameBoxes]:
     """The frames of the same scene from an index on, and up to so many seconds later."""
     now = sequence.stamps[index]
     last_ns = now.timestamp_ns + round((seconds + LATE_S) * 1e9)
@@ -98,7 +98,7 @@ def _frames_until(sequence: Sequence, index: int, seconds: float) -> Iterator[Fr
 
 
 def head_losses(
-    outputs: VADOutputs, truths: Items[FrameTruth], matches: Items[tuple[Tensor, Tensor]], config: VADConfig
+    outputs: VADOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]], config: VADConfig
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of lines, futures and paths by name.
 
@@ -112,7 +112,7 @@ def head_losses(
 
 
 def motion_losses(
-    outputs: MotionOutputs, truths: Items[Boxes3D], matches: Items[tuple[Tensor, Tensor]], weights: LossWeights
+    outputs: MotionOutputs, truths: Sequence[Boxes3D], matches: Sequence[tuple[Tensor, Tensor]], weights: LossWeights
 ) -> dict[str, Tensor]:
     """The weighted scalar losses, divided by the number of matched boxes whose next place is known.
 
@@ -154,7 +154,7 @@ def best_modes(offsets: Tensor, true: Tensor, known: Tensor) -> Tensor:
     return summed.norm(dim=-1).argmin(-1)
 
 
-def plan_losses(outputs: VADOutputs, truths: Items[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
+def plan_losses(outputs: VADOutputs, truths: Sequence[FrameTruth], config: VADConfig) -> dict[str, Tensor]:
     """The weighted scalar losses of the paths of the commands that were followed.
 
     Each is the mean over frames and steps; unknown steps count as zero. As published, the mean of the distances is
@@ -316,7 +316,7 @@ def _orders(points: Array) -> Array:
 
 
 def line_losses(
-    outputs: LineOutputs, targets: Items[LineTargets], weights: LossWeights, extent_m: Tensor
+    outputs: LineOutputs, targets: Sequence[LineTargets], weights: LossWeights, extent_m: Tensor
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of all decoder layers, divided by the number of matched lines of the batch.
 
@@ -328,7 +328,7 @@ def line_losses(
 
 
 def _layer_loss(
-    logits: Tensor, points: Tensor, targets: Items[LineTargets], weights: LossWeights, extent_m: Tensor
+    logits: Tensor, points: Tensor, targets: Sequence[LineTargets], weights: LossWeights, extent_m: Tensor
 ) -> Tensor:
     """(3,) losses of one decoder layer. logits: (B, N, classes). points: (B, N, P, 2)."""
     class_targets, matched, true = torch.zeros_like(logits), [], []

@@ -1,4 +1,4 @@
-"""A ROS 2 bag or an MCAP file as a Sequence: its frames, and the images of its messages.
+"""A ROS 2 bag or an MCAP file as a drive: its frames, and the images of its messages.
 
 Image messages are compressed files, raw pixels in ROS's encodings, or video packets. OpenCV decodes files only. So the
 packets from a keyframe to the next are written to a temporary file, and read from it.
@@ -26,7 +26,7 @@ from bevcli.printing import one_line
 from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
-from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
@@ -201,8 +201,8 @@ def _is_keyframe(packet: bytes, video_format: str) -> bool:
     return any(head >> 1 & 0x3F in (32, 33) for head in heads)
 
 
-def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.ListedSequence:
-    """A bag as a `Sequence`. Opening it reads the index, the calibration, the poses and the times of the images.
+def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.ListedDrive:
+    """A bag as a `Drive`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
 
@@ -240,7 +240,7 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
         *gaps,
     )
     anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
-    sequence = images.ListedSequence(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
+    sequence = images.ListedDrive(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
     sequence.facts = replace(facts, geo_origin=geo_origin)
     if path.is_file():
         sequence.name = path.resolve().stem
@@ -248,7 +248,7 @@ def open_bag(path: Path, common: SequenceOptions, own: BagOptions) -> images.Lis
 
 
 def _files_beside(
-    folder: Path, rig: CameraRig | None, common: SequenceOptions, own: BagOptions
+    folder: Path, rig: CameraRig | None, common: InputOptions, own: BagOptions
 ) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
     """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
     calibration, notes = folder / CALIBRATION, []
