@@ -13,7 +13,6 @@ GROUPS = {
         *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     ),
     "rendered": ("test_drive", "test_export", "test_random_rig", "test_rendered_lens"),
-    "code": ("test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
     "weights": ("test_checkpoints", "test_system_errors"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}

@@ -1,4 +1,4 @@
-"""Every link, command, option and path that a document names exists; the CI workflow calls targets of the Makefile."""
+"""Every command, option and path that a document names exists. `make docs` checks the links."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 import typer
-import yaml
-from test_layers import LEVEL
 
 from bevcli.cli.main import app
 
@@ -21,8 +19,6 @@ OF_TODAY = [path for path in DOCUMENTS if path.name != "CHANGELOG.md"]
 
 FENCED = re.compile(r"^ *```.*?^ *```", flags=re.MULTILINE | re.DOTALL)
 CODE_SPAN = re.compile(r"(`+)(.+?)\1", flags=re.DOTALL)
-LINK = re.compile(r"\]\(([^)\s]+)\)")
-HEADING = re.compile(r"^#+ +(.+?) *$", flags=re.MULTILINE)
 HELP = {"--help", "-h"}
 
 
@@ -37,25 +33,6 @@ def prose(document: Path) -> str:
 
 def code_spans(document: Path) -> list[str]:
     return [" ".join(text.split()) for _, text in CODE_SPAN.findall(prose(document))]
-
-
-def anchors(document: Path) -> set[str]:
-    """The anchors that GitHub gives to the headings: lower case, spaces as hyphens, without punctuation."""
-    headings = (re.sub(r"\]\([^)]*\)", "", heading) for heading in HEADING.findall(prose(document)))
-    names = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
-    repeated = (names[:place].count(name) for place, name in enumerate(names))
-    return {f"{name}-{count}" if count else name for name, count in zip(names, repeated, strict=True)}
-
-
-@each(DOCUMENTS)
-def test_links_lead_to_files_and_headings(document: Path) -> None:
-    for link in LINK.findall(CODE_SPAN.sub("", prose(document))):
-        if link.startswith(("http://", "https://")):
-            continue
-        path, _, anchor = link.partition("#")
-        target = (document.parent / path).resolve() if path else document
-        assert target.exists(), link
-        assert not anchor or anchor in anchors(target), link
 
 
 def shown_commands(document: Path) -> list[str]:
@@ -124,11 +101,6 @@ def test_readme_lists_every_folder_and_module_once() -> None:
     )
 
 
-def test_readme_lists_rooms_in_the_order_of_layers() -> None:
-    levels = [LEVEL[room] for room in rooms_of_the_readme() if room in LEVEL]
-    assert levels == sorted(levels)
-
-
 def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
 
@@ -137,22 +109,3 @@ def make_targets() -> set[str]:
 def test_make_targets_in_the_prose_exist(document: Path) -> None:
     mentioned = {span.split()[-1] for span in code_spans(document) if re.fullmatch(r"(\w+=\S+ )?make [\w-]+", span)}
     assert mentioned <= make_targets()
-
-
-def test_the_workflow_calls_make_targets_on_two_pythons() -> None:
-    workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
-    job = workflow["jobs"]["test"]
-    assert job["strategy"]["matrix"]["python"] == ["3.11", "3.13"]
-    calls = [step["run"].split() for step in job["steps"] if "run" in step]
-    assert {program for program, *_ in calls} == {"make"}
-    called = {target for _, *targets in calls for target in targets}
-    assert {"check", "test"} <= called <= make_targets()
-
-
-def test_pre_commit_runs_the_same_ruff_as_make_check() -> None:
-    [repository] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
-    assert f"ruff=={repository['rev'].removeprefix('v')}" in (ROOT / "constraints.txt").read_text().splitlines()
-    assert {hook["id"]: hook.get("args") for hook in repository["hooks"]} == {
-        "ruff-check": ["--fix"],
-        "ruff-format": None,
-    }

@@ -1,8 +1,7 @@
-"""The package of docs/extend.md, installed and run, and the places that an extension touches."""
+"""The package of docs/extend.md, installed and run."""
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import re
@@ -10,7 +9,6 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from textwrap import dedent
@@ -18,9 +16,8 @@ from textwrap import dedent
 import pytest
 from command_line import MINI_TOML
 from forks import FORKS, run_in_fork
-from source_code import ROOT as PACKAGE, trees
 
-from bevcli.registry import entries, installed, own
+from bevcli.registry import entries, installed
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/extend.md").read_text()
@@ -124,35 +121,3 @@ def test_the_engine_of_the_page_runs_an_exported_file(folder):
     options = ("--engine", "unoptimised", "--frames", "0:1", "--out", "runs/engine")
     bevcli(folder, "run", "samples/street", "--model", "mini.onnx", *options)
     assert json.loads((folder / "runs/engine/summary.json").read_text())["frames"] == 1
-
-
-def imported(path: Path) -> Iterator[str]:
-    """The modules that a file imports anywhere, also by a text "module:attribute"."""
-    for node in ast.walk(trees()[path]):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            yield from [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("bevcli."):
-            yield node.value.partition(":")[0]
-
-
-def folders(group: str) -> set[str]:
-    """The packages of bevcli's entries of a group, such as "bevcli.workshop.uniad"."""
-    modules = {value.partition(":")[0] for value in own(group).values()}
-    packages = {module for module in modules if (PACKAGE.parent / module.replace(".", "/")).is_dir()}
-    return packages | {module.rpartition(".")[0] for module in modules - packages}
-
-
-def test_opening_a_sequence_names_no_format():
-    inside = tuple(f"{folder}." for folder in folders("bevcli.sequences"))
-    files = [PACKAGE / "sequences" / f"{name}.py" for name in ("open", "format", "options")]
-    for path in [*files, PACKAGE / "cli/run.py", *PACKAGE.glob("inference/*.py"), *PACKAGE.glob("runs/*.py")]:
-        assert not [name for name in imported(path) if f"{name}.".startswith(inside)], path
-
-
-def test_commands_are_in_cli_or_in_the_file_of_their_wing():
-    files = {value.partition(":")[0] for value in own("bevcli.commands").values()}
-    assert all(re.fullmatch(r"bevcli\.cli\.\w+|bevcli\.workshop\.\w+\.commands", file) for file in files), files
-    for name in ("__main__", "cli/__init__", "cli/main", "cli/bridge"):
-        assert not files & set(imported(PACKAGE / f"{name}.py")), name

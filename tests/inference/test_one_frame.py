@@ -76,7 +76,7 @@ def test_objects_of_the_api_are_described_in_one_line(model, images):
         "CameraRig(CAM_FRONT 320x180)": front,
         f"Prediction(frame 0, {len(prediction.boxes)} boxes)": prediction,
         "Frame(frame 0, images of CAM_FRONT)": model({"CAM_FRONT": images["CAM_FRONT"]}, front).frame,
-        "MemorySequence(memory, 1 frame, 6 cameras)": DRIVE,
+        "MemoryDrive(memory, 1 frame, 6 cameras)": DRIVE,
     }
     assert {repr(each) for each in described.values()} == described.keys()
 

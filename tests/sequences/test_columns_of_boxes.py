@@ -23,10 +23,10 @@ from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.viewer.recording_reader import read_recording
 sys.path.insert(0, sys.argv[3])
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, boxes_ahead, predict
 
-folder, drive = Path(sys.argv[2]), MemorySequence(1)
+folder, drive = Path(sys.argv[2]), MemoryDrive(1)
 boxes, frame = replace(boxes_ahead()[:2], lanes=np.array([7, -1])), drive.load(0)
 assert boxes.to_dict()["lane"] == [7, -1]
 assert with_all_columns(boxes_ahead()).lanes.tolist() == [-1] * len(boxes_ahead())

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-import torch._dynamo  # optimizers import it, which is impossible beside a simulated Triton
 from painted_drives import CONFIG, PaintedDrives
 from simulated_device import provide_training, simulated
 

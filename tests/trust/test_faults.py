@@ -180,14 +180,14 @@ def test_colors_that_are_reversed_twice_are_the_same():
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> planted_faults.Sequence:
+def street(tmp_path_factory: pytest.TempPathFactory) -> planted_faults.Drive:
     cache, config = tmp_path_factory.mktemp("streets"), load_model("demo").config
     return RenderedDrives([1_000_000], cache, config).open(0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", planted_faults.FAULTS)
-def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted_faults.Sequence, fault: str):
+def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted_faults.Drive, fault: str):
     plant, code = planted_faults.FAULTS[fault]
     faulty = plant(street, "CAM_FRONT")
     findings = find_faults(load_model("demo"), faulty) if code == "color-order" else input_faults(faulty)
@@ -196,11 +196,11 @@ def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted_faults.Seq
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", planted_faults.MODEL_FAULTS)
-def test_a_planted_fault_of_a_model_is_named(street: planted_faults.Sequence, fault: str):
+def test_a_planted_fault_of_a_model_is_named(street: planted_faults.Drive, fault: str):
     change, code = planted_faults.MODEL_FAULTS[fault]
     assert [finding.code for finding in model_faults(change(load_model("demo")), street)] == [code]
 
 
 @pytest.mark.slow
-def test_a_sound_rendered_drive_has_no_fault(street: planted_faults.Sequence):
+def test_a_sound_rendered_drive_has_no_fault(street: planted_faults.Drive):
     assert not [each for each in find_faults(load_model("demo"), street) if each.severity != "info"]
