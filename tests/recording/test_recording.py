@@ -244,10 +244,10 @@ def test_every_frame_survives_a_crash(tmp_path):
     script = f"""
 import os, sys
 sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
-from memory_drive import MemorySequence
+from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, predict
 from bevcli.recording.writer import Recording
-drive = MemorySequence(4)
+drive = MemoryDrive(4)
 with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     for place in range(3):
         r.log(drive.load(place), predict(drive.load(place)))
