@@ -80,7 +80,7 @@ bench: $(DEVELOPER)
 	$(BIN)/python docs/site/speed_table.py docs/speed.md
 
 gpu-check: $(DEVELOPER)
-	$(BIN)/python tests/benchmark/gpu_check.py --device $(or $(DEVICE),auto)
+	$(BIN)/python tests/tools/gpu_check.py --device $(or $(DEVICE),auto)
 
 fuzz: $(DEVELOPER)
 	OMP_NUM_THREADS=1 BEVCLI_FUZZ_CASES=$${BEVCLI_FUZZ_CASES:-150} BEVCLI_FUZZ_SHARE=$${BEVCLI_FUZZ_SHARE:-1} \

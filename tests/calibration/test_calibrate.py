@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy import WrongTimes, errors_of_drive
+from calibration_accuracy import WrongTimes, errors_of_drive
 from command_line import MINI_TOML, command
 from memory_drive import MemoryDrive, make_camera
 from planted import BlackImages, ThroughLens, angle_deg, distance_m, wrong_rig

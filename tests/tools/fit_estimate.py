@@ -1,8 +1,8 @@
 """Fit the estimated score of `bevcli validate` to rendered drives with ground truth, and print how exact it is.
 
-    python tests/trust/fit.py collect rows --first 1001000 --count 48        # runs the model; one file a drive
-    python tests/trust/fit.py collect rows --first 1002000 --count 24 --check
-    python tests/trust/fit.py fit rows bevcli/workshop/trust/fits/demo.toml  # seconds
+    python tests/tools/fit_estimate.py collect rows --first 1001000 --count 48        # runs the model; one file a drive
+    python tests/tools/fit_estimate.py collect rows --first 1002000 --count 24 --check
+    python tests/tools/fit_estimate.py fit rows bevcli/workshop/trust/fits/demo.toml  # seconds
 
 A drive has a random rig. It is run as rendered and under six random conditions of `bevcli stress`. Drives that were
 collected with --check are not fitted, nor are the corruptions of HELD_OUT.
@@ -274,7 +274,7 @@ def main() -> None:
     fit = fitted([row for row, is_chosen in zip(rows, chosen, strict=True) if is_chosen], table[chosen], model)
     if given.out is not None:
         given.out.write_text(
-            "# Written by tests/trust/fit.py\n\n" + as_toml({"fit": vars(fit)}).lstrip(), encoding="utf-8"
+            "# Written by tests/tools/fit_estimate.py\n\n" + as_toml({"fit": vars(fit)}).lstrip(), encoding="utf-8"
         )
     print(report(rows, table, fit, range_m))
 

@@ -1,6 +1,8 @@
-"""How exact `odometry` is: `python tests/odometry/accuracy.py DRIVE… [--every N] [--cameras NAMES] [--scores MODEL]`.
+"""How exact `odometry` is.
 
-The drives' own poses count as right. The measurement does not get them. `drives.py` renders drives for it.
+    python tests/tools/odometry_accuracy.py DRIVE… [--every N] [--cameras NAMES] [--scores MODEL]
+
+The drives' own poses count as right. The measurement does not get them. `odometry_drives.py` renders drives for it.
 """
 
 import argparse

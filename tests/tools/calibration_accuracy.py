@@ -1,4 +1,4 @@
-"""How well `calibrate` finds planted noise: `python tests/calibration/accuracy.py DRIVE… --levels 1,2,3,4`.
+"""How well `calibrate` finds planted noise: `python tests/tools/calibration_accuracy.py DRIVE… --levels 1,2,3,4`.
 
 The drives' own calibration counts as right. Points are matched once a drive, because they do not depend on the noise.
 """

