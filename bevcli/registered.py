@@ -25,7 +25,6 @@ Group = Literal[
     "bevcli.hubs",
     "bevcli.packings",
     "bevcli.commands",
-    "bevcli.extensions",
 ]
 
 # Group -> name -> "module:attribute".

@@ -20,11 +20,9 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
 from bevcli.printing import one_line, say
-from bevcli.registered import Group
-from bevcli.registry import entries, hub_of, load
+from bevcli.registry import hub_of
 from bevcli.sequences.format import option_classes
 
-EXTENSIONS: Group = "bevcli.extensions"
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _OTHER_ARGUMENT = re.compile(r"`([a-z]\w*)=\"?([^`\"]*)\"?`")
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
@@ -62,34 +60,6 @@ class Part:
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     classes: Callable[[], list[type[Any]]] = option_classes
-
-
-@dataclass(frozen=True)
-class Extension:
-    """Options and a step that a package adds to a command: the entry COMMAND.NAME of the group "bevcli.extensions".
-
-    Attributes:
-        options: the dataclass of the options.
-        apply: called with the options, and an argument of the command. That of `run` is the drive, and it returns the
-            drive to use; that of `run-done`, after the run, is a tuple of the model, the drive and the run's folder.
-            That of `project-debug` is a function that opens the drive, and it returns findings.
-    """
-
-    options: type[Any]
-    apply: Callable[[Any, Any], Any]
-
-
-Steps = tuple[Callable[[Any], Any], ...]  # a parameter with the steps of all extensions of a command
-
-
-@dataclass(frozen=True)
-class ExtensionsOf:
-    """The command whose extensions a parameter gets, in an annotation: `Annotated[Steps, ExtensionsOf("run")]`.
-
-    "run-done" for those that `run` calls when it is done.
-    """
-
-    command: str
 
 
 @dataclass(frozen=True)
@@ -285,13 +255,9 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     marks = getattr(hint, "__metadata__", ())
     hint = get_args(hint)[0] if marks else hint
     part = next((mark for mark in marks if isinstance(mark, Part)), Part())
-    extended = next((mark.command for mark in marks if isinstance(mark, ExtensionsOf)), None)
     make: Callable[..., Any] = hint
     classes: list[type[Any]] = [hint]
-    if extended is not None:
-        extensions = [load(EXTENSIONS, name) for name in entries(EXTENSIONS) if name.startswith(f"{extended}.")]
-        make, classes = partial(_steps, extensions), [extension.options for extension in extensions]
-    elif hint == FormatValues:
+    if hint == FormatValues:
         make, classes = dict, part.classes()
     elif not dataclasses.is_dataclass(hint):
         return None, {}
@@ -306,13 +272,3 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
                 flags.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
     assert set(part.only) <= flags.keys(), f"{hint}: {part.only}"
     return make, flags
-
-
-def _steps(extensions: list[Extension], **values: Any) -> Steps:
-    """The steps of extensions with their options. values: of all options, by name."""
-    steps = []
-    for extension in extensions:
-        names = {field.name for field in dataclasses.fields(extension.options)}
-        options = extension.options(**{name: value for name, value in values.items() if name in names})
-        steps.append(partial(extension.apply, options))
-    return tuple(steps)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import ExtensionsOf, FormatValues, Json, Part, Steps, argument, as_flags, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags, print_note
 from bevcli.errors import InputError
 from bevcli.evaluation import EvaluationOptions, ExportOptions, score_options
 from bevcli.options import Option, defaults
@@ -208,7 +208,6 @@ def project_debug(
         ),
     ],
     options: CheckOptions,
-    further: Annotated[Steps, ExtensionsOf("project-debug")],
     as_json: Json = False,
 ) -> None:
     """Find mistakes in a calibration.
@@ -241,8 +240,10 @@ def project_debug(
             given["calibration"] = input
         how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
         open_drive = partial(open_sequence, options.sequence or input, **how)
-        findings = [finding for step in further for finding in step(open_drive)]
-        check = replace(check, report=with_findings(check.report, findings))
+        if options.motion:
+            from bevcli.workshop.calibration.core_options import check_motion
+
+            check = replace(check, report=with_findings(check.report, check_motion(open_drive)))
         if options.model is not None or options.against is not None:
             gap = load("bevcli.comparisons", "rigs")(check, model, options.against, open_drive)
             check = replace(check, further={"rig_gap": gap.to_dict()})

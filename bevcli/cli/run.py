@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import ExtensionsOf, FormatValues, InputDrive, Steps, as_flags, print_note
+from bevcli.cli.bridge import FormatValues, InputDrive, as_flags, print_note
 from bevcli.inference.options import ModelOptions
+from bevcli.options import Option
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
@@ -25,12 +26,24 @@ PHOTOGRAPHS = "photographs"  # the model in the package that learned from random
 
 def run(
     sequence: InputDrive,
+    *,
     model: ModelOptions,
     run_options: RunOptions,
     recording: RecordingOptions,
     source: InputOptions,
-    first: Annotated[Steps, ExtensionsOf("run")],
-    last: Annotated[Steps, ExtensionsOf("run-done")],
+    calibrate: Annotated[
+        bool,
+        Option(
+            "Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.", "Input"
+        ),
+    ] = False,
+    score_without_labels: Annotated[
+        bool,
+        Option(
+            "Print the NDS that the boxes are likely to have, with an interval; the drive needs no ground truth.",
+            "Output",
+        ),
+    ] = False,
     output: OutputOptions,
     format_options: FormatValues,
 ) -> None:
@@ -62,8 +75,10 @@ def run(
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
     with odometry_bar() as show_steps:
         drive = open_sequence(sequence, replace(reading, after_step=show_steps), **format_options)
-    for step in first:
-        drive = step(drive)
+    if calibrate:
+        from bevcli.workshop.calibration.core_options import corrected
+
+        drive = corrected(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
     loaded = loaded.in_engine(drive.rig, drive, parts="`probes`" if recording.probes else "", report=print_note)
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
@@ -98,8 +113,11 @@ def run(
             should_stop=signals.received,
         )
     say(as_flags(summary.table()))
-    for step in last:
-        step((loaded, drive, out))
+    if score_without_labels:
+        from bevcli.workshop.trust.estimate import estimate_of_run
+        from bevcli.workshop.trust.faults import find_faults
+
+        say(estimate_of_run(loaded, out, drive.rig).with_faults(find_faults(loaded, drive)).table())
     if signals.received() and not summary.is_complete:
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)

@@ -16,7 +16,7 @@ from bevcli.options import option, options
 
 @options()
 class CheckOptions:
-    """The sequence that belongs to a calibration, the model and rig that it is compared with, and the output."""
+    """The sequence that belongs to a calibration, what it is compared with, and the output."""
 
     sequence: Path | None = option(
         reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
@@ -35,4 +35,9 @@ class CheckOptions:
         reads="path",
         default=None,
         help="A second calibration or drive: measure both rigs with the model, and what the second one gains or loses.",
+    )
+    motion: bool = option(
+        default=True,
+        help="With a sequence, also measure its motion and its calibration from its images, and compare.",
+        flag="--motion/--no-motion",
     )

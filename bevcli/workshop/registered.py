@@ -106,9 +106,4 @@ OWN: dict[Group, dict[str, str]] = {
         "train": "bevcli.workshop.training.commands:train",
         "validate": "bevcli.workshop.training.commands:validate",
     },
-    "bevcli.extensions": {
-        "project-debug.motion": "bevcli.workshop.calibration.commands:CHECK_MOTION",
-        "run.calibrate": "bevcli.workshop.calibration.run_option:CALIBRATE_FIRST",
-        "run-done.score": "bevcli.workshop.trust.run_option:SCORE_WITHOUT_LABELS",
-    },
 }

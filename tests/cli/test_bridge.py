@@ -175,18 +175,3 @@ def test_arguments_in_messages_become_flags(library, shown):
 
 def test_arguments_stay_as_they_are_outside_a_command():
     assert Context().run(as_flags, "pass `force=True`") == "pass `force=True`"
-
-
-def test_an_extension_adds_options_and_a_step(monkeypatch):
-    @options("Input")
-    class Scale:
-        factor: int = option(default=1, help="Factor.")
-
-    monkeypatch.setattr(bridge, "entries", lambda group: ["read.scale", "write.scale"])
-    monkeypatch.setattr(bridge, "load", lambda group, name: bridge.Extension(Scale, lambda given, x: given.factor * x))
-
-    def read(steps: Annotated[bridge.Steps, bridge.ExtensionsOf("read")]) -> None:
-        (step,) = steps
-        assert step(3) == 6
-
-    assert invoke(read, "--factor", "2").exit_code == 0

@@ -14,7 +14,8 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.workshop.calibration import CheckMotionOptions, calibrate, commands
+from bevcli.workshop.calibration import calibrate
+from bevcli.workshop.calibration.core_options import check_motion as check
 from bevcli.workshop.odometry import check_motion
 from bevcli.workshop.odometry.check_motion import chosen_places, stated_motion_findings, without_consequences
 from bevcli.workshop.odometry.compare import compare
@@ -59,11 +60,9 @@ def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
 
 def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch):
     monkeypatch.setattr(calibrate, "motion_findings", lambda drive: (OFF,))
-    check = commands.CHECK_MOTION.apply
-    (finding,) = check(CheckMotionOptions(), lambda: MadeDrive(MISTAKES["km/h"][0]))
+    (finding,) = check(lambda: MadeDrive(MISTAKES["km/h"][0]))
     assert finding.code == "motion-scale"
-    assert check(CheckMotionOptions(), lambda: MadeDrive(stated())) == (OFF,)
-    assert check(CheckMotionOptions(motion=False), lambda: MadeDrive(MISTAKES["km/h"][0])) == ()
+    assert check(lambda: MadeDrive(stated())) == (OFF,)
 
 
 def test_one_cause_is_told_where_both_are_off():

@@ -6,6 +6,7 @@ In the order of the work, on top of the wing `correspondence`, which finds what 
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     estimates            what is said of each camera and of the whole rig
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
+    core_options         options of `bevcli run` and `bevcli project-debug`
     in_turn              the same for a drive without poses, whose motion the wing `odometry` measures
 """
 
@@ -35,17 +36,6 @@ class CalibrateOptions:
         minimum=0.0001, maximum=0.2,
     )  # fmt: skip
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
-
-
-@options()
-class CheckMotionOptions:
-    """Whether a check of a calibration measures the motion and the calibration too."""
-
-    motion: bool = option(
-        default=True,
-        help="With a sequence, also measure its motion and its calibration from its images, and compare.",
-        flag="--motion/--no-motion",
-    )
 
 
 @options("Output")

@@ -1,21 +1,13 @@
-"""`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion.
+"""`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion."""
 
-And its short form, the check of `bevcli project-debug`.
-"""
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from bevcli.cli.bridge import Extension, FormatValues, InputDrive, Json, Part, as_flags
+from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions, CheckMotionOptions
-
-if TYPE_CHECKING:
-    from bevcli.findings import Finding
-    from bevcli.frame import Drive
+from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions
 
 PANEL = "Look"
 
@@ -51,25 +43,3 @@ def calibrate(
     written = result.write(out)
     say(result.to_json() if as_json else as_flags(result.text()))
     say("Written: " + ", ".join(map(str, written)), err=as_json)
-
-
-def _motion_findings(options: CheckMotionOptions, open_drive: Callable[[], "Drive"]) -> "tuple[Finding, ...]":
-    """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone."""
-    if not options.motion:
-        return ()
-    from bevcli.errors import InputError
-    from bevcli.findings import errors_of
-    from bevcli.workshop.calibration.calibrate import motion_findings
-    from bevcli.workshop.odometry.check_motion import stated_motion_findings, without_consequences
-
-    try:
-        drive = open_drive()
-    except InputError:  # the check has said so
-        return ()
-    motion = stated_motion_findings(drive)
-    if errors_of(motion):  # which make a calibration wrong
-        return motion
-    return without_consequences(motion, motion_findings(drive), len(drive.rig.cameras))
-
-
-CHECK_MOTION = Extension(CheckMotionOptions, _motion_findings)

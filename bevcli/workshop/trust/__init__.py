@@ -6,6 +6,5 @@ In the order of the work:
     estimate      the entry point: the estimated score of a drive, or of the files of a run
     camera_faults faults of single cameras, by how points move in their images
     faults        all faults that show without labels
-    run_option    the option `score_without_labels` of `bevcli run`
     rig_differences, rig_gap, rig_gap_picture, gap_option: what a rig costs, for `bevcli project-debug --model`
 """
