@@ -40,7 +40,15 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), InputOptions(), (), (), results, {})
+    run(
+        drive,
+        model=ModelOptions(),
+        run_options=RunOptions(),
+        recording=RecordingOptions(),
+        source=InputOptions(),
+        output=results,
+        format_options={},
+    )
     if options.view:
         show(options.out / "results/recording.rrd", ViewOptions())
 
