@@ -34,7 +34,8 @@ def run(
     calibrate: Annotated[
         bool,
         Option(
-            "Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.", "Input"
+            "Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.",
+            "Input",
         ),
     ] = False,
     score_without_labels: Annotated[
