@@ -10,7 +10,6 @@ Group = Literal[
     "bevcli.models",
     "bevcli.calibrations",
     "bevcli.results",
-    "bevcli.model_uses",
     "bevcli.sequences",
     "bevcli.poses",
     "bevcli.motion",
@@ -31,14 +30,8 @@ Group = Literal[
 OWN: dict[Group, dict[str, str]] = {
     "bevcli.models": {
         "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
-        "BEVFormerV2": "bevcli.model.bevformer_v2.bevformer_v2:BEVFormerV2",
     },
     "bevcli.results": {},
-    # What others need to know of a model, by its class or a base class: see `bevcli.registry.for_model`.
-    "bevcli.model_uses": {
-        "constant_parts BEVFormer": "bevcli.model.prepare:fix_first_attention",
-        "constant_parts BEVFormerV2": "bevcli.model.bevformer_v2.constant_parts:fix_attentions",
-    },
     "bevcli.sequences": {
         "native": "bevcli.sequences.native:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes:FORMAT",

@@ -56,16 +56,6 @@ def load(group: Group, name: str) -> Any:
         ) from error
 
 
-def for_model(use: str, model: type) -> list[Any]:
-    """What is registered for a use of a model, such as "export_form": that of its class, then those of its bases.
-
-    The names in the group are "USE CLASS", so that a wing of the workshop, or another package, adds to a model what the
-    model itself need not know.
-    """
-    names = [f"{use} {kind.__name__}" for kind in model.__mro__]
-    return [load("bevcli.model_uses", name) for name in names if name in entries("bevcli.model_uses")]
-
-
 def load_form(group: Group, form: str) -> Any:
     """The format of files to write, as `load` gives it. form: its name, an option. Raises InputError."""
     if form not in entries(group):

@@ -15,7 +15,6 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.machine import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
@@ -23,6 +22,7 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.viewer import recording_file
+from bevcli.workshop.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
 from bevcli.workshop.vad.vad import VAD, VADConfig
 

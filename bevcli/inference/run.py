@@ -1,7 +1,7 @@
 """Run a model: `run` over a drive, a `Session` over frames from memory, such as those of a vehicle or a simulator."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -236,8 +236,9 @@ class Session:
         if self._meter is None or gap_ns > self._runner.config.max_gap_s * 1e9:
             self._meter = load("bevcli.motion", "live")()
         before, pose = self._meter.add(frame)
-        if before is not None and self.frame is not None:
-            memory = with_pose(self._state.memory, self.frame.world_from_ego, before)
+        # A frame without images has left the memory as it was.
+        if before is not None and self.frame is not None and self._state.stamp == self.frame.stamp:
+            memory = self._runner.model.with_pose(self._state.memory, before)
             self._state = replace(self._state, memory=memory)
         return replace(
             frame,
@@ -255,20 +256,6 @@ class Session:
             )
         number = 0 if self.frame is None else self.frame.stamp.index + 1
         return FrameStamp(number, str(self._drive) if self._drive > 1 else "", time)
-
-
-def with_pose(memory: Any, known: Pose, better: Pose) -> Any:
-    """The memory of a model with another pose in place of a known one, which is found by its identity."""
-    if memory is known:
-        return better
-    if type(memory) is tuple:
-        return tuple(with_pose(each, known, better) for each in memory)
-    if not is_dataclass(memory) or isinstance(memory, type | Pose):
-        return memory
-    parts = {part.name: getattr(memory, part.name) for part in fields(memory)}
-    changed = {name: with_pose(value, known, better) for name, value in parts.items()}
-    changed = {name: value for name, value in changed.items() if value is not parts[name]}
-    return replace(memory, **changed) if changed else memory
 
 
 def _pose(given: Pose | ArrayLike, argument: str) -> Pose:

@@ -24,7 +24,6 @@ from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import read_json
-from bevcli.registry import for_model
 
 Memory = TypeVar("Memory")
 # Commands of the driver, such as "straight": each chooses one of the paths that a model plans. Index of a frame and the
@@ -121,7 +120,7 @@ class Runner:
 
         0 on other devices, and where this gains nothing, because more is read of the device than the outputs.
         """
-        reads_more = self.options.ask_attention or for_model("read_within_a_step", type(self.model))
+        reads_more = self.options.ask_attention or self.model.waits_within_step
         return int(self.device.type == "cuda" and not reads_more)
 
     def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:

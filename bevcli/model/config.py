@@ -268,7 +268,7 @@ class ModelConfig:
 
     @property
     def future_times_s(self) -> tuple[float, ...]:
-        """Seconds after a frame at which its losses compare places of objects and of the vehicle; empty for none."""
+        """Seconds after a frame at which the model predicts places of objects and the vehicle; empty for none."""
         return ()
 
     @property

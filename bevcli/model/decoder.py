@@ -123,6 +123,10 @@ class Decoder(nn.Module):
             reference_points = refined.detach()
         return torch.stack(class_logits), torch.stack(box_codes), query
 
+    def fix_first_attention(self) -> None:
+        """The queries attend to each other before they see the frame: computed once, in place of the first layer's."""
+        self.layers[0].self_attention = ConstantSelfAttention(self.layers[0], self.object_queries(batch=1))
+
     def first_queries(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
         """A state dict with the first queries of one that has more; the same where this decoder has several groups.
 
@@ -180,6 +184,25 @@ class DecoderLayer(nn.Module):
         attended = self.cross_attention.attend(query + position, reference_points, bev, self.level_shapes)
         query = self.norms[1](query + self.dropout(attended))
         return self.norms[2](query + self.feed_forward(query))
+
+
+class ConstantSelfAttention(nn.Module):
+    """Takes the place of the self-attention in a first decoder layer, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
+        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
+        super().__init__()
+        assert isinstance(first, DecoderLayer)
+        with torch.no_grad():
+            key = queries.content + queries.position
+            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
+        return self.attended.expand_as(value), None
 
 
 class DetectionHead(nn.Module):

@@ -1,6 +1,7 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from torch import Tensor
 
@@ -12,9 +13,9 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
-from bevcli.model.pillar_projection import Pillars
+from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.segmentation import SegmentationHead
-from bevcli.model.step import ModelOutputs
+from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.model.upload import without_autocast
 
@@ -64,6 +65,62 @@ class Network(TemporalModel):
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return ModelOutputs(bev, class_logits, box_codes, segmentation)
+
+    def history_of_clip(self, clip: Clip, frame: int, memory: Any) -> Any:
+        """The memory after a frame of training clips that is history only; None before the first frame. No gradient."""
+        raise NotImplementedError
+
+    def outputs_of_clip(self, clip: Clip, frame: int, memory: Any) -> tuple[ModelOutputs, Any]:
+        """The outputs for a frame of training clips, and the memory after it, which has no gradient."""
+        raise NotImplementedError
+
+    def run_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+        """Run a frame with history, so that `bevcli bench` counts its operations, on the device "meta".
+
+        images: (1, N, 3, H, W). camera_index: (N,). hits: as in a real frame.
+        """
+        raise NotImplementedError
+
+    def part_names(self) -> Iterator[tuple[str, ...]]:
+        """See `TemporalModel`."""
+        yield from self.bev_part_names()
+        layers = self.config.decoder.layers
+        yield "object queries (position, content)", "decoder.query_embedding"
+        yield "object queries: reference points", "decoder.reference_points"
+        attentions = {"self_attention": "self-attention", "cross_attention": "cross-attention to BEV"}
+        yield from _layer_names("decoder", layers, attentions)
+        yield f"detection head: {layers} class branches", "detection_head.class_branches"
+        yield f"detection head: {layers} box branches", "detection_head.box_branches"
+        yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
+        yield "segmentation: location decoder", "segmentation_head.location_decoder"
+        for layer in range(self.config.segmentation.mask_layers):
+            yield f"segmentation: mask decoder layer {layer}", f"segmentation_head.mask_layers.{layer}"
+
+    def bev_part_names(self) -> Iterator[tuple[str, ...]]:
+        """The parts up to the BEV map, as `part_names`."""
+        yield "backbone: stem", "backbone.conv1", "backbone.bn1"
+        for stage, name in enumerate(self.config.backbone.stage_names()):
+            yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
+        yield "neck (FPN)", "neck"
+        yield "level embeddings", "image_tokens.level_embedding"
+        yield "camera embeddings", "image_tokens.camera_embedding"
+        yield "calibration embedding", "calibration_embedding"
+        yield "BEV queries", "bev_queries.embedding"
+        yield "position embedding, rows", "bev_queries.row_embedding"
+        yield "position embedding, columns", "bev_queries.column_embedding"
+        yield "can-bus MLP", "bev_queries.can_bus_embedding"
+        attentions = {
+            "temporal_self_attention": "temporal self-attention",
+            "spatial_cross_attention": "spatial cross-attention",
+        }
+        yield from _layer_names("encoder", self.config.encoder.layers, attentions)
+
+
+def _layer_names(part: str, layers: int, attentions: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """The parts of each layer of encoder or decoder. attentions: module -> name."""
+    for layer in range(layers):
+        for module, name in {**attentions, "feed_forward": "feed-forward network", "norms": "norms"}.items():
+            yield f"{part} layer {layer}: {name}", f"{part}.layers.{layer}.{module}"
 
 
 def build_network(config: ModelConfig) -> Network:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.model.decoder import DecoderLayer, ObjectQueries
+from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
@@ -26,7 +26,6 @@ from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.registry import for_model
 
 Precision = Literal["fp32", "bf16", "fp16"]
 TOKENS_OF_A_BLOCK = 1024  # the sums of a block stay in the cache
@@ -39,8 +38,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
-    Results that do not change from frame to frame are computed once ("constant_parts" of the model, `LastCall`). On a
-    CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
+    Results that do not change from frame to frame are computed once (`TemporalModel.fix_constant_parts`, `LastCall`).
+    On a CUDA GPU, methods that are marked by `on_device` are replayed as CUDA graphs.
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -49,8 +48,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
     """
     network = copy.deepcopy(model).eval().requires_grad_(False)
-    for fix_constant_parts in for_model("constant_parts", type(network))[:1]:
-        fix_constant_parts(network)
+    network.fix_constant_parts()
     points_on_cpu = {name: module.points for name, module in network.named_modules() if isinstance(module, Pillars)}
     network.to(device)
     choose.fold_batch_norms(network, device)
@@ -121,31 +119,6 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
 def methods_on_device(kind: type) -> list[str]:
     """Names of the methods of a class that are marked by `on_device`."""
     return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
-
-
-def fix_first_attention(model: Network) -> None:
-    """The object queries attend to each other before they see the frame: computed once, for the first decoder layer."""
-    first = model.decoder.layers[0]
-    first.self_attention = ConstantSelfAttention(first, model.decoder.object_queries(batch=1))
-
-
-class ConstantSelfAttention(nn.Module):
-    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
-
-    attended: Tensor
-
-    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
-        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
-        super().__init__()
-        assert isinstance(first, DecoderLayer)
-        with torch.no_grad():
-            key = queries.content + queries.position
-            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
-        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
-
-    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
-        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
-        return self.attended.expand_as(value), None
 
 
 class EfficientNetLiteByImage(EfficientNetLite):

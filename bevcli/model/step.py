@@ -1,8 +1,8 @@
 """The data of one step: a preprocessed frame with its cameras in the model's order, and the tensors of a network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Self
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from bevcli.geometry.transforms import Pose, wrap_angle
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
-from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
 
 # Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
@@ -104,6 +104,21 @@ class ModelInputs:
         return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 
 
+class Clip(Protocol):
+    """B training clips.
+
+    Attributes:
+        inputs: of each frame.
+        world_from_bev: (frames, B, 4, 4) float64.
+    """
+
+    @property
+    def inputs(self) -> Sequence[ModelInputs]: ...
+
+    @property
+    def world_from_bev(self) -> Tensor: ...
+
+
 @dataclass(frozen=True)
 class ModelOutputs:
     """The outputs of one step.
@@ -125,9 +140,51 @@ class ModelOutputs:
     segmentation: SegmentationOutputs | None = None
 
     @property
-    def further(self) -> dict[str, Tensor]:
-        """The last layers' outputs that only this model has, by their names in an exported file."""
-        return {}
+    def by_name(self) -> dict[str, Tensor]:
+        """The last layers' outputs by their names in an exported file, in the order of `ports`."""
+        named = {"bev": self.bev, "class_logits": self.class_logits[-1], "box_codes": self.box_codes[-1]}
+        if self.segmentation is not None:
+            named["mask_logits"] = self.segmentation.mask_logits[-1]
+            named["mask_class_logits"] = self.segmentation.class_logits[-1]
+        return named
+
+    @classmethod
+    def of_names(cls, tensors: Mapping[str, Tensor]) -> Self:
+        """The inverse of `by_name`, with one decoder layer."""
+        segmentation = None
+        if "mask_logits" in tensors:
+            masks, classes = tensors["mask_logits"][None], tensors["mask_class_logits"][None]
+            segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
+        return cls(tensors["bev"], tensors["class_logits"][None], tensors["box_codes"][None], segmentation)
+
+    @classmethod
+    def ports(cls, config: ModelConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
+        """Name, shape and meaning of each output of an exported file, see `by_name`."""
+        cells, queries = config.bev_grid.rows * config.bev_grid.columns, config.decoder.queries
+        yield (
+            "bev",
+            (1, cells, config.channels),
+            "(1, Y*X, C): the BEV map; cell row * columns + column, rows by rising y, columns by rising x.",
+        )
+        yield "class_logits", (1, queries, len(config.classes)), "(1, Q, classes): of the last decoder layer."
+        yield (
+            "box_codes",
+            (1, queries, 10),
+            "(1, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; metres and m/s, bev frame; "
+            "yaw = -atan2(sin, cos) - pi / 2.",
+        )
+        if "segmentation" in config.heads:
+            masks = len(STUFF_CLASSES) + config.segmentation.thing_queries
+            yield (
+                "mask_logits",
+                (1, masks, cells),
+                f"(1, Q, Y*X): masks of {', '.join(STUFF_CLASSES)}, then of vehicles.",
+            )
+            yield (
+                "mask_class_logits",
+                (1, masks),
+                "(1, Q): that the object exists. A cell's probability is sigmoid(mask) * sigmoid(class).",
+            )
 
     def boxes(self, config: ModelConfig) -> Boxes3D:
         """The boxes with the best scores of the last decoder layer, by falling score, bev frame; of a batch of one.

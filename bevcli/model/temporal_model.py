@@ -1,7 +1,6 @@
 """The protocol of a model: frame by frame through a sequence, with a memory that goes in and comes out.
 
-A network, the same network prepared for inference, and an exported file are each a `TemporalModel`. What others need of
-a model beyond this, such as its exported form, they register by its class: see `bevcli.registry.for_model`.
+A network, the same network prepared for inference, and an exported file are each a `TemporalModel`.
 """
 
 import re
@@ -12,8 +11,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bevcli.frame import BevMap, FrameResult
+from bevcli.errors import BevcliError
+from bevcli.frame import BevMap, FrameResult, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import decode_map
 from bevcli.model.step import ModelOutputs, PreparedFrame
@@ -55,6 +56,8 @@ class TemporalModel(nn.Module):
     Attributes:
         config_class: class of the configuration, which a TOML file fills in.
         memory_type: class of the memory, by which the state of an interrupted run is read.
+        outputs_type: class of the outputs.
+        waits_within_step: the CPU reads of the device within a step: no frame is begun before the last one ends.
         official_names: of the tensors in the released files of the model.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
         config: of the model.
@@ -62,6 +65,8 @@ class TemporalModel(nn.Module):
 
     config_class: ClassVar[type[ModelConfig]] = ModelConfig
     memory_type: ClassVar[type] = type(None)
+    outputs_type: ClassVar[type[ModelOutputs]] = ModelOutputs
+    waits_within_step: ClassVar[bool] = False
     official_names: ClassVar[OfficialNames] = OfficialNames()
     stages: Mapping[str, str] = {}
 
@@ -86,6 +91,23 @@ class TemporalModel(nn.Module):
         """Memory kept across a history reset, or None."""
         return None
 
+    def with_pose(self, memory: Memory, pose: Pose) -> Memory:
+        """The memory with another world_from_ego of its newest frame, as live motion knows it better a frame later.
+
+        Raises BevcliError for a model that has not stated where its memory holds the pose.
+        """
+        raise BevcliError(
+            f"{self.config.name}: a {self.config.architecture} cannot run without poses: it has no `with_pose`, which "
+            "corrects the pose in its memory: pass poses"
+        )
+
+    def with_past(self, memory: Memory, past: Sequence[tuple[FrameStamp, Pose]]) -> Memory:
+        """The memory after one frame as if the model had seen earlier frames too, to be timed.
+
+        past: their stamps and world_from_ego.
+        """
+        return memory
+
     def decode(self, outputs: ModelOutputs) -> Iterator[Boxes3D | BevMap | FrameResult]:
         """Yields the boxes, best score first, bev frame; the map of the ground, if there is one; further results.
 
@@ -94,6 +116,24 @@ class TemporalModel(nn.Module):
         yield outputs.boxes(self.config)
         if outputs.segmentation is not None:
             yield decode_map(outputs.segmentation, self.config.segmentation, self.config.bev_grid)
+
+    def fix_constant_parts(self) -> None:
+        """Compute once, in place, what is the same in every frame. A copy of the model for inference is changed."""
+
+    def part_names(self) -> Iterator[tuple[str, ...]]:
+        """The name of each part in the paper's terms, then its modules, in the order of a frame's way.
+
+        The model may lack some. A module that no part names is one of its own.
+        """
+        yield from ()
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> Any:
+        """The `ExportForm` in which `bevcli export-onnx` writes the model for a number of cameras.
+
+        Raises BevcliError for a model that cannot be exported.
+        """
+        raise BevcliError(f"{config.name}: a {config.architecture} cannot be exported")
 
     @property
     def device(self) -> torch.device:

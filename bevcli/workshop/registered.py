@@ -4,6 +4,7 @@ from bevcli.registered import Group
 
 OWN: dict[Group, dict[str, str]] = {
     "bevcli.models": {
+        "BEVFormerV2": "bevcli.workshop.bevformer_v2.bevformer_v2:BEVFormerV2",
         "UniAD": "bevcli.workshop.uniad.uniad:UniAD",
         "VAD": "bevcli.workshop.vad.vad:VAD",
     },
@@ -15,25 +16,6 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.true_results": {
         "native/ground_truth_lines.json": "bevcli.workshop.formats.map_lines:TrueLines",
         "nuscenes/maps/expansion": "bevcli.workshop.formats.map_lines:MapExpansion",
-    },
-    "bevcli.model_uses": {
-        "clip_steps BEVFormer": "bevcli.workshop.training.clip_steps:RecurrentSteps",
-        "clip_steps BEVFormerV2": "bevcli.workshop.training.clip_steps:WindowSteps",
-        "constant_parts UniAD": "bevcli.workshop.uniad.uniad:fix_nothing",
-        "constant_parts VAD": "bevcli.workshop.vad.vad:fix_first_attentions",
-        "export_form BEVFormer": "bevcli.workshop.engines.export_form:RecurrentForm",
-        "export_form BEVFormerV2": "bevcli.workshop.engines.export_form:WindowForm",
-        "export_form UniAD": "bevcli.workshop.uniad.uniad:refuse_export",
-        "exported_outputs VAD": "bevcli.workshop.vad.vad:exported_outputs",
-        "training_heads VAD": "bevcli.workshop.vad.losses:HEADS",
-        "operations BEVFormer": "bevcli.workshop.benchmark.measure:run_recurrent_frame",
-        "operations BEVFormerV2": "bevcli.workshop.benchmark.measure:run_window",
-        "operations UniAD": "bevcli.workshop.uniad.uniad:run_map_head",
-        "outputs_of_file VAD": "bevcli.workshop.vad.vad:outputs_of_file",
-        "part_names UniAD": "bevcli.workshop.uniad.uniad:PART_NAMES",
-        "part_names VAD": "bevcli.workshop.vad.vad:PART_NAMES",
-        "read_within_a_step UniAD": "bevcli.workshop.uniad.uniad:READ_WITHIN_A_STEP",
-        "past BEVFormerV2": "bevcli.workshop.benchmark.versions:with_past",
     },
     "bevcli.sequences": {
         "argoverse2": "bevcli.workshop.formats:ARGOVERSE2",

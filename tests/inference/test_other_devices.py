@@ -16,13 +16,13 @@ from bevcli.config import known_models, load_config
 from bevcli.frame import Prediction
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.network import Network
 from bevcli.model.prepare import methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.workshop.benchmark.made_up import made_up_model
+from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
 
 CPU = torch.device("cpu")

@@ -25,11 +25,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_from_quaternion
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame, other_bev_from_bev
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.official_keys import from_official
 from bevcli.model.step import ModelInputs
+from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame, other_bev_from_bev
 
 DATA = Path(__file__).parents[1] / "data"
 STEM_GAIN = {"tiny": 1.0}

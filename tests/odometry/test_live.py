@@ -1,19 +1,21 @@
 """A session without poses: what it measures is used at once, and corrected when the next frame is there."""
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from memory_drive import MemoryDrive
 
 import bevcli
-from bevcli.errors import InputError
-from bevcli.frame import StartReason
-from bevcli.geometry.ego_motion import RecentPoses
+from bevcli.errors import BevcliError, InputError
+from bevcli.frame import FrameStamp, StartReason
 from bevcli.geometry.transforms import Pose, inverse, rigid
-from bevcli.inference import run
+from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.temporal_model import TemporalModel
+from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2, FeatureWindow, FrameFeatures
 from bevcli.workshop.odometry import live
 from bevcli.workshop.odometry.measure import MeasuredStep
 
@@ -124,13 +126,15 @@ def test_a_gap_begins_a_new_world(session):
     np.testing.assert_array_equal(prediction.world_from_ego.matrix, np.eye(4))
 
 
-def test_only_the_known_pose_of_a_memory_is_exchanged():
-    one, same, other = Pose.identity(), Pose.identity(), Pose(np.ones(3), np.array([1.0, 0, 0, 0]))
-    memory = RecentPoses, (one, replace(same), 5), "text"
-    changed = run.with_pose(memory, one, other)
-    assert changed[1][0] is other
-    assert changed[1][1] is memory[1][1]
-    assert (changed[0], changed[2]) == (memory[0], memory[2])
+def test_the_newest_pose_of_a_memory_is_exchanged(mini_config):
+    old, new = Pose.identity(), Pose(np.ones(3), np.array([1.0, 0, 0, 0]))
+    assert BEVFormer.with_pose(None, BevHistory(torch.zeros(1), old), new).pose is new
+    features, cameras = FeatureMaps(torch.zeros(1), ()), [torch.zeros(1)] * 2
+    frames = tuple(FrameFeatures(FrameStamp(index, "", index), old, features, *cameras) for index in (0, 1))
+    assert [frame.pose for frame in BEVFormerV2.with_pose(None, FeatureWindow(frames), new).frames] == [old, new]
+    assert BEVFormerV2.with_pose(None, FeatureWindow(()), new) == FeatureWindow(())
+    with pytest.raises(BevcliError, match="has no `with_pose`"):
+        TemporalModel(mini_config).with_pose("memory", new)
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ from painted_drives import CONFIG, PaintedDrives
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.temporal_model import build_model
+from bevcli.workshop.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.clip_steps import forward_clip

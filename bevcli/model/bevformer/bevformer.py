@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from bevcli.geometry.transforms import Pose
+from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
+from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import on_device, upload, upload_together
 
 
@@ -107,3 +109,34 @@ class BEVFormer(Network):
             shift=inputs.shift,
         )
         return self.detect(bev) if heads else bev
+
+    def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
+        """See `TemporalModel`."""
+        return replace(memory, pose=pose)
+
+    def fix_constant_parts(self) -> None:
+        """See `TemporalModel`."""
+        self.decoder.fix_first_attention()
+
+    def history_of_clip(self, clip: Clip, frame: int, memory: Tensor | None) -> Tensor:
+        """See `Network`; the memory of clips is their BEV map (B, Y·X, C)."""
+        bev: Tensor = self.compute(self.geometry(clip.inputs[frame], memory), False)
+        return bev
+
+    def outputs_of_clip(self, clip: Clip, frame: int, memory: Tensor | None) -> tuple[ModelOutputs, Tensor]:
+        """See `Network`."""
+        outputs = self(clip.inputs[frame], memory)
+        return outputs, outputs.bev.detach()
+
+    def run_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+        """See `Network`."""
+        history = torch.empty(1, *self.bev_queries.embedding.shape)
+        can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
+        self.compute(EncoderInputs(images, camera_index, can_bus, shift, hits, None, history, rotation))
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> Any:
+        """See `TemporalModel`."""
+        from bevcli.workshop.engines.export_form import RecurrentForm
+
+        return RecurrentForm(config, cameras)

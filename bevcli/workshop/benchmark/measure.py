@@ -13,7 +13,6 @@ from statistics import median
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.frame import Frame, Prediction
@@ -22,14 +21,11 @@ from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.pipeline import WriteBehind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
-from bevcli.model.bevformer.bevformer import BEVFormer, EncoderInputs
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.recording.writer import Recording
-from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.versions import WARM_UP_FRAMES, Comparison, Version, compare_with_plain, wait_for
 
@@ -333,25 +329,8 @@ def count_operations(config: ModelConfig, hits_per_camera: tuple[int, ...]) -> f
             cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
         )
         images, camera_index = torch.empty(1, cameras, 3, height, width), torch.zeros(cameras, dtype=torch.int64)
-        for run in for_model("operations", type(model)):
-            run(model, images, camera_index, hits)
+        model.run_shapes(images, camera_index, hits)
     return float(counter.get_total_flops())
-
-
-def run_recurrent_frame(model: BEVFormer, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
-    """A frame with history, for a network on the device "meta".
-
-    images: (1, N, 3, H, W). camera_index: (N,). hits: as in a real frame.
-    """
-    history = torch.empty(1, *model.bev_queries.embedding.shape)
-    can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
-    model.compute(EncoderInputs(images, camera_index, can_bus, shift, hits, None, history, rotation))
-
-
-def run_window(model: BEVFormerV2, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
-    """See `run_recurrent_frame`. Every frame of the window is encoded anew; its images were seen before."""
-    features, frames = model.image_features(images, camera_index), len(model.config.frames)
-    model.compute(((features, hits),) * frames, range(frames))
 
 
 def _sampling_operations(*_shapes: Any, out_shape: Any, **_options: Any) -> int:

@@ -11,20 +11,17 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.frame import FrameStamp, Prediction
-from bevcli.geometry.transforms import Pose
+from bevcli.frame import Prediction
 from bevcli.inference.load import Model, installed_engines
 from bevcli.inference.machine import describe_machine, keep_freed_memory, return_freed_memory
 from bevcli.inference.options import TORCH
 from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState, StepOptions
-from bevcli.model.bevformer_v2.bevformer_v2 import FeatureWindow
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
-from bevcli.registry import for_model
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.engines.engine import CALIBRATION_FRAMES
 from bevcli.workshop.engines.exported import NEAR_M
@@ -83,23 +80,12 @@ class Version:
         assert self.state is not None
         assert self.state.stamp is not None
         past = [(stamp, drive.pose(stamp.index)) for stamp in drive.stamps[: self.state.stamp.index]]
-        for with_past in for_model("past", model_class(self.runner.config))[:1]:
-            self.state = replace(self.state, memory=with_past(self.state.memory, past))
+        model = model_class(self.runner.config)  # an exported file has the memory of its model
+        self.state = replace(self.state, memory=model.with_past(self.runner.model, self.state.memory, past))
 
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: ModelOutputs) -> None:
         codes = outputs.box_codes[-1, 0]
         self.queries = torch.cat([codes[:, :2], codes[:, 4:5]], dim=-1), outputs.class_logits[-1, 0].sigmoid()
-
-
-def with_past(memory: FeatureWindow, past: Sequence[tuple[FrameStamp, Pose]]) -> FeatureWindow:
-    """A memory as if the model had seen earlier frames too, with copies of the image features.
-
-    past: their stamps and world_from_ego.
-    """
-    if not memory.frames:
-        return memory  # nothing of one frame is kept for the next
-    seen = memory.frames[-1]
-    return FeatureWindow((*(replace(seen, stamp=stamp, pose=pose) for stamp, pose in past), seen))
 
 
 def wait_for(device: torch.device) -> None:

@@ -1,22 +1,16 @@
 """The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from bevcli.errors import BevcliError
-from bevcli.model.bevformer.bevformer import BevHistory
-from bevcli.model.bevformer_v2 import bevformer_v2
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.deformable_attention import FeatureMaps
-from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
-from bevcli.registry import for_model
-from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, WindowStep
+from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, with_most_cameras
 
 
 @dataclass(frozen=True)
@@ -34,6 +28,15 @@ class Port:
     shape: tuple[int, ...]
     meaning: str
     dtype: torch.dtype = torch.float32
+
+
+MOST_CAMERAS = Port(
+    "most_cameras_per_cell",
+    (1,),
+    "(1,): the largest number of cameras that see one cell of the BEV map. If it exceeds the metadata's "
+    "cameras_per_cell, cameras are left out, and the results are wrong: export with more.",
+    torch.int64,
+)
 
 
 class ExportForm:
@@ -58,9 +61,8 @@ class ExportForm:
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         """The outputs, in the order of the results of the step's `forward`. decode: with boxes."""
         boxes = _box_ports(self.config) if decode else ()
-        stated = for_model("exported_outputs", model_class(self.config))
-        further = [Port(*port) for outputs_of in stated for port in outputs_of(self.config)]
-        return (*_output_ports(self.config), *further, *boxes)
+        own = [Port(*port) for port in model_class(self.config).outputs_type.ports(self.config)]
+        return (*with_most_cameras(own, MOST_CAMERAS), *boxes)
 
     def facts(self) -> dict[str, Any]:
         """Further metadata of the file."""
@@ -80,10 +82,7 @@ class ExportForm:
 
 def export_form(config: ModelConfig, cameras: int) -> ExportForm:
     """The form in which a model is exported for a number of cameras. Raises BevcliError for a model that has none."""
-    forms = for_model("export_form", model_class(config))
-    if not forms:
-        raise BevcliError(f"{config.name}: a {config.architecture} cannot be exported")
-    form: ExportForm = forms[0](config, cameras)
+    form: ExportForm = model_class(config).export_form(config, cameras)
     return form
 
 
@@ -122,41 +121,6 @@ def camera_ports(
         Port("camera_index", lead[-1:], f"(N,): the camera embedding of each image: {names}.", torch.int64),
         Port("has_image", lead, f"({axes}): false for a camera without an image, which then sees nothing.", torch.bool),
     )
-
-
-def _output_ports(config: ModelConfig) -> Iterator[Port]:
-    """The outputs that the files of all models have."""
-    cells = config.bev_grid.rows * config.bev_grid.columns
-    queries, classes = config.decoder.queries, len(config.classes)
-    yield Port(
-        "bev",
-        (1, cells, config.channels),
-        "(1, Y*X, C): the BEV map; cell row * columns + column, rows by rising y, columns by rising x.",
-    )
-    yield Port("class_logits", (1, queries, classes), "(1, Q, classes): of the last decoder layer.")
-    yield Port(
-        "box_codes",
-        (1, queries, 10),
-        "(1, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; metres and m/s, bev frame; "
-        "yaw = -atan2(sin, cos) - pi / 2.",
-    )
-    yield Port(
-        "most_cameras_per_cell",
-        (1,),
-        "(1,): the largest number of cameras that see one cell of the BEV map. If it exceeds the metadata's "
-        "cameras_per_cell, cameras are left out, and the results are wrong: export with more.",
-        torch.int64,
-    )
-    if "segmentation" in config.heads:
-        masks = len(STUFF_CLASSES) + config.segmentation.thing_queries
-        yield Port(
-            "mask_logits", (1, masks, cells), f"(1, Q, Y*X): masks of {', '.join(STUFF_CLASSES)}, then of vehicles."
-        )
-        yield Port(
-            "mask_class_logits",
-            (1, masks),
-            "(1, Q): that the object exists. A cell's probability is sigmoid(mask) * sigmoid(class).",
-        )
 
 
 def _box_ports(config: ModelConfig) -> Iterator[Port]:
@@ -201,7 +165,7 @@ def _pixel(config: ModelConfig) -> str:
 
 
 class RecurrentForm(ExportForm):
-    """The exported form: the BEV map of the previous frame enters, that of the current one comes out."""
+    """The exported form of a BEVFormer: the previous BEV map enters, the current one comes out."""
 
     step = RecurrentStep
 
@@ -209,12 +173,12 @@ class RecurrentForm(ExportForm):
     def inputs(self) -> tuple[Port, ...]:
         return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
 
-    def feed(self, prepared: PreparedFrame, memory: BevHistory | None) -> dict[str, Tensor]:
+    def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
         inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
-    def memory(self, prepared: PreparedFrame, memory: BevHistory | None, by_name: Mapping[str, Tensor]) -> BevHistory:
-        return BevHistory(by_name["bev"], prepared.frame.world_from_ego)
+    def memory(self, prepared: PreparedFrame, memory: Any, by_name: Mapping[str, Tensor]) -> Any:
+        return model_class(self.config).memory_type(by_name["bev"], prepared.frame.world_from_ego)
 
 
 def _history_ports(config: ModelConfig) -> Iterator[Port]:
@@ -254,100 +218,3 @@ def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelCon
         "previous_bev": previous,
         "use_previous": torch.tensor([history is not None]),
     }
-
-
-class WindowForm(ExportForm):
-    """The form of one step of a BEVFormerV2.
-
-    Attributes:
-        frames: of the window, relative to the current one, which is the last.
-    """
-
-    step = WindowStep
-
-    def __init__(self, config: bevformer_v2.BEVFormerV2Config, cameras: int) -> None:
-        """Raises BevcliError for a model that looks at later frames."""
-        if config.later_frames:
-            raise BevcliError(
-                f"{config.name}: a model that looks at later frames cannot be exported: frames is "
-                f"{list(config.frames)} (expected a window that ends with 0, the current frame)"
-            )
-        super().__init__(config, cameras)
-        self.frames = config.frames
-
-    @property
-    def inputs(self) -> tuple[Port, ...]:
-        lead, bev_frame = (1, len(self.frames), self.cameras), "the current frame's bev frame"
-        images, projection, camera_index, has_image = camera_ports(self.config, lead, "1, F, N", bev_frame)
-        window = (
-            " For the cameras of each of the window's F frames, which are, relative to the current one: "
-            f"{_listed(self.frames)}."
-        )
-        absent = (
-            " All false for a frame that does not exist, such as before a scene's first frame or before a gap in "
-            "time of more than max_gap_s: the BEV map of the next frame takes the place of its own."
-        )
-        projection = replace(projection, meaning=projection.meaning + window)
-        ports = (images, projection, camera_index, replace(has_image, meaning=has_image.meaning + absent))
-        if len(self.frames) == 1:
-            return ports
-        meaning = (
-            "(F - 1, N, S, C): the output image_features of the window's earlier frames "
-            f"{_listed(self.frames[:-1])}, in this order; ignored for a frame that does not exist."
-        )
-        return (*ports, Port("previous_features", (len(self.frames) - 1, *self._features_shape), meaning))
-
-    def outputs(self, *, decode: bool) -> tuple[Port, ...]:
-        ports = super().outputs(decode=decode)
-        if len(self.frames) == 1:
-            return ports
-        meaning = "(N, S, C): of the current frame's images, for previous_features of the next frames."
-        return (*ports, Port("image_features", self._features_shape, meaning))
-
-    def facts(self) -> dict[str, Any]:
-        return {"window": self.frames}
-
-    def feed(self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None) -> dict[str, Tensor]:
-        """See `ExportForm`. Of a frame that does not exist no camera has an image."""
-        past = self._past(prepared, memory)
-        current = model_inputs(prepared, None, self.config)
-        indices = [len(past) + offset for offset in self.frames[:-1]]
-        absent = bevformer_v2.WindowFrame(
-            FeatureMaps(torch.zeros(self._features_shape), self.config.level_shapes),
-            torch.zeros_like(current.image_from_bev),
-            torch.zeros_like(current.has_image),
-            current.image_size,
-        )
-        earlier = [frame or absent for frame in bevformer_v2.frames_at(past, indices, prepared)]
-        feed = camera_feed(current) | {
-            "image_from_bev": torch.stack(
-                [*(frame.image_from_bev for frame in earlier), current.image_from_bev], dim=1
-            ),
-            "has_image": torch.stack([*(frame.has_image for frame in earlier), current.has_image], dim=1),
-        }
-        if earlier:
-            feed["previous_features"] = torch.stack([frame.image_features.tokens for frame in earlier])
-        return feed
-
-    def memory(
-        self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None, by_name: Mapping[str, Tensor]
-    ) -> bevformer_v2.FeatureWindow:
-        past = self._past(prepared, memory)
-        if "image_features" not in by_name:
-            return bevformer_v2.kept(past, len(past), -self.frames[0])
-        features = FeatureMaps(by_name["image_features"], self.config.level_shapes)
-        return bevformer_v2.kept([*past, bevformer_v2.FrameFeatures.of(prepared, features)], len(past), -self.frames[0])
-
-    def _past(
-        self, prepared: PreparedFrame, memory: bevformer_v2.FeatureWindow | None
-    ) -> list[bevformer_v2.FrameFeatures]:
-        return [] if memory is None else memory.before(prepared.frame.stamp, -self.frames[0])
-
-    @property
-    def _features_shape(self) -> tuple[int, int, int]:
-        cells = sum(height * width for height, width in self.config.level_shapes)
-        return self.cameras, cells, self.config.channels
-
-
-def _listed(frames: tuple[int, ...]) -> str:
-    return ", ".join(map(str, frames))

@@ -5,8 +5,9 @@ replaced by ones of standard operators with the same numbers.
 """
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -20,6 +21,8 @@ from bevcli.model.ego_motion import rotate_history
 from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.step import ModelOutputs
+
+Output = TypeVar("Output")
 
 
 class ExportedStep(nn.Module):
@@ -74,10 +77,14 @@ class ExportedStep(nn.Module):
     def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
         """The outputs in the order of `ExportForm.outputs`. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
         outputs: ModelOutputs = self.network.detect(bev)
-        logits, codes, segmentation = outputs.class_logits[-1], outputs.box_codes[-1], outputs.segmentation
-        masks = () if segmentation is None else (segmentation.mask_logits[-1], segmentation.class_logits[-1])
-        boxes = decode_boxes(logits, codes, self.config) if self.decode else ()
-        return (bev, logits, codes, most_cameras, *masks, *outputs.further.values(), *boxes)
+        named = outputs.by_name
+        boxes = decode_boxes(named["class_logits"], named["box_codes"], self.config) if self.decode else ()
+        return (*with_most_cameras(tuple(named.values()), most_cameras), *boxes)
+
+
+def with_most_cameras(outputs: Sequence[Output], most_cameras: Output) -> tuple[Output, ...]:
+    """The model's outputs with one that only exported files have, after the BEV map, the logits and the box codes."""
+    return (*outputs[:3], most_cameras, *outputs[3:])
 
 
 class RecurrentStep(ExportedStep):
@@ -115,44 +122,6 @@ class RecurrentStep(ExportedStep):
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         return self.outputs(bev, hits.most_cameras)
-
-
-class WindowStep(ExportedStep):
-    """One step of a BEVFormerV2 whose window ends with the current frame: `BEVFormerV2.forward`.
-
-    The image features of the earlier frames enter, and those of the current frame come out. All frames are encoded,
-    also those that do not exist, because a graph has no optional parts; a frame without any image then takes the map
-    of the next one, as in `fill_window`.
-    """
-
-    def forward(
-        self,
-        images: Tensor,
-        image_from_bev: Tensor,
-        camera_index: Tensor,
-        has_image: Tensor,
-        previous_features: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
-        """One step; `WindowForm` documents every input and output."""
-        network = self.network
-        image_features = self.image_features(images, camera_index)
-        tokens = [*([] if previous_features is None else previous_features), image_features.tokens]
-        hits = [self.hits(image_from_bev[:, index], has_image[:, index]) for index in range(len(tokens))]
-        maps = [
-            network.encoder(
-                bev_query=network.bev_queries.embedding[None],
-                position=network.bev_queries.position(),
-                image_features=FeatureMaps(frame_tokens, image_features.level_shapes),
-                hits=frame_hits,
-            )
-            for frame_tokens, frame_hits in zip(tokens, hits, strict=True)
-        ]
-        for index in reversed(range(len(maps) - 1)):
-            maps[index] = torch.where(has_image[:, index].any(), maps[index], maps[index + 1])
-        bev = maps[0] if network.fusion is None else network.fusion(maps)
-        most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
-        outputs = self.outputs(bev, most_cameras)
-        return outputs if previous_features is None else (*outputs, image_features.tokens)
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from bevcli.errors import WeightsError
 from bevcli.frame import BevMap, Drive, FrameResult
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState
@@ -22,13 +23,14 @@ from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.printing import counted, reason_of
-from bevcli.registry import for_model, load
+from bevcli.registry import load
 from bevcli.workshop.engines.export_form import export_form, pixels_of
 from bevcli.workshop.engines.export_onnx import read_metadata
 
 Arrays = Mapping[str, np.ndarray]
 NEAR_M = 0.1
 CENTER = (0, 1, 4)  # columns of box codes
+COMPARED = ("bev", "class_logits", "box_codes", "mask_logits", "mask_class_logits")  # outputs with columns of their own
 
 
 class LoadedFile(nn.Module):
@@ -104,17 +106,13 @@ class ExportedModel(TemporalModel):
         """See `TemporalModel`. The class of the model decodes; it needs only the configuration of this one."""
         return self.kind.decode(self, outputs)
 
+    def with_pose(self, memory: Memory, pose: Pose) -> Memory:
+        """See `TemporalModel`; the memory is that of the model."""
+        return self.kind.with_pose(self, memory, pose)
+
     def forward(self, outputs: Mapping[str, Tensor]) -> ModelOutputs:
         """The outputs as the model's own, with one decoder layer. outputs: of `outputs_by_name`."""
-        segmentation = None
-        if "mask_logits" in outputs:
-            masks, classes = outputs["mask_logits"][None], outputs["mask_class_logits"][None]
-            segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
-        logits, codes = outputs["class_logits"][None], outputs["box_codes"][None]
-        result = ModelOutputs(outputs["bev"], logits, codes, segmentation)
-        for own_outputs in for_model("outputs_of_file", self.kind):
-            result = own_outputs(result, outputs)
-        return result
+        return self.kind.outputs_type.of_names(outputs)
 
     def outputs_by_name(self, feed: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Every output of the file by name. feed: its inputs by name, see `ExportForm.feed`.
@@ -214,6 +212,7 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> Fra
     probabilities = [
         _probabilities(outputs.segmentation) for outputs in (ours, theirs) if outputs.segmentation is not None
     ]
+    further = {name: tensor for name, tensor in ours.by_name.items() if name not in COMPARED}
     return FrameDifference(
         frame=frame,
         bev=_largest(ours.bev, theirs.bev),
@@ -222,7 +221,7 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> Fra
         near=(distances <= NEAR_M).float().mean().item(),
         code=codes[..., others].max().item(),
         masks=_largest(*probabilities) if len(probabilities) == 2 else 0.0,
-        further={name: _largest(tensor, theirs.further[name]) for name, tensor in ours.further.items()},
+        further={name: _largest(tensor, theirs.by_name[name]) for name, tensor in further.items()},
     )
 
 

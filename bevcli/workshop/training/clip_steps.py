@@ -1,7 +1,4 @@
-"""Forward passes through training clips: of the model, frame by frame, of its frozen stages, and of a teacher.
-
-How a model goes through clips is registered by its class, as "clip_steps CLASS".
-"""
+"""Forward passes through training clips: of the model, frame by frame, of its frozen stages, and of a teacher."""
 
 import contextlib
 import copy
@@ -9,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,85 +15,15 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
 from bevcli.inference.load import weights_file
-from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network, build_network
 from bevcli.model.resnet import Backbone
 from bevcli.model.step import ModelOutputs
-from bevcli.registry import for_model
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.samples import Batch
-
-WindowMemory = list[FeatureMaps]  # the image features of all frames of the clip so far
-
-
-class ClipSteps(Protocol):
-    """A model and the frames of B clips, in turn. The memory of the first frame is None."""
-
-    def __init__(self, model: Any) -> None: ...
-
-    def history(self, clip: Batch, frame: int, memory: Any) -> Any:
-        """The memory after a frame that is history only; called without gradient."""
-
-    def outputs(self, clip: Batch, frame: int, memory: Any) -> tuple[ModelOutputs, Any]:
-        """The outputs for a frame, and the memory after it, which has no gradient."""
-
-
-def clip_steps(model: Network) -> ClipSteps:
-    """The steps of a model through clips."""
-    steps: ClipSteps = for_model("clip_steps", type(model))[0](model)
-    return steps
-
-
-class RecurrentSteps:
-    """Of a BEVFormer: the memory of a clip is its BEV map (B, Y·X, C)."""
-
-    def __init__(self, model: BEVFormer) -> None:
-        self._model = model
-
-    def history(self, clip: Batch, frame: int, memory: Tensor | None) -> Tensor:
-        """See `ClipSteps`."""
-        bev: Tensor = self._model.compute(self._model.geometry(clip.inputs[frame], memory), False)
-        return bev
-
-    def outputs(self, clip: Batch, frame: int, memory: Tensor | None) -> tuple[ModelOutputs, Tensor]:
-        """See `ClipSteps`."""
-        outputs = self._model(clip.inputs[frame], memory)
-        return outputs, outputs.bev.detach()
-
-
-class WindowSteps:
-    """Of a BEVFormerV2: its BEV encoder and its fusion are trained on the whole window."""
-
-    def __init__(self, model: BEVFormerV2) -> None:
-        self._model = model
-
-    def history(self, clip: Batch, frame: int, memory: WindowMemory | None) -> WindowMemory:
-        """See `ClipSteps`."""
-        inputs = clip.inputs[frame]
-        return [*(memory or ()), self._model.image_features(inputs.images, inputs.camera_index)]
-
-    def outputs(self, clip: Batch, frame: int, memory: WindowMemory | None) -> tuple[ModelOutputs, WindowMemory]:
-        """See `ClipSteps`."""
-        features = self.history(clip, frame, memory)
-        indices = [frame + offset for offset in self._model.config.frames]
-        window = [_seen_from(frame, clip, features[index], index) if index >= 0 else None for index in indices]
-        return self._model(window), [FeatureMaps(maps.tokens.detach(), maps.level_shapes) for maps in features]
-
-
-def _seen_from(current: int, clip: Batch, features: FeatureMaps, index: int) -> WindowFrame:
-    """The frames of the clips with an index, seen from the bev frames of the current ones."""
-    inputs = clip.inputs[index]
-    image_from_bev = inputs.image_from_bev
-    if index != current:
-        moved = torch.linalg.solve(clip.world_from_bev[index], clip.world_from_bev[current])
-        image_from_bev = (image_from_bev.double() @ moved[:, None]).float()
-    return WindowFrame(features, image_from_bev, inputs.has_image, inputs.image_size)
 
 
 def forward_clip(
@@ -113,17 +40,17 @@ def forward_clip(
     """
     frames = len(batch.inputs)
     first_learned = 0 if learn_all else frames - 1
-    steps, memory = clip_steps(model), None
+    memory = None
     model.eval()
     with torch.no_grad():
         for frame in range(first_learned):
-            memory = steps.history(batch, frame, memory)
+            memory = model.history_of_clip(batch, frame, memory)
     model.train()
     for module in model.modules():
         if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
     for frame in range(first_learned, frames):
-        outputs, memory = steps.outputs(batch, frame, memory)
+        outputs, memory = model.outputs_of_clip(batch, frame, memory)
         yield outputs
 
 
@@ -234,7 +161,7 @@ class Teacher:
     def lessons(self, clip: Batch) -> Iterator[Lesson]:
         """The results for each frame of clips, lazily."""
         image, own, network = self._taught.image, self._network.config.image, self._network
-        steps, memory = clip_steps(network), None
+        memory = None
         if image != own:
             clip = replace(
                 clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
@@ -243,7 +170,7 @@ class Teacher:
             bev = None
             with last_outputs(network.neck) as features:
                 if self._config.weight:
-                    outputs, memory = steps.outputs(clip, frame, memory)
+                    outputs, memory = network.outputs_of_clip(clip, frame, memory)
                     bev = outputs.bev.float()
                 else:
                     network.image_features(inputs.images, inputs.camera_index)

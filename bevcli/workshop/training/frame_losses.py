@@ -24,7 +24,7 @@ from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.model.upload import upload
 from bevcli.workshop.training import losses
 from bevcli.workshop.training.clip_steps import DistillationLossConfig, Lesson, last_outputs
-from bevcli.workshop.training.targets import AnyTargets, PaddedTargets, Targets, own_heads, padded
+from bevcli.workshop.training.targets import AnyTargets, PaddedTargets, Targets, padded
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)
@@ -377,7 +377,6 @@ class FrameLosses:
     def __init__(self, model: Network, configs: LossConfigs) -> None:
         classes = len(model.config.classes)
         self.configs = configs
-        self._config, self._own_heads = model.config, own_heads(model.config)
         self._query_groups = model.config.decoder.training_groups
         self._dense_head: losses.DenseHead | None = None
         self._perspective_head: PerspectiveHead | None = None
@@ -425,9 +424,6 @@ class FrameLosses:
             pairs = zip(self._feature_maps[0], taught.features, strict=True)
             shares = [nn.functional.mse_loss(own.float(), other) / other.var() for own, other in pairs]
             terms |= {"features": self.configs.distillation_loss.feature_weight * torch.stack(shares).mean()}
-        if self._own_heads is not None:
-            matches = losses.layer_matches(logits[-1], codes[-1], targets.detection, weights)
-            terms |= self._own_heads.losses(outputs, targets.truths, matches, self._config)
         if outputs.segmentation is not None and targets.segmentation is not None:
             terms |= losses.segmentation_loss(
                 outputs.segmentation, targets.segmentation, self.configs.segmentation_loss

@@ -132,18 +132,6 @@ def detection_loss(
     return {"classes": classes, "boxes": boxes}
 
 
-def layer_matches(
-    class_logits: Tensor, box_codes: Tensor, targets: AnyTargets, config: DetectionLossConfig
-) -> list[tuple[Tensor, Tensor]]:
-    """The queries of each of B frames that a layer matches to boxes, and the indices of these, both (K,) int64.
-
-    class_logits: (B, Q, classes). box_codes: (B, Q, 10).
-    """
-    truth = padded(targets)
-    costs = matching_costs(class_logits, box_codes, truth, config)
-    return [hungarian_matching(of_frame[:, :count]) for of_frame, count in zip(costs, truth.counts, strict=True)]
-
-
 def matching_costs(
     class_logits: Tensor, box_codes: Tensor, truth: PaddedTargets, config: DetectionLossConfig
 ) -> Tensor:

@@ -237,8 +237,7 @@ def load_batch(
             mask_images(step.images, augmentation.grid_mask, random)
         poses = [[x.frame.world_from_ego.matrix @ x.frame.rig.ego_from_bev] for x in prepared]
         world_from_bev = torch.from_numpy(np.array(poses))
-        learned = list(zip(prepared, clip.frames, strict=True))[0 if learn_all else -1 :]
-        targets = tuple(frame_targets(x.frame, drive, index, config) for x, index in learned)
+        targets = tuple(frame_targets(x.frame, config) for x in prepared[0 if learn_all else -1 :])
         before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
         distortions = tuple(map(_distortions, prepared, drawn)) if in_bytes and augmentation.photometric else ()
         return Batch(inputs, world_from_bev, targets, before, distortions)

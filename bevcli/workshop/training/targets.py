@@ -6,7 +6,6 @@ The boxes and masks of one frame are made on the CPU; a batch has them padded, s
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, Drive, Frame
+from bevcli.frame import BevMap, Frame
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
@@ -22,9 +21,7 @@ from bevcli.geometry.transforms import inverse
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import encode
 from bevcli.model.segmentation import STUFF_CLASSES
-from bevcli.model.temporal_model import model_class
 from bevcli.model.upload import exchanged, pinned, tensors_in, upload
-from bevcli.registry import for_model
 
 
 @dataclass(frozen=True)
@@ -256,27 +253,6 @@ def _locations(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class OwnHeads:
-    """The training of a model's heads beyond boxes and maps, registered as "training_heads CLASS".
-
-    Attributes:
-        missing: the truth that a frame lacks, in words, and its file; None where nothing is missing.
-        truth: of a frame of a drive, at an index, on the CPU. Raises InputError where some of it is missing.
-        losses: the weighted scalar losses by name. They take the outputs for B frames, B truths, and of each frame the
-            queries that the detection loss matches to boxes, with the indices of these.
-    """
-
-    missing: Callable[[Frame, Any], tuple[str, str] | None]
-    truth: Callable[[Frame, Drive, int, Any], Any]
-    losses: Callable[[Any, Sequence[Any], Sequence[tuple[Tensor, Tensor]], Any], dict[str, Tensor]]
-
-
-def own_heads(config: ModelConfig) -> OwnHeads | None:
-    """The registered training of a model's own heads, if it has some."""
-    return next(iter(for_model("training_heads", model_class(config))), None)
-
-
-@dataclass(frozen=True)
 class Targets:
     """The targets of B frames, one of each clip.
 
@@ -284,13 +260,11 @@ class Targets:
         detection: B, the boxes inside the BEV grid.
         perspective: B, all boxes, for the perspective loss.
         segmentation: B, or None if the model has no segmentation head.
-        truths: B, see `OwnHeads`; empty for a model without heads of its own.
     """
 
     detection: PaddedTargets
     perspective: PaddedTargets
     segmentation: PaddedMasks | None
-    truths: tuple[Any, ...] = ()
 
     def to(self, device: torch.device) -> "Targets":
         """A copy on a device."""
@@ -303,7 +277,7 @@ class Targets:
     def _changed(self, change: Callable[[Tensor], Tensor]) -> "Targets":
         parts = (self.detection, self.perspective, self.segmentation)
         boxes, all_boxes, masks = exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts)))
-        return Targets(boxes, all_boxes, masks, self.truths)
+        return Targets(boxes, all_boxes, masks)
 
 
 def joined_targets(parts: Sequence[Targets]) -> Targets:
@@ -312,7 +286,6 @@ def joined_targets(parts: Sequence[Targets]) -> Targets:
         padded([part.detection[frame] for part in parts for frame in range(len(part.detection))]),
         padded([part.perspective[frame] for part in parts for frame in range(len(part.perspective))]),
         padded_masks(masks) if masks else None,
-        tuple(truth for part in parts for truth in part.truths),
     )
 
 
@@ -326,13 +299,10 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def frame_targets(frame: Frame, drive: Drive, index: int, config: ModelConfig) -> Targets:
-    """index: of the frame in the drive."""
+def frame_targets(frame: Frame, config: ModelConfig) -> Targets:
     boxes = ground_truth_boxes(frame)
     detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
-    heads = own_heads(config)
-    truths = () if heads is None else (heads.truth(frame, drive, index, config),)
     if "segmentation" not in config.heads:
-        return Targets(detection, perspective, None, truths)
+        return Targets(detection, perspective, None)
     masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
-    return Targets(detection, perspective, padded_masks([masks]), truths)
+    return Targets(detection, perspective, padded_masks([masks]))

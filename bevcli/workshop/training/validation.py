@@ -35,7 +35,6 @@ from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.targets import own_heads
 from bevcli.writing import output_errors, whole_file
 
 
@@ -58,7 +57,7 @@ def check_training_drives(
     if short:
         named = ", ".join(f"{name} ({frames})" for name, frames in short.items())
         raise _too_short(named, clips.frames, min(short.values()))
-    _check_ground_truth(drives, clips, config)
+    _check_ground_truth(drives, clips)
     notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
     if held_out is not None:
         notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
@@ -102,23 +101,17 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
         raise _no_known_class("the ground truth of rendered drives", ", ".join(NUSCENES_CLASSES), "car", config)
 
 
-def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
-    first, heads = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0, own_heads(config)
+def _check_ground_truth(drives: Drives, clips: ClipConfig) -> None:
+    first = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0
     for drive in map(drives.open, range(len(drives))):
         indices = [index for scene in scenes_of(drive.stamps) for index in scene[first:]]
-        without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): []}
-        for frame in map(drive.ground_truth_frame, indices):
-            if frame.ground_truth is None:
-                without["boxes", BOXES_FILE].append(frame.stamp.index)
-            lacking = None if heads is None else heads.missing(frame, config)
-            if lacking is not None:
-                without.setdefault(lacking, []).append(frame.stamp.index)
-        for (truth, file), missing in without.items():
-            if missing:
-                raise InputError(
-                    f"{drive.name}: {len(missing)} of {len(indices)} frames to train on have no ground truth {truth}, "
-                    f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
-                )
+        frames = map(drive.ground_truth_frame, indices)
+        missing = [frame.stamp.index for frame in frames if frame.ground_truth is None]
+        if missing:
+            raise InputError(
+                f"{drive.name}: {len(missing)} of {len(indices)} frames to train on have no ground truth boxes, "
+                f"the first is frame {missing[0]}: add them to {BOXES_FILE}, or remove the frames"
+            )
 
 
 def longest_scene(drive: Drive) -> int:

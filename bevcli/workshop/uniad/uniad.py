@@ -18,6 +18,7 @@ from bevcli.model.decoder import ObjectQueries, boxes_of_codes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
 from bevcli.model.official_keys import OfficialNames, Renames
+from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import upload, without_autocast
 from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map
@@ -164,7 +165,6 @@ _RENAMES: Renames = (
 # The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
 OFFICIAL_NAMES = OfficialNames(r"^(query_embedding|memory_bank|query_interact|seg_head)\.", _RENAMES, _UNUSED)
 
-READ_WITHIN_A_STEP = "tracks"  # the CPU chooses them, so a step waits for its device
 PART_NAMES = (
     ("tracks: memory bank", "memory_bank"),
     ("tracks: query interaction", "query_interaction"),
@@ -186,6 +186,7 @@ class UniAD(BEVFormer):
     config: UniADConfig
     config_class = UniADConfig
     memory_type = TrackMemory
+    waits_within_step = True  # the CPU chooses the tracks
     stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
     official_names = OFFICIAL_NAMES
 
@@ -285,30 +286,38 @@ class UniAD(BEVFormer):
         """See `TemporalModel`: the next identity, and the pose for EgoMotionConfig.first_frame "original"."""
         return replace(memory, bev=None, tracks=memory.tracks.ended())
 
+    def with_pose(self, memory: TrackMemory, pose: Pose) -> TrackMemory:  # type: ignore[override]
+        """See `TemporalModel`."""
+        return replace(memory, pose=pose)
+
+    def fix_constant_parts(self) -> None:
+        """Nothing is constant, because the tracks and the learned queries attend to each other."""
+
+    def part_names(self) -> Iterator[tuple[str, ...]]:
+        """See `TemporalModel`."""
+        yield from super().part_names()
+        yield from PART_NAMES
+
+    def run_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+        """See `Network`."""
+        super().run_shapes(images, camera_index, hits)
+        grid = self.config.bev_grid
+        self.map_head(torch.empty(1, grid.rows * grid.columns, self.config.channels))
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> NoReturn:
+        """Raises BevcliError."""
+        raise BevcliError(
+            f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
+            "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
+        )
+
     def decode(self, outputs: ModelOutputs) -> Iterator[Boxes3D | BevMap | FrameResult]:
         assert isinstance(outputs, UniADOutputs)
         grid, head = self.config.bev_grid, self.config.map_head
         yield decode_tracks(outputs, self.config)
         if outputs.map is not None:
             yield merge_map(outputs.map, head, grid).bev_map(grid, head)
-
-
-def fix_nothing(model: UniAD) -> None:
-    """Nothing is constant, because the tracks and the learned queries attend to each other."""
-
-
-def run_map_head(model: UniAD, *_inputs: object) -> None:
-    """The operations of a frame that BEVFormer does not have, for the network on the device "meta"."""
-    grid = model.config.bev_grid
-    model.map_head(torch.empty(1, grid.rows * grid.columns, model.config.channels))
-
-
-def refuse_export(config: ModelConfig, cameras: int) -> NoReturn:
-    """Raises BevcliError in the place of an exported form."""
-    raise BevcliError(
-        f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
-        "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
-    )
 
 
 def _motion(prepared: PreparedFrame, memory: TrackMemory, device: torch.device) -> FrameMotion:

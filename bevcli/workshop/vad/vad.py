@@ -1,58 +1,27 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from bevcli.errors import ConfigError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
-from bevcli.model.decoder import best_boxes, best_classes
+from bevcli.model.decoder import ConstantSelfAttention, best_boxes, best_classes
 from bevcli.model.network import STAGES
-from bevcli.model.prepare import ConstantSelfAttention, fix_first_attention
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import OfficialNames, Renames
 from bevcli.model.upload import without_autocast
 from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.vad import heads
 from bevcli.workshop.vad.plan import Plan
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """The [loss_weights] table: weights of the losses of lines, futures and paths. Defaults: as published (stage 2).
-
-    Attributes:
-        line_class: of the focal loss of the lines' classes; also of their cost in the matching.
-        line_points: of the L1 loss of the lines' points, summed, as shares of the range; also of their cost.
-        line_direction: of 1 minus the cosine between the segments of a line and the true ones.
-        future: of the L1 loss of the movements in the best mode of an object.
-        mode: of the focal loss of the modes.
-        plan: of the L1 loss of the movements of the vehicle.
-        boundary: of the shares of a metre by which planned places are nearer than that to a boundary.
-        collision: of the metres by which planned places are too near to vehicles.
-        direction: of the angle between the planned path and the nearest divider, radians.
-    """
-
-    line_class: float = 0.8
-    line_points: float = 0.4
-    line_direction: float = 0.005
-    future: float = 0.2
-    mode: float = 0.2
-    plan: float = 1.0
-    boundary: float = 1.0
-    collision: float = 1.0
-    direction: float = 0.5
-
-    def __post_init__(self) -> None:
-        if min(astuple(self)) < 0:
-            raise ValueError("the weights must not be negative")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +32,6 @@ class VADConfig(ModelConfig):
         commands: of the driver, in the order of the planned paths.
         line_decoder: the map decoder.
         motion: the motion head and the planner.
-        loss_weights: of the losses of lines, futures and paths.
     """
 
     architecture: ClassVar[str] = "VAD"
@@ -71,7 +39,6 @@ class VADConfig(ModelConfig):
     commands: tuple[str, ...] = ("right", "left", "straight")
     line_decoder: heads.LineDecoderConfig = field(default_factory=heads.LineDecoderConfig)
     motion: heads.MotionConfig = field(default_factory=heads.MotionConfig)
-    loss_weights: LossWeights = field(default_factory=LossWeights)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,6 +56,9 @@ class VADConfig(ModelConfig):
     @property
     def future_times_s(self) -> tuple[float, ...]:
         return tuple(self.motion.step_s * step for step in range(1, self.motion.steps + 1))
+
+    def check_training(self, clip_frames: int) -> None:
+        raise ConfigError(f"{self.name}: a VAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
 
 
 _RENAMES: Renames = (
@@ -148,14 +118,59 @@ class VADOutputs(ModelOutputs):
     plan: Tensor
 
     @property
-    def further(self) -> dict[str, Tensor]:
+    def by_name(self) -> dict[str, Tensor]:
+        """See `ModelOutputs`."""
         return {
+            **super().by_name,
             "line_class_logits": self.lines.class_logits[-1],
             "line_points": self.lines.points[-1],
             "future_offsets": self.motion.offsets,
             "mode_logits": self.motion.mode_logits,
             "plan_offsets": self.plan,
         }
+
+    @classmethod
+    def of_names(cls, tensors: Mapping[str, Tensor]) -> Self:
+        """See `ModelOutputs`. Features between the heads are not in the file."""
+        base, none = ModelOutputs.of_names(tensors), torch.zeros(0)
+        return cls(
+            base.bev,
+            base.class_logits,
+            base.box_codes,
+            lines=heads.LineOutputs(tensors["line_class_logits"][None], tensors["line_points"][None], none),
+            motion=heads.MotionOutputs(tensors["future_offsets"], tensors["mode_logits"], none),
+            plan=tensors["plan_offsets"],
+        )
+
+    @classmethod
+    def ports(cls, config: ModelConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
+        """See `ModelOutputs`."""
+        assert isinstance(config, VADConfig)
+        yield from super().ports(config)
+        lines, motion, queries = config.line_decoder, config.motion, config.decoder.queries
+        commands = config.commands
+        yield (
+            "line_class_logits",
+            (1, lines.lines, len(lines.classes)),
+            f"(1, N, classes): of lines of the map: {', '.join(lines.classes)}.",
+        )
+        yield (
+            "line_points",
+            (1, lines.lines, lines.line_points, 2),
+            "(1, N, P, 2): points of the lines, x and y, 0 to 1 over x_range_m and y_range_m.",
+        )
+        yield (
+            "future_offsets",
+            (1, queries, motion.modes, motion.steps, 2),
+            f"(1, Q, M, T, 2): movement of each object in each step of {motion.step_s:g} s, x and y in metres, bev "
+            "frame. Sums over the steps, added to the centre, are places.",
+        )
+        yield "mode_logits", (1, queries, motion.modes), "(1, Q, M): of the futures."
+        yield (
+            "plan_offsets",
+            (1, len(commands), motion.steps, 2),
+            f"(1, commands, T, 2): movement of the vehicle in each step, for the commands {', '.join(commands)}.",
+        )
 
     def last_layers(self) -> Self:
         """See `ModelOutputs`. Features, which only the network uses, are left out."""
@@ -170,6 +185,7 @@ class VAD(BEVFormer):
     config: VADConfig
     config_class = VADConfig
     stages: Mapping[str, str] = STAGES | {"line_decoder": "map_decoder", "motion_head": "motion", "planner": "planner"}
+    outputs_type = VADOutputs
     official_names = OFFICIAL_NAMES
 
     def __init__(self, config: VADConfig) -> None:
@@ -178,6 +194,17 @@ class VAD(BEVFormer):
         self.line_encoder = heads.LineEncoder(config.channels)
         self.motion_head = heads.MotionHead(config.motion, config.channels)
         self.planner = heads.Planner(config.motion, len(config.commands), config.channels)
+
+    def fix_constant_parts(self) -> None:
+        """The queries of objects and of lines attend to each other before they see the frame: computed once."""
+        super().fix_constant_parts()
+        first = self.line_decoder.layers[0]
+        first.self_attention = ConstantSelfAttention(first, self.line_decoder.queries(batch=1))
+
+    def part_names(self) -> Iterator[tuple[str, ...]]:
+        """See `TemporalModel`."""
+        yield from super().part_names()
+        yield from PART_NAMES
 
     def detect(self, bev: Tensor) -> VADOutputs:
         """The outputs for a BEV map (B, Y·X, C)."""
@@ -209,50 +236,6 @@ class VAD(BEVFormer):
         yield decode_futures(outputs, self.config)
         yield decode_lines(outputs, self.config)
         yield decode_plan(outputs, self.config)
-
-
-def fix_first_attentions(model: VAD) -> None:
-    """The queries of objects and of lines attend to each other before they see the frame: computed once."""
-    fix_first_attention(model)
-    first = model.line_decoder.layers[0]
-    first.self_attention = ConstantSelfAttention(first, model.line_decoder.queries(batch=1))
-
-
-def exported_outputs(config: VADConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
-    """Name, shape and meaning of each of `VADOutputs.further` in an exported file."""
-    lines, motion, queries = config.line_decoder, config.motion, config.decoder.queries
-    commands = config.commands
-    yield (
-        "line_class_logits",
-        (1, lines.lines, len(lines.classes)),
-        f"(1, N, classes): of lines of the map: {', '.join(lines.classes)}.",
-    )
-    yield (
-        "line_points",
-        (1, lines.lines, lines.line_points, 2),
-        "(1, N, P, 2): points of the lines, x and y, 0 to 1 over x_range_m and y_range_m.",
-    )
-    yield (
-        "future_offsets",
-        (1, queries, motion.modes, motion.steps, 2),
-        f"(1, Q, M, T, 2): movement of each object in each step of {motion.step_s:g} s, x and y in metres, bev "
-        "frame. Sums over the steps, added to the centre, are places.",
-    )
-    yield "mode_logits", (1, queries, motion.modes), "(1, Q, M): of the futures."
-    yield (
-        "plan_offsets",
-        (1, len(commands), motion.steps, 2),
-        f"(1, commands, T, 2): movement of the vehicle in each step, for the commands {', '.join(commands)}.",
-    )
-
-
-def outputs_of_file(outputs: ModelOutputs, by_name: Mapping[str, Tensor]) -> VADOutputs:
-    """The outputs of an exported file as the model's own. outputs: those of every model. by_name: all of the file."""
-    none = torch.zeros(0)  # features between the heads are not in the file
-    lines = heads.LineOutputs(by_name["line_class_logits"][None], by_name["line_points"][None], none)
-    motion = heads.MotionOutputs(by_name["future_offsets"], by_name["mode_logits"], none)
-    parts = outputs.bev, outputs.class_logits, outputs.box_codes
-    return VADOutputs(*parts, lines=lines, motion=motion, plan=by_name["plan_offsets"])
 
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:

@@ -1,27 +1,14 @@
 """What is constant in a BEVFormerV2, computed before the first frame.
 
-The plain model knows nothing of this. No ego-motion enters its BEV queries, and they take the place of the history.
+No ego-motion enters its BEV queries, and they take the place of the history.
 """
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.model.bev_queries import BevQueries
-from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.model.deformable_attention import DeformableAttention
-from bevcli.model.encoder import Encoder, EncoderLayer, TemporalSelfAttention
-from bevcli.model.prepare import fix_first_attention
-
-
-def fix_attentions(model: BEVFormerV2) -> None:
-    """Exchanges, in place, temporal self-attentions and the decoder's first self-attention."""
-    first, *others = model.encoder.layers
-    first.temporal_self_attention = ConstantTemporalSelfAttention(model.encoder, model.bev_queries)
-    for layer in others:
-        assert isinstance(layer, EncoderLayer)
-        own = OwnQueriesAttention(layer.temporal_self_attention, model.bev_queries.position())
-        layer.set_submodule("temporal_self_attention", own)
-    fix_first_attention(model)
+from bevcli.model.encoder import Encoder, TemporalSelfAttention
 
 
 class ConstantTemporalSelfAttention(nn.Module):

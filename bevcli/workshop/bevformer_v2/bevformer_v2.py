@@ -14,9 +14,9 @@ A window [-2, -1, 0] at frame 1, the second of its scene; frame -1 does not exis
                                BevFusion                    -> the BEV map of frame 1
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,16 +28,19 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig
+from bevcli.model.encoder import EncoderLayer
 from bevcli.model.network import STAGES, Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.resnet import BasicBlock
-from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.step import Clip, ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import OfficialNames
 from bevcli.model.upload import on_device, upload
+from bevcli.workshop.bevformer_v2.constant_parts import ConstantTemporalSelfAttention, OwnQueriesAttention
 
 NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
 # Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
 FLOAT32_RANGE_M = 10_000
+ClipMemory = list[FeatureMaps]  # the image features of all frames of training clips so far
 
 
 @dataclass(frozen=True)
@@ -223,6 +226,61 @@ class BEVFormerV2(Network):
         """See `Network`."""
         return super().image_features(images, camera_index)
 
+    def with_pose(self, memory: FeatureWindow, pose: Pose) -> FeatureWindow:
+        """See `TemporalModel`."""
+        if not memory.frames:
+            return memory  # a window of one frame
+        return FeatureWindow((*memory.frames[:-1], replace(memory.frames[-1], pose=pose)))
+
+    def with_past(self, memory: FeatureWindow, past: Sequence[tuple[FrameStamp, Pose]]) -> FeatureWindow:
+        """See `TemporalModel`: copies of the image features."""
+        if not memory.frames:
+            return memory
+        seen = memory.frames[-1]
+        return FeatureWindow((*(replace(seen, stamp=stamp, pose=pose) for stamp, pose in past), seen))
+
+    def fix_constant_parts(self) -> None:
+        """See `TemporalModel`: temporal self-attentions and the decoder's first self-attention."""
+        first, *others = self.encoder.layers
+        first.temporal_self_attention = ConstantTemporalSelfAttention(self.encoder, self.bev_queries)
+        for layer in others:
+            assert isinstance(layer, EncoderLayer)
+            own = OwnQueriesAttention(layer.temporal_self_attention, self.bev_queries.position())
+            layer.set_submodule("temporal_self_attention", own)
+        self.decoder.fix_first_attention()
+
+    def bev_part_names(self) -> Iterator[tuple[str, ...]]:
+        """See `Network`."""
+        yield from super().bev_part_names()
+        for block in range(len(self.fusion.blocks) if self.fusion is not None else 0):
+            yield f"fusion of the window: residual block {block}", f"fusion.blocks.{block}"
+        yield "fusion of the window: projection and norm", "fusion.projection", "fusion.norm"
+
+    def history_of_clip(self, clip: Clip, frame: int, memory: ClipMemory | None) -> ClipMemory:
+        """See `Network`; BEV encoder and fusion are trained on the whole window."""
+        inputs = clip.inputs[frame]
+        return [*(memory or ()), self.image_features(inputs.images, inputs.camera_index)]
+
+    def outputs_of_clip(self, clip: Clip, frame: int, memory: ClipMemory | None) -> tuple[ModelOutputs, ClipMemory]:
+        """See `Network`."""
+        features = self.history_of_clip(clip, frame, memory)
+        indices = [frame + offset for offset in self.config.frames]
+        window = [_seen_in_clip(frame, clip, features[index], index) if index >= 0 else None for index in indices]
+        return self(window), [FeatureMaps(maps.tokens.detach(), maps.level_shapes) for maps in features]
+
+    def run_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> None:
+        """See `Network`. Every frame of the window is encoded anew; its images were seen before."""
+        features, frames = self.image_features(images, camera_index), len(self.config.frames)
+        self.compute(((features, hits),) * frames, range(frames))
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> Any:
+        """See `TemporalModel`."""
+        from bevcli.workshop.bevformer_v2.export import WindowForm
+
+        assert isinstance(config, BEVFormerV2Config)
+        return WindowForm(config, cameras)
+
     def forward(self, window: Sequence[WindowFrame | None]) -> ModelOutputs:
         """One step. window: the frames in the order of `config.frames`.
 
@@ -275,6 +333,16 @@ class BevFusion(nn.Module):
         cells = torch.cat(list(maps), dim=-1).unflatten(1, self.bev_shape)  # (B, Y, X, frames · C)
         fused = self.blocks(cells.permute(0, 3, 1, 2))  # (B, width, Y, X)
         return self.norm(self.projection(fused.permute(0, 2, 3, 1).flatten(1, 2)))
+
+
+def _seen_in_clip(current: int, clip: Clip, features: FeatureMaps, index: int) -> WindowFrame:
+    """The frames of training clips with an index, seen from the bev frames of the current ones."""
+    inputs = clip.inputs[index]
+    image_from_bev = inputs.image_from_bev
+    if index != current:
+        moved = torch.linalg.solve(clip.world_from_bev[index], clip.world_from_bev[current])
+        image_from_bev = (image_from_bev.double() @ moved[:, None]).float()
+    return WindowFrame(features, image_from_bev, inputs.has_image, inputs.image_size)
 
 
 def frames_at(
