@@ -11,7 +11,7 @@ import pytest
 
 from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table, read_model_file
 from bevcli.errors import ConfigError
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2Config
+from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
 
 

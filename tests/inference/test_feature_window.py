@@ -16,7 +16,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.runs.run_into_folder import run_into_folder
-from bevcli.workshop.bevformer_v2.bevformer_v2 import fill_window, other_bev_from_bev
+from bevcli.workshop.bevformer_v2.window import fill_window, other_bev_from_bev
 
 
 def assert_same(one, other):

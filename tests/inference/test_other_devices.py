@@ -22,7 +22,7 @@ from bevcli.model.network import Network
 from bevcli.model.prepare import methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.workshop.benchmark.made_up import made_up_model
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2Config
+from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
 
 CPU = torch.device("cpu")

@@ -19,7 +19,7 @@ from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.runs.state import RunState, load_state, save_state
 from bevcli.runs.summary import Counts
-from bevcli.workshop.bevformer_v2.bevformer_v2 import FeatureWindow
+from bevcli.workshop.bevformer_v2.window import FeatureWindow
 from bevcli.workshop.uniad.uniad import TrackMemory
 
 

@@ -15,7 +15,8 @@ from bevcli.errors import ConfigError
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.temporal_model import build_model
-from bevcli.workshop.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
+from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
+from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.clip_steps import forward_clip

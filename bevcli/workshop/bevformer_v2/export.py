@@ -10,7 +10,7 @@ from torch import Tensor
 from bevcli.errors import BevcliError
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.step import PreparedFrame, model_inputs
-from bevcli.workshop.bevformer_v2.bevformer_v2 import (
+from bevcli.workshop.bevformer_v2.window import (
     BEVFormerV2Config,
     FeatureWindow,
     FrameFeatures,

@@ -1,0 +1,219 @@
+"""The configuration of a BEVFormerV2, and its memory: the image features of the frames of a window."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bevcli.errors import ConfigError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.transforms import Array, Pose
+from bevcli.model.config import ModelConfig
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.ego_motion import EgoMotionConfig
+from bevcli.model.step import Clip, PreparedFrame
+
+NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
+# Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
+FLOAT32_RANGE_M = 10_000
+ClipMemory = list[FeatureMaps]  # the image features of all frames of training clips so far
+
+
+@dataclass(frozen=True)
+class BevFusionConfig:
+    """The fusion of the window's BEV maps.
+
+    Attributes:
+        blocks: number of residual blocks.
+        width: channels of the blocks. Where the concatenated maps have another number of channels, the first block's
+            shortcut is a convolution.
+    """
+
+    blocks: int = 3
+    width: int = 512
+
+    def __post_init__(self) -> None:
+        if min(self.blocks, self.width) < 1:
+            raise ValueError("blocks and width must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BEVFormerV2Config(ModelConfig):
+    """A whole BEVFormerV2. The neck may have more levels than there are level embeddings: those are for training only.
+
+    Attributes:
+        frames: the frames of the window, relative to the current one, in the order of fusion: [-1, 0] is the previous
+            frame and the current one. Positive numbers are later frames (offline use).
+        fusion: fuses the BEV maps of the window; unused where the window has only one frame.
+        ego_motion: switched off; the poses enter by the projections of the window's frames.
+    """
+
+    architecture: ClassVar[str] = "BEVFormerV2"
+    trains_with_gaps: ClassVar[bool] = False
+    trains_with_more_levels: ClassVar[bool] = True
+
+    frames: tuple[int, ...]
+    fusion: BevFusionConfig = field(default_factory=BevFusionConfig)
+    ego_motion: EgoMotionConfig = NO_EGO_MOTION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 not in self.frames or list(self.frames) != sorted(set(self.frames)):
+            raise ValueError("frames must be ascending, and hold 0, the current frame")
+        if self.ego_motion.can_bus or self.ego_motion.shift or self.ego_motion.rotation:
+            raise ValueError("ego_motion: can_bus, shift and rotation must be false: BEVFormerV2 has no recurrence")
+
+    @property
+    def past_frames(self) -> int:
+        return -self.frames[0]
+
+    @property
+    def later_frames(self) -> int:
+        return self.frames[-1]
+
+    @property
+    def uses_history(self) -> bool:
+        return len(self.frames) > 1
+
+    def check_training(self, clip_frames: int) -> None:
+        if self.later_frames:
+            raise ConfigError(
+                f"{self.name}: frames after the current one cannot be trained; expected frames that end with 0, "
+                f"found {list(self.frames)}"
+            )
+        if clip_frames <= self.past_frames:
+            raise ConfigError(
+                f"{self.name}: training.clips.frames must be at least {self.past_frames + 1}, so that a clip fills the "
+                f"window of the model, but is {clip_frames}"
+            )
+
+
+@dataclass(frozen=True)
+class WindowFrame:
+    """One frame of the window of B sequences with N cameras.
+
+    Attributes:
+        image_features: tokens of the B·N images.
+        image_from_bev: (B, N, 4, 4) float32, from the current frame's bev metres to pixels of this frame's images.
+        has_image: (B, N) bool; a camera without an image sees no BEV cell.
+        image_size: (height, width) of the network's input, pixels.
+    """
+
+    image_features: FeatureMaps
+    image_from_bev: Tensor
+    has_image: Tensor
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FrameFeatures:
+    """The image features of one frame and where its cameras were.
+
+    Attributes:
+        stamp: of the frame.
+        pose: its world_from_ego.
+        image_features: tokens of its N images.
+        image_from_bev: (1, N, 4, 4) float64 on the CPU, from the frame's own bev metres to network pixels.
+        has_image: (1, N) bool.
+    """
+
+    stamp: FrameStamp
+    pose: Pose
+    image_features: FeatureMaps
+    image_from_bev: Tensor
+    has_image: Tensor
+
+    @staticmethod
+    def of(prepared: PreparedFrame, features: FeatureMaps) -> "FrameFeatures":
+        """The features of a frame's images."""
+        frame, projections = prepared.frame, prepared.image_from_bev
+        return FrameFeatures(frame.stamp, frame.world_from_ego, features, projections, prepared.has_image)
+
+    def seen_from(self, current: PreparedFrame) -> WindowFrame:
+        """The frame in the window of the current one."""
+        image_from_bev = self.image_from_bev
+        if self.stamp != current.frame.stamp:
+            moved = other_bev_from_bev(current.frame.world_from_ego, self.pose, current.frame.rig.ego_from_bev)
+            image_from_bev = image_from_bev @ torch.from_numpy(moved)
+        height, width = current.images.shape[-2:]
+        # The projections stay on the CPU, as the model reads them.
+        return WindowFrame(self.image_features, image_from_bev.float(), self.has_image, (height, width))
+
+
+@dataclass(frozen=True)
+class FeatureWindow:
+    """The memory of a BEVFormerV2.
+
+    Attributes:
+        frames: the last frames, and with a model that looks ahead the next ones, in order of time.
+    """
+
+    frames: tuple[FrameFeatures, ...]
+
+    def before(self, now: FrameStamp, count: int) -> list[FrameFeatures]:
+        """The last `count` frames before the current one."""
+        past = [frame for frame in self.frames if frame.stamp.timestamp_ns < now.timestamp_ns]
+        return past[len(past) - min(count, len(past)) :]
+
+
+def seen_in_clip(current: int, clip: Clip, features: FeatureMaps, index: int) -> WindowFrame:
+    """The frames of training clips with an index, seen from the bev frames of the current ones."""
+    inputs = clip.inputs[index]
+    image_from_bev = inputs.image_from_bev
+    if index != current:
+        moved = torch.linalg.solve(clip.world_from_bev[index], clip.world_from_bev[current])
+        image_from_bev = (image_from_bev.double() @ moved[:, None]).float()
+    return WindowFrame(features, image_from_bev, inputs.has_image, inputs.image_size)
+
+
+def frames_at(
+    frames: Sequence[FrameFeatures], indices: Sequence[int], current: PreparedFrame
+) -> list[WindowFrame | None]:
+    """The frames at these indices, seen from the current one; None where there is no frame."""
+    return [frames[index].seen_from(current) if 0 <= index < len(frames) else None for index in indices]
+
+
+def kept(frames: Sequence[FrameFeatures], current: int, past_frames: int) -> FeatureWindow:
+    """The memory for the next frame, which needs one frame less of the past. current: index of the current frame."""
+    return FeatureWindow(tuple(frames[max(0, current + 1 - past_frames) :]))
+
+
+def fill_window(frames: Sequence[int], exists: Sequence[bool]) -> list[int]:
+    """For each frame of the window, the index of the frame whose BEV map it takes.
+
+    That is its own, or, where it does not exist, that of the nearest existing frame towards the current one.
+
+    Args:
+        frames: frames of the window relative to the current one, ascending.
+        exists: for each of them; the current one, 0, does.
+    """
+    current = list(frames).index(0)
+    sources = list(range(len(frames)))
+    for index in (*range(current - 1, -1, -1), *range(current + 1, len(frames))):
+        if not exists[index]:
+            sources[index] = sources[index + (1 if index < current else -1)]
+    return sources
+
+
+def other_bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_from_bev: Array) -> Array:
+    """(4, 4) float64 from the bev frame now to the bev frame at another time.
+
+    As in the released code, both times take the current pose of the bev frame in the vehicle, and the arithmetic is
+    float32, so that the same cells are seen at the edges of images. Far from the world's origin float32 is too coarse;
+    there it is float64.
+
+    Args:
+        world_from_ego: the vehicle's pose now.
+        other_world_from_ego: the vehicle's pose at the other time.
+        ego_from_bev: (4, 4), the current pose of the bev frame in the vehicle.
+    """
+    now, other = world_from_ego.matrix, other_world_from_ego.matrix
+    far = max(np.abs(now[:3, 3]).max(), np.abs(other[:3, 3]).max()) > FLOAT32_RANGE_M
+    dtype: type[np.floating] = np.float64 if far else np.float32
+    offset = ego_from_bev.astype(dtype)
+    bev_from_other_bev = np.linalg.inv(offset) @ np.linalg.inv(now.astype(dtype)) @ other.astype(dtype) @ offset
+    moved: Array = np.linalg.inv(bev_from_other_bev).astype(np.float64)
+    return moved
