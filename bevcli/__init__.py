@@ -18,7 +18,6 @@ from bevcli._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from bevcli.errors import BevcliError as BevcliError
-    from bevcli.evaluation.evaluate import evaluate as evaluate
     from bevcli.frame import (
         MAP_CLASSES as MAP_CLASSES,
         BevMap as BevMap,
@@ -36,13 +35,11 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import Session as Session, run as run
     from bevcli.recording.options import RecordingOptions as RecordingOptions
-    from bevcli.recording.record import record as record
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
-    from bevcli.viewer.export import export as export
     from bevcli.viewer.recording_file import show as show
     from bevcli.viewer.views import screenshot as screenshot, video as video
     from bevcli.weights.model_file import model_file_for as model_file_for
@@ -50,9 +47,12 @@ if TYPE_CHECKING:
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
+    from bevcli.workshop.formats.export import export as export
     from bevcli.workshop.hub.pack import pack_model as pack_model
     from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare
+    from bevcli.workshop.scores.evaluate import evaluate as evaluate
+    from bevcli.workshop.scores.record import record as record
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "bevcli.workshop.calibration.calibrate": "calibrate",
     "bevcli.errors": "BevcliError",
-    "bevcli.evaluation.evaluate": "evaluate",
+    "bevcli.workshop.scores.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Drive Sequence",
     "bevcli.geometry.boxes": "Box3D Boxes3D",
     "bevcli.geometry.cameras": "Camera CameraRig Distortion",
@@ -70,7 +70,7 @@ _NAMES = {
     "bevcli.inference.load": "Model load_model",
     "bevcli.inference.run": "Session run",
     "bevcli.recording.options": "RecordingOptions",
-    "bevcli.recording.record": "record",
+    "bevcli.workshop.scores.record": "record",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
@@ -86,7 +86,7 @@ _NAMES = {
     "bevcli.workshop.synth.drive": "render",
     "bevcli.workshop.training.train": "train validate",
     "bevcli.workshop.trust.estimate": "estimate_score",
-    "bevcli.viewer.export": "export",
+    "bevcli.workshop.formats.export": "export",
     "bevcli.viewer.recording_file": "show",
     "bevcli.viewer.views": "screenshot video",
 }

@@ -1,6 +1,7 @@
 """Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
 
 import io
+import math
 import sys
 import unicodedata
 from collections.abc import Collection, Sequence
@@ -42,6 +43,11 @@ def counted(count: int | str, things: str) -> str:
     """A number of things, such as "6 cameras" or "1 camera". things: a plural, such as "cameras" or "boxes"."""
     ending = "es" if things.endswith(("xes", "ches")) else "s"
     return f"{count} {things.removesuffix(ending) if str(count) == '1' else things}"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for a table; "-" for NaN."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 class _Output(io.FileIO):

@@ -17,7 +17,6 @@ Group = Literal[
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",
-    "bevcli.scores",
     "bevcli.comparisons",
     "bevcli.plots",
     "bevcli.engines",
@@ -36,18 +35,10 @@ OWN: dict[Group, dict[str, str]] = {
         "native": "bevcli.sequences.native:FORMAT",
         "nuscenes": "bevcli.sequences.nuscenes:FORMAT",
     },
-    "bevcli.box_formats": {
-        "csv": "bevcli.evaluation.box_format:CSV",
-        "json": "bevcli.evaluation.box_format:JSON",
-        "nuscenes": "bevcli.evaluation.submission:DETECTION",
-        "nuscenes-tracking": "bevcli.evaluation.submission:TRACKING",
-    },
     "bevcli.plots": {
         "prediction": "bevcli.viewer.plot:plot",
     },
     "bevcli.commands": {
-        "eval": "bevcli.cli.commands:evaluate",
-        "export": "bevcli.cli.commands:export",
         "project-debug": "bevcli.cli.commands:project_debug",
         "run": "bevcli.cli.run:run",
         "samples": "bevcli.cli.commands:samples",

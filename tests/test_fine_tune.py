@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from command_line import command
 
-from bevcli.evaluation.box_format import write_csv
 from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.sequences.files.boxes_table import write_csv
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/fine-tune.md").read_text()

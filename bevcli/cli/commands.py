@@ -1,21 +1,18 @@
-"""The short commands of the core: `bevcli samples`, `viz`, `project-debug`, `eval` and `export`."""
+"""The short commands of the core: `bevcli samples`, `viz` and `project-debug`."""
 
-import json
 import shlex
 import shutil
 import tempfile
 import textwrap
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags
 from bevcli.errors import InputError
-from bevcli.evaluation import EvaluationOptions, ExportOptions, score_options
 from bevcli.options import Option, defaults
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
@@ -29,7 +26,7 @@ if TYPE_CHECKING:
     from bevcli.frame import Frame
 
 
-PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look", "eval": "Score", "export": "Score"}
+PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look"}
 RIG = ("calibration", "extrinsics", "transform", "fov_deg", "height", "yaw_deg")
 ERRORS_FOUND = 3  # exit code of `bevcli project-debug`
 
@@ -122,9 +119,9 @@ def _record_drive(
     """Record a drive and boxes, and show the recording."""
     from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.cli.run import input_warnings
-    from bevcli.recording.record import names_of, record
     from bevcli.sequences.open import open_sequence
     from bevcli.viewer.recording_file import RECORDING, check_is_drive
+    from bevcli.workshop.scores.record import names_of, record
 
     check_is_drive(path)
     if options.out is not None and options.out.suffix.lower() != ".rrd":
@@ -263,70 +260,3 @@ def project_debug(
         say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
-
-
-def evaluate(
-    predictions: Annotated[
-        list[Path],
-        argument(
-            "predictions.json, the folder of a run, or a results_nusc.json. Two are compared.", metavar="PREDICTIONS"
-        ),
-    ],
-    ground_truth: Annotated[
-        Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
-    ],
-    source: Annotated[InputOptions, Part(only=("scene", "class_map"))],
-    format_options: Annotated[FormatValues, Part(only=("version", "split"))],
-    options: EvaluationOptions,
-    results: Annotated[FormatValues, Part(classes=score_options)],
-    as_json: Json = False,
-) -> None:
-    """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
-
-    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
-    runs a model on several drives and scores them together.
-
-    With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
-    frames.
-    """
-    from bevcli.errors import InputError
-    from bevcli.evaluation.evaluate import evaluate
-    from bevcli.registry import load
-
-    if len(predictions) > 2:
-        raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
-    score: Callable[..., Any] = evaluate if len(predictions) == 1 else load("bevcli.comparisons", "boxes")
-    scores = score(
-        *predictions,
-        ground_truth,
-        options.max_range,
-        options.count_missing,
-        scene=source.scene,
-        class_map=source.class_map,
-        **format_options,
-        **results,
-    )
-    say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
-    for note in scores.notes:
-        print_note(note)
-    if options.plot is not None:
-        for path in scores.write_plots(options.plot):
-            say(f"wrote {path}", err=True)
-
-
-def export(
-    predictions: Annotated[
-        Path,
-        argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
-    ],
-    options: ExportOptions,
-) -> None:
-    """Write boxes as a table, a boxes file, KITTI labels, or a nuScenes submission.
-
-    KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
-    those above the score of the run.
-    """
-    from bevcli.viewer.export import export
-
-    target, what = export(predictions, options, report=print_note)
-    say(f"{target}: {what}")

@@ -12,10 +12,10 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.evaluation.matching import DetectionConfig, ScoredBoxes, descending_scores, match_greedily
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
+from bevcli.geometry.matching import DetectionConfig, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities

@@ -11,7 +11,6 @@ import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import OutputError
-from bevcli.evaluation.box_format import CsvWriter
 from bevcli.frame import Drive, Frame, FrameResult, Prediction, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
@@ -20,6 +19,7 @@ from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.boxes_table import CsvWriter
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
@@ -27,7 +27,7 @@ from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.writing import whole_file, write_whole
 
 if TYPE_CHECKING:
-    from bevcli.evaluation.submission import SubmissionWriter
+    from bevcli.sequences.files.submission import SubmissionWriter
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
@@ -189,7 +189,7 @@ class RunFiles:
         return file
 
     def _open_submission(self) -> "SubmissionWriter":
-        from bevcli.evaluation.submission import SubmissionWriter  # nuScenes drives only
+        from bevcli.sequences.files.submission import SubmissionWriter  # nuScenes drives only
 
         return self._open(SUBMISSION, SubmissionWriter)
 

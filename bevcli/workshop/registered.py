@@ -40,6 +40,10 @@ OWN: dict[Group, dict[str, str]] = {
         "nuscenes": "bevcli.workshop.formats.nuscenes_writer:OUTPUT",
     },
     "bevcli.box_formats": {
+        "csv": "bevcli.workshop.formats.export:CSV",
+        "json": "bevcli.workshop.formats.export:JSON",
+        "nuscenes": "bevcli.workshop.formats.export:DETECTION",
+        "nuscenes-tracking": "bevcli.workshop.formats.export:TRACKING",
         "kitti": "bevcli.workshop.formats.kitti:BOXES",
     },
     "bevcli.label_formats": {
@@ -48,18 +52,8 @@ OWN: dict[Group, dict[str, str]] = {
         "kitti": "bevcli.workshop.formats.kitti:LABELS",
         "kitti-raw": "bevcli.workshop.formats.kitti:TRACKLETS",
     },
-    "bevcli.scores": {
-        "tracking": "bevcli.workshop.scores:SCORER",
-        "vad": "bevcli.workshop.vad:SCORER",
-        "worst": "bevcli.workshop.scores:WORST",
-    },
     "bevcli.comparisons": {
-        "boxes": "bevcli.workshop.scores.compare:compare",
         "rigs": "bevcli.workshop.trust.gap_option:gap_of_rigs",
-    },
-    "bevcli.plots": {
-        "comparison": "bevcli.workshop.scores.plots:write_comparison",
-        "scores": "bevcli.workshop.scores.plots:write_plots",
     },
     "bevcli.engines": {
         "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
@@ -79,6 +73,8 @@ OWN: dict[Group, dict[str, str]] = {
         "checks": "bevcli.workshop.checks.commands:checks",
         "convert": "bevcli.workshop.formats.commands:convert",
         "demo": "bevcli.workshop.synth.commands:demo",
+        "eval": "bevcli.workshop.scores.commands:evaluate",
+        "export": "bevcli.workshop.formats.commands:export",
         "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
         "odometry": "bevcli.workshop.odometry.commands:odometry",
         "quantize": "bevcli.workshop.engines.commands:quantize",

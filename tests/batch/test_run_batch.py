@@ -16,7 +16,6 @@ from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import make_job, results_of, write_drive, write_fleet
 
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.evaluate import evaluate
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
@@ -25,6 +24,7 @@ from bevcli.workshop.batch.job import find_drives
 from bevcli.workshop.batch.run_batch import run_batch
 from bevcli.workshop.batch.worker import Worker
 from bevcli.workshop.formats import BagOptions
+from bevcli.workshop.scores.evaluate import evaluate
 
 COMPARED = ("predictions.json", "tracks.csv")
 

@@ -21,16 +21,16 @@ from typer.testing import CliRunner
 import bevcli
 from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
-from bevcli.evaluation.detection import RECALLS, evaluate_detections
-from bevcli.evaluation.inputs import open_ground_truth
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.workshop.scores.bootstrap import draw_frames, resampled
 from bevcli.workshop.scores.compare import interval
+from bevcli.workshop.scores.detection import RECALLS, evaluate_detections
+from bevcli.workshop.scores.inputs import open_ground_truth
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 

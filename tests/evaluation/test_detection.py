@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.detection import DetectionScores, evaluate_detections, gather
-from bevcli.evaluation.matching import DetectionConfig, descending_scores, match_greedily
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import DetectionConfig, descending_scores, match_greedily
 from bevcli.geometry.transforms import rigid, rotation_about_z
+from bevcli.workshop.scores.detection import DetectionScores, evaluate_detections, gather
 
 
 def cars(x: list[float], scores: list[float] | None = None, class_name: str = "car") -> Boxes3D:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.evaluate import evaluate
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import DetectionConfig
+from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.evaluate import evaluate
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "detection_metrics.json").read_text())
 TOLERANCE = 1e-9  # docs/scoring.md and README.md state it

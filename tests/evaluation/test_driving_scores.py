@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, apply, rigid
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines
+from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.vad.driving_metrics import PlannedFrame, evaluate_lines, evaluate_plans
 from bevcli.workshop.vad.plan import Plan, PlanWriter
 

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import evaluate
-from bevcli.evaluation.inputs import open_ground_truth, open_predictions, pair_frames, without_cycles_in_racks
 from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, read_boxes
 from bevcli.sequences.files.map_folder import write_map
+from bevcli.workshop.scores.evaluate import evaluate
+from bevcli.workshop.scores.inputs import open_ground_truth, open_predictions, pair_frames, without_cycles_in_racks
 
 
 def write_frames(path: Path, frames: list[Boxes3D], reference: str = "ego", pose: Pose | None = None) -> Path:

@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 from bevcli.cli.bridge import as_flags
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.workshop.formats.kitti import kitti_labels, write_kitti
 
 # Camera axes in the ego frame, as columns: x right, y down, z forward.

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.runs.state import load_state, save_state
 from bevcli.workshop.batch.report import DriveMatches, score_jointly
+from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation
 
 CONFIG = DetectionConfig().cut_at(25)
 

@@ -10,13 +10,13 @@ import pytest
 from random_boxes import as_predictions, random_truth
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.inputs import FramePairs, pair_frames
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, inverse, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.inputs import FramePairs, pair_frames
 
 TRUTH = random_truth(11, frames=4)
 PREDICTIONS = as_predictions(TRUTH, 12, noise_m=0.5, false_per_frame=10)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bevcli.evaluation.evaluate import evaluate_segmentation
 from bevcli.frame import BevMap
+from bevcli.workshop.scores.evaluate import evaluate_segmentation
 
 RANGES = ((-2.0, 2.0), (-2.0, 2.0))
 

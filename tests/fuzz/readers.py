@@ -158,13 +158,13 @@ def _classes(folder: Path) -> None:
 
 
 def _predictions(folder: Path) -> None:
-    from bevcli.evaluation.evaluate import evaluate
+    from bevcli.workshop.scores.evaluate import evaluate
 
     evaluate(folder / "predictions.json", folder / "drive/ground_truth.json")
 
 
 def _submission(folder: Path) -> None:
-    from bevcli.evaluation.inputs import open_predictions
+    from bevcli.workshop.scores.inputs import open_predictions
 
     open_predictions(folder / "results_nusc.json")
 

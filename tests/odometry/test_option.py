@@ -14,7 +14,6 @@ from true_motion import STREET, motion_of, street_copy
 
 import bevcli
 from bevcli.errors import InputError
-from bevcli.evaluation.inputs import pair_frames
 from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.options import InputOptions
@@ -22,6 +21,7 @@ from bevcli.workshop.batch.job import Job
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredDrive
 from bevcli.workshop.odometry.run_option import MOST_RATE_HZ, at_most_rate, with_measured_motion
+from bevcli.workshop.scores.inputs import pair_frames
 
 FRAMES = 4
 

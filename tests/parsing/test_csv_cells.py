@@ -7,11 +7,11 @@ import pytest
 from memory_drive import MemoryDrive, make_rig
 from recorded_drive import boxes_ahead
 
-from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.output import NativeWriter
 

@@ -11,18 +11,18 @@ from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.errors import InputError
-from bevcli.evaluation.submission import write_submission
 from bevcli.frame import BevMap, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid
 from bevcli.recording import entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.record import names_of, record
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
+from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
 from bevcli.viewer.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.scores.record import names_of, record
 
 CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS

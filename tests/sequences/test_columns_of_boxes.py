@@ -17,8 +17,8 @@ spec.loader.exec_module(module)
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
-from bevcli.evaluation.box_format import write_csv
-from bevcli.evaluation.detection import with_all_columns
+from bevcli.sequences.files.boxes_table import write_csv
+from bevcli.workshop.scores.detection import with_all_columns
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.viewer.recording_reader import read_recording

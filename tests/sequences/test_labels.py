@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import write_csv
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
+from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
 from bevcli.workshop.formats.labels import WithLabels, _labelled_frames, read_labels

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import Ground
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines
+from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.vad.plan import Plan, PlanWriter
 
 TIMES = 0.5 * np.arange(1, 7)

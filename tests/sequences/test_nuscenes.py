@@ -11,14 +11,14 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import evaluate
-from bevcli.evaluation.inputs import open_ground_truth
 from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
 from bevcli.sequences.nuscenes import NuScenesOptions, tables
 from bevcli.sequences.nuscenes.index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.sequence import NuScenesDrive, read_can_bus
 from bevcli.sequences.nuscenes.tables import build_index
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.scores.evaluate import evaluate
+from bevcli.workshop.scores.inputs import open_ground_truth
 
 SMALL = Size(scenes=3, samples=4, objects=8)
 

@@ -19,7 +19,6 @@ from written_formats import RING, WRITTEN
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import evaluate
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Distortion
@@ -32,6 +31,7 @@ from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.labels import with_track_velocities
+from bevcli.workshop.scores.evaluate import evaluate
 
 FORMATS: dict[str, Format] = {name: load("bevcli.sequences", name) for name in WRITTEN}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}

@@ -18,16 +18,16 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from bevcli.config import as_toml
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.transforms import Array
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.open import select
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition
+from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.training.job import rig_for_drives
 from bevcli.workshop.training.validation import boxes_ego

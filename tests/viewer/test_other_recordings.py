@@ -11,8 +11,8 @@ from recorded_drive import record
 from rerun.chunk import LazyChunkStream, RrdReader
 
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import write_csv
 from bevcli.recording import entities
+from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.box_format import COLUMNS
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
+from bevcli.sequences.files.boxes_table import COLUMNS
 from bevcli.viewer import video
 from bevcli.viewer.video import write_video
 

@@ -19,9 +19,9 @@ import bevcli
 from bevcli.cli import commands
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.submission import write_submission
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordingReader
 
 ROOT = Path(__file__).parents[2]

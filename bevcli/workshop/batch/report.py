@@ -18,11 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevcli._version import __version__
-from bevcli.evaluation.detection import ClassMatches, DetectionScores, with_all_columns
-from bevcli.evaluation.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
-from bevcli.evaluation.matching import ERRORS, DetectionConfig, ScoredBoxes
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import ERRORS, DetectionConfig, ScoredBoxes
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
@@ -31,6 +29,8 @@ from bevcli.printing import counted, duration
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.job import Record
 from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage
+from bevcli.workshop.scores.detection import ClassMatches, DetectionScores, with_all_columns
+from bevcli.workshop.scores.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"

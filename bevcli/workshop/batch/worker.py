@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from bevcli.errors import BevcliError
-from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
@@ -40,6 +39,7 @@ from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage
 from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
+from bevcli.workshop.scores.evaluate import Scores, evaluate
 from bevcli.workshop.trust.estimate import estimate_of_run, fits
 
 _SCRATCH = "bevcli-batch-"

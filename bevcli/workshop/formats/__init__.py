@@ -108,6 +108,31 @@ class WriteOptions:
     )
 
 
+@options()
+class ExportOptions:
+    """The format of exported boxes and what it needs."""
+
+    form: str = option(
+        help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. Or the format of an installed package.",
+        flag="--format",
+        metavar="NAME",
+        complete=lambda incomplete: list(entries("bevcli.box_formats")),
+    )
+    out: Path | None = option(
+        default=None, help="Default: a name that depends on the format, such as boxes.csv, next to PREDICTIONS."
+    )
+    score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
+    calibration: Path | None = option(
+        reads="path",
+        default=None,
+        help="kitti: calibration.json, or the sequence folder that contains it. Default: the one next to PREDICTIONS.",
+    )
+    camera: str | None = option(
+        default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."
+    )
+
+
 def is_packed_bag(path: Path) -> bool:
     """True for the name of a compressed bag, such as drive.mcap.zst."""
     return path.suffix in PACKED and path.with_suffix("").suffix in BAG_SUFFIXES

@@ -1,18 +1,18 @@
-"""`bevcli convert`: writes any input as a drive of another format."""
+"""`bevcli convert` and `export`: write drives and boxes in other formats."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
+from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument, print_note
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats import LabelOptions, WriteOptions
+from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame
 
-PANEL = "Start"
+PANEL = {"convert": "Start", "export": "Score"}
 CONVERTED = ("strict", "scene", "ground_truth", "allow_outside", "class_map", "odometry")
 
 
@@ -46,3 +46,21 @@ def convert(
     for note in converted.notes:
         say(f"note: {note}", err=True)
     say(str(converted))
+
+
+def export(
+    predictions: Annotated[
+        Path,
+        argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
+    ],
+    options: ExportOptions,
+) -> None:
+    """Write boxes as a table, a boxes file, KITTI labels, or a nuScenes submission.
+
+    KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
+    those above the score of the run.
+    """
+    from bevcli.workshop.formats.export import export
+
+    target, what = export(predictions, options, report=print_note)
+    say(f"{target}: {what}")

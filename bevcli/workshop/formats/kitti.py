@@ -13,8 +13,6 @@ import msgspec
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation import ExportOptions
-from bevcli.evaluation.box_format import BoxFormat
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
@@ -23,7 +21,8 @@ from bevcli.parsing.files import MIB, read_bytes, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
-from bevcli.workshop.formats import LabelOptions
+from bevcli.workshop.formats import ExportOptions, LabelOptions
+from bevcli.workshop.formats.export import BoxFormat
 from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels, Moment
 from bevcli.workshop.formats.markup import parse_xml
 from bevcli.writing import write_whole

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
-from bevcli.evaluation import MAX_RANGE_HELP
 from bevcli.options import option, options
+from bevcli.workshop.scores.options import MAX_RANGE_HELP
 
 LostImage = Literal["black", "missing"]
 SeverityChoice = Literal["easy", "mid", "hard", "all"]

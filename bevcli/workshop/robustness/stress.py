@@ -11,11 +11,9 @@ from typing import Any, Self
 import msgspec
 
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.detection import evaluate_detections, known_mean
-from bevcli.evaluation.evaluate import finite
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
@@ -27,6 +25,8 @@ from bevcli.sequences.open import scenes_of, select
 from bevcli.workshop.calibration.calibrate import DriveWithRig, calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
+from bevcli.workshop.scores.detection import evaluate_detections, known_mean
+from bevcli.workshop.scores.evaluate import finite
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
 from bevcli.writing import write_whole
 

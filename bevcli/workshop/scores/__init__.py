@@ -1,32 +1,10 @@
-"""The nuScenes devkit's scores of tracks, comparison of two models, worst frames, and plots of detection scores."""
+"""Scores of predictions: the nuScenes metrics of boxes and tracks, IoU of BEV maps, comparison of two models, plots.
 
-from bevcli.evaluation import Scorer
-from bevcli.options import option, options
-
-
-@options()
-class TrackingScoreOptions:
-    """Whether tracks are scored."""
-
-    tracking: bool = option(
-        default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
-    )
-
-
-SCORER = Scorer(TrackingScoreOptions, "bevcli.workshop.scores.tracking:score_tracks")
-
-
-@options()
-class WorstOptions:
-    """Whether the worst frames are listed."""
-
-    worst: int | None = option(
-        default=None,
-        help="List the N frames with most missed and most invented boxes. Default: none for one file of predictions, "
-        "3 for two.",
-        metavar="N",
-        minimum=1,
-    )
-
-
-WORST = Scorer(WorstOptions, "bevcli.workshop.scores.worst_frames:score_worst_frames")
+evaluate            the entry point: reads predictions and ground truth, scores them; dict for JSON, and tables
+inputs              predictions and ground truth from files, folders or a nuScenes root, and pairs of their frames
+detection           boxes of many frames -> AP, mAP, true-positive errors, NDS; reads no files
+tracking            boxes with identities -> AMOTA and what comes with it; `association` matches them
+compare             two models on the same frames; `bootstrap` draws frames for the intervals
+worst_frames        the frames with most missed and most invented boxes
+record              a drive with its labels, and boxes of models, as a recording
+"""

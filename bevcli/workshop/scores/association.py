@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection import gather
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.scores.detection import gather
 
 Indices = NDArray[np.int64]
 

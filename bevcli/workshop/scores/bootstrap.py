@@ -1,7 +1,7 @@
 """Bootstrap of frames: the scores of frames drawn with replacement, from matches that are computed once.
 
-A resample has the scores of a data set with its frames, by the formulas of `bevcli.evaluation.detection`: a frame that
-is drawn twice counts twice. The loops are compiled, because each of thousands of resamples has all predictions.
+A resample has the scores of a data set with its frames, by the formulas of `detection`: a frame that is drawn
+twice counts twice. The loops are compiled, because each of thousands of resamples has all predictions.
 """
 
 from collections.abc import Iterator
@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.evaluation.detection import (
+from bevcli.jit import njit
+from bevcli.workshop.scores.detection import (
     RECALLS,
     ClassMatches,
     ClassScores,
@@ -17,7 +18,6 @@ from bevcli.evaluation.detection import (
     ScoreTable,
     true_positive_errors,
 )
-from bevcli.jit import njit
 
 SEED = 0
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import ConfigError, InputError
-from bevcli.evaluation.detection import ScoreTable
-from bevcli.evaluation.evaluate import Scores, finite, number, read, score
-from bevcli.evaluation.inputs import Compared
-from bevcli.printing import aligned, counted
-from bevcli.registry import load
+from bevcli.printing import aligned, counted, number
 from bevcli.workshop.scores.bootstrap import draw_frames, resampled
+from bevcli.workshop.scores.detection import ScoreTable
+from bevcli.workshop.scores.evaluate import Scores, finite, read, score
+from bevcli.workshop.scores.inputs import Compared
+from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.worst_frames import MODELS, WorstFrames, find_worst_frames
 
 CONFIDENCE = 0.95
@@ -110,8 +110,9 @@ class Comparison:
 
         Returns its path, in a list.
         """
-        paths: list[Path] = load("bevcli.plots", "comparison")(self, Path(folder))
-        return paths
+        from bevcli.workshop.scores.plots import write_comparison
+
+        return write_comparison(self, Path(folder))
 
 
 def _row(name: str, boxes: str, each: Difference) -> tuple[str, ...]:
@@ -158,8 +159,8 @@ def compare(
         InputError: as there, or the two have no frame or class in common.
         ConfigError: max_range or resamples is not positive.
     """
-    worst = results.pop("worst", None)
-    if further := [name for name, value in results.items() if value]:
+    options = ResultOptions(**results)  # type: ignore[arg-type]
+    if further := [name for name, value in vars(options).items() if value and name != "worst"]:
         raise InputError(
             f"`{further[0]}=True`: two files of predictions are compared by their boxes only: leave it out"
         )
@@ -180,7 +181,7 @@ def compare(
         {name: differences[name] for name in scores[0].detection.overall.classes},
         differences["mAP"],
         differences["NDS"],
-        find_worst_frames(models, worst or WORST),
+        find_worst_frames(models, options.worst or WORST),
         resamples,
         (*notes, *_joined_notes(scores)),
     )

@@ -14,13 +14,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
-from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
-from bevcli.evaluation.evaluate import Scores
-from bevcli.evaluation.inputs import FramePairs
-from bevcli.evaluation.matching import ERRORS, ScoredBoxes
+from bevcli.geometry.matching import ERRORS, ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted
 from bevcli.workshop.scores.compare import Comparison
+from bevcli.workshop.scores.detection import RECALLS, ClassScores, DetectionScores
+from bevcli.workshop.scores.evaluate import Scores
+from bevcli.workshop.scores.inputs import FramePairs
 from bevcli.workshop.scores.worst_frames import MODELS, Outcome, best_outcome
 from bevcli.writing import whole_file
 

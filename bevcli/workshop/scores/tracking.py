@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import number
-from bevcli.evaluation.inputs import Compared
-from bevcli.evaluation.matching import ClassRanges, ranges_m
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import ClassRanges, ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
-from bevcli.printing import aligned
+from bevcli.printing import aligned, number
 from bevcli.workshop.scores.association import MATCH, MISS, SWITCH, TrackedBoxes, associate, near_pairs, scored_tracks
+from bevcli.workshop.scores.inputs import Compared
 
 
 @dataclass(frozen=True)
@@ -261,8 +260,8 @@ class TrackingScores:
         )
 
 
-def score_tracks(_: object, compared: Compared) -> TrackingScores:
-    """The scores of the tracks: the function of a `Scorer`. Raises InputError as `evaluate_tracking`."""
+def score_tracks(compared: Compared) -> TrackingScores:
+    """The scores of the tracks. Raises InputError as `evaluate_tracking`."""
     pairs = compared.pairs
     config = TrackingConfig.of(compared.classes)
     config = config.for_frames(compared.max_range_m, ego_pose_known=pairs.ego_pose_known)

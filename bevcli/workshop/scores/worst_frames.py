@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.evaluation.detection import ClassMatches
-from bevcli.evaluation.inputs import Compared
-from bevcli.evaluation.matching import ScoredBoxes
+from bevcli.geometry.matching import ScoredBoxes
 from bevcli.printing import aligned
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.format import is_drive
 from bevcli.sequences.nuscenes import is_nuscenes_root
-from bevcli.workshop.scores import WorstOptions
+from bevcli.workshop.scores.detection import ClassMatches
+from bevcli.workshop.scores.inputs import Compared
 
 MODELS = ("A", "B")
 
@@ -193,9 +192,3 @@ def _scene_starts(model: Compared) -> dict[str, int]:
         for frame in truth.boxes.frames:
             starts.setdefault(frame.stamp.scene, frame.stamp.index)
     return starts
-
-
-def score_worst_frames(options: WorstOptions, compared: Compared) -> WorstFrames:
-    """The worst frames of one model, for `Scorer`."""
-    assert options.worst
-    return find_worst_frames([compared], options.worst)

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from bevcli.evaluation import MAX_RANGE_HELP
 from bevcli.inference.options import complete_model
 from bevcli.options import option, options, parse_pairs
+from bevcli.workshop.scores.options import MAX_RANGE_HELP
 
 Log = Literal["tensorboard"]
 Preset = Literal["quick", "demo", "tiny", "base"]

@@ -18,12 +18,9 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.evaluate import FrameScores, evaluate_segmentation, finite, score_results
-from bevcli.evaluation.inputs import Compared, FramePairs
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import MAP_CLASSES, Drive, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
@@ -32,6 +29,10 @@ from bevcli.parsing.files import MIB, read_text
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes, count_classes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import scenes_of
+from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation, finite
+from bevcli.workshop.scores.inputs import Compared, FramePairs
+from bevcli.workshop.scores.tracking import score_tracks
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig
@@ -238,7 +239,7 @@ def validate(
     return Validation(
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
-        score_results({"tracking": True}, Compared(_pairs(tracks), classes, range_m)) if tracked else {},
+        score_tracks(Compared(_pairs(tracks), classes, range_m)) if tracked else None,
         drives=tuple(of_drives),
     )
 

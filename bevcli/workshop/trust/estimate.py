@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from bevcli.config import settings_of_table
-from bevcli.evaluation.evaluate import finite, number
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.inference.load import Model
 from bevcli.parsing.documents import parse_toml
-from bevcli.printing import aligned
+from bevcli.printing import aligned, number
 from bevcli.sequences.files.boxes_file import FrameBoxes, read_boxes
+from bevcli.workshop.scores.evaluate import finite
 from bevcli.workshop.trust.faults import find_faults, frame_boxes
 from bevcli.workshop.trust.figures import Figures, figures_of, scores_of, within
 from bevcli.workshop.trust.fit import Fit

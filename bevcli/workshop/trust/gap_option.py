@@ -15,7 +15,6 @@ import numpy as np
 from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import finite
 from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import load_model
@@ -24,6 +23,7 @@ from bevcli.printing import aligned, counted
 from bevcli.rig.check_calibration import CalibrationCheck, check_calibration
 from bevcli.rig.rig_report import WIDTH
 from bevcli.workshop.scores.compare import Difference
+from bevcli.workshop.scores.evaluate import finite
 from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.trust.rig_differences import (
     Kind,

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.detection import DetectionScores, evaluate_detections
-from bevcli.evaluation.matching import DetectionConfig
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.load import Model
@@ -30,6 +29,7 @@ from bevcli.rig.rig_checks import side_of
 from bevcli.runs.state import digest, load_state, save_state
 from bevcli.workshop.scores.bootstrap import draw_frames, resampled
 from bevcli.workshop.scores.compare import Difference
+from bevcli.workshop.scores.detection import DetectionScores, evaluate_detections
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.corruptions import low_light
 from bevcli.workshop.synth.drive import FIRST_TIMESTAMP_NS, RenderedDrive

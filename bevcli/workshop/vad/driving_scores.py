@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.evaluate import number
-from bevcli.evaluation.inputs import Compared, FramePairs, ScoredInput
 from bevcli.frame import FrameStamp, Ground, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.printing import aligned, counted
+from bevcli.printing import aligned, counted, number
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes import is_nuscenes_root
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
-from bevcli.workshop.vad import DrivingScoreOptions, driving_metrics as metrics
+from bevcli.workshop.scores.inputs import Compared, FramePairs, ScoredInput
+from bevcli.workshop.scores.options import ResultOptions
+from bevcli.workshop.vad import driving_metrics as metrics
 from bevcli.workshop.vad.plan import Plan, read_plans
 
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
@@ -137,8 +137,8 @@ def _horizons(
     }
 
 
-def evaluate_driving(options: DrivingScoreOptions, compared: Compared) -> DrivingScores:
-    """Score what the options ask for: the function of a `Scorer`. Raises InputError where a side lacks it."""
+def evaluate_driving(options: ResultOptions, compared: Compared) -> DrivingScores:
+    """Score what the options ask for. Raises InputError where a side lacks it."""
     predicted, truth, pairs = compared.predictions, compared.truth, compared.pairs
     assert predicted is not None
     assert truth is not None

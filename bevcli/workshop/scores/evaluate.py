@@ -5,26 +5,28 @@ Scores become a dict for JSON, with the key names of the nuScenes devkit, and ta
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from pkgutil import resolve_name
-from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.evaluation import SCORES, inputs
-from bevcli.evaluation.detection import DetectionScores, ScoreTable, evaluate_detections
-from bevcli.evaluation.matching import ERRORS, DetectionConfig
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
+from bevcli.geometry.matching import ERRORS, DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
-from bevcli.options import defaults
-from bevcli.printing import aligned, counted
-from bevcli.registry import entries, load
+from bevcli.printing import aligned, counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
+from bevcli.workshop.scores import inputs
+from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
+from bevcli.workshop.scores.options import ResultOptions
+from bevcli.workshop.scores.tracking import TrackingScores, score_tracks
+from bevcli.workshop.scores.worst_frames import WorstFrames, find_worst_frames
+
+if TYPE_CHECKING:
+    from bevcli.workshop.vad.driving_scores import DrivingScores
 
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "
@@ -53,23 +55,6 @@ class SegmentationScores:
         return {name: self.intersection[name] / union if union else math.nan for name, union in self.union.items()}
 
 
-class ResultScores(Protocol):
-    """The scores of one kind of results."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was assumed or left out, one line each."""
-        ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """Further members of the JSON object of the scores."""
-        ...
-
-    def tables(self) -> Iterable[str]:
-        """Further tables for a terminal."""
-        ...
-
-
 @dataclass(frozen=True)
 class FrameScores:
     """The scores of the boxes, maps and further results of some frames.
@@ -77,26 +62,28 @@ class FrameScores:
     Attributes:
         detection: the scores of the boxes.
         segmentation: the scores of the maps; None where predictions or ground truth have none.
-        others: the scores of further results that were asked for, by the name of their scorer, such as "tracking". Each
-            is an attribute too: `scores.tracking`.
+        tracking: the scores of tracks.
+        vad: those of lines of the map, forecasts and planned paths.
+        worst: the frames with most missed and most invented boxes.
         notes: what was assumed or left out, one line each.
     """
 
     detection: DetectionScores
     segmentation: SegmentationScores | None = None
-    others: Mapping[str, ResultScores] = field(default_factory=dict)
+    tracking: TrackingScores | None = None
+    vad: "DrivingScores | None" = None
+    worst: WorstFrames | None = None
     notes: tuple[str, ...] = ()
 
-    def __getattr__(self, name: str) -> Any:
-        others = self.__dict__.get("others", {})
-        if name not in others:
-            raise AttributeError(f"these scores have no {name}")
-        return others[name]
+    @property
+    def others(self) -> "list[TrackingScores | DrivingScores | WorstFrames]":
+        """The scores of further results that were asked for."""
+        return [scores for scores in (self.tracking, self.vad, self.worst) if scores is not None]
 
     def to_dict(self) -> dict[str, Any]:
         """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
         content = _content(self)
-        for scores in self.others.values():
+        for scores in self.others:
             content |= scores.to_dict()
         return finite(content)
 
@@ -107,7 +94,7 @@ class FrameScores:
             parts.append(_visibilities(self.detection))
         if self.segmentation is not None:
             parts.append(_maps(self.segmentation))
-        for scores in self.others.values():
+        for scores in self.others:
             parts += scores.tables()
         return "\n\n".join(parts)
 
@@ -128,8 +115,9 @@ class Scores(FrameScores):
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
-        paths: list[Path] = load("bevcli.plots", "scores")(self, Path(folder))
-        return paths
+        from bevcli.workshop.scores.plots import write_plots
+
+        return write_plots(self, Path(folder))
 
 
 def evaluate(
@@ -168,12 +156,13 @@ def evaluate(
         InputError: a file is missing or wrong, the two have no frame in common, or one of them lacks what `results`
             asks for.
         ConfigError: max_range is not positive.
-        TypeError: `results` has an option that no scorer has.
+        TypeError: `results` has an unknown option.
     """
+    options = ResultOptions(**results)  # type: ignore[arg-type]
     compared = read(
         predictions, ground_truth, count_missing, scene=scene, version=version, split=split, class_map=class_map
     )
-    return score(replace(compared, max_range_m=max_range), results)
+    return score(replace(compared, max_range_m=max_range), options)
 
 
 def read(
@@ -196,8 +185,8 @@ def read(
     return inputs.Compared(pairs, classes, None, predicted, truth, selection=selection)
 
 
-def score(compared: inputs.Compared, results: Mapping[str, int | None] = MappingProxyType({})) -> Scores:
-    """Score what was read. results: those of `evaluate`, whose default range holds for a `max_range_m` of None."""
+def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -> Scores:
+    """Score what was read. The default range of `evaluate` holds for a `max_range_m` of None."""
     pairs, classes, max_range = compared.pairs, compared.classes, compared.max_range_m
     predicted, truth = compared.predictions, compared.truth
     assert predicted is not None
@@ -208,35 +197,26 @@ def score(compared: inputs.Compared, results: Mapping[str, int | None] = Mapping
     predicted_boxes, true_boxes = pairs.boxes
     detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(predicted, truth, pairs)
-    others = score_results(results, replace(compared, max_range_m=limit, detection=detection))
+    compared = replace(compared, max_range_m=limit, detection=detection)
+    tracking = score_tracks(compared) if results.tracking else None
+    vad = None
+    if results.map or results.motion or results.plan:
+        from bevcli.workshop.vad.driving_scores import evaluate_driving
+
+        vad = evaluate_driving(results, compared)
+    worst = find_worst_frames([compared], results.worst) if results.worst else None
+    scores = Scores(detection, segmentation, tracking, vad, worst, pairs=pairs)
     notes = (
         *pairs.notes,
         *map_notes,
         *_class_notes(predicted_boxes, true_boxes, classes),
         *_range_notes(max_range, model_range, pairs),
         *_detection_notes(detection),
-        *(note for scores in others.values() for note in scores.notes),
+        *(note for result in scores.others for note in result.notes),
     )
     if impossible := truth.impossible_boxes:
         notes = (*notes, f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}")
-    return Scores(detection, segmentation, others, notes, pairs=pairs)
-
-
-def score_results(values: Mapping[str, int | None], compared: inputs.Compared) -> dict[str, ResultScores]:
-    """The scores that options ask for, by the name of their scorer. Raises InputError as `Scorer` says.
-
-    values: by option.
-    """
-    scores, unknown = dict[str, ResultScores](), set(values)
-    for name in entries(SCORES) if values else ():
-        scorer = load(SCORES, name)
-        own = {option: values[option] for option in defaults(scorer.options) if option in values}
-        unknown -= own.keys()
-        if any(own.values()):
-            scores[name] = resolve_name(scorer.function)(scorer.options(**own), compared)
-    if unknown:
-        raise TypeError(f"evaluate() has no option `{unknown.pop()}`")
-    return scores
+    return replace(scores, notes=notes)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: inputs.FramePairs) -> Iterator[str]:
@@ -455,8 +435,3 @@ def _visibilities(detection: DetectionScores) -> str:
 def _maps(segmentation: SegmentationScores) -> str:
     rows = [("map class", "IoU"), *((name, number(iou)) for name, iou in segmentation.iou.items())]
     return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number for a table; "-" for NaN."""
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection import DetectionScores
-from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
@@ -17,12 +15,14 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, ClassNames, FrameBoxes, read_boxes
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
+from bevcli.sequences.files.submission import is_submission, read_submission
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.scores.detection import DetectionScores
 
 
 @dataclass(frozen=True)
@@ -348,7 +348,7 @@ def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:
 
 @dataclass(frozen=True)
 class Compared:
-    """Predictions and ground truth of the same frames, for a `Scorer`.
+    """Predictions and ground truth of the same frames.
 
     Attributes:
         pairs: the frames that are scored.

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.box_format import BoxFormat
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
-from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_from_json
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
@@ -166,9 +164,3 @@ def _yaw(rotation: Any, where: str) -> float:
     if not numbers or not abs(np.linalg.norm(rotation) - 1) < 1e-2:
         raise InputError(f"{where}: rotation: expected 4 numbers of norm 1 (w, x, y, z), found {rotation!r:.60}")
     return yaw_of_rotation(rotation_from_quaternion(rotation))
-
-
-DETECTION = BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples"))
-TRACKING = BoxFormat(
-    "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
-)

@@ -1,36 +1,18 @@
-"""BoxFormat: a format that boxes are exported in, registered under `bevcli.box_formats`; boxes files and CSV tables."""
+"""Tables of boxes: a CSV file with a row for each box."""
 
 import csv
 import io
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from bevcli.evaluation import ExportOptions
 from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS
 from bevcli.parsing.documents import cell_of
-from bevcli.printing import counted
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file
 
 COLUMNS = ("frame", "scene", "timestamp_ns", "frame_of_reference", *TABLE_COLUMNS)
 NAMES = ("scene", "class", *(column.key for column in OPTIONAL_COLUMNS.values() if column.values == "text"))
-
-
-@dataclass(frozen=True)
-class BoxFormat:
-    """A format that boxes are exported in.
-
-    Attributes:
-        target: name of the file or folder that is written next to the boxes by default.
-        write: writes boxes to a path with the options of the export, given the file that the boxes are from, and
-            returns what it wrote, such as "20 frames, 3 tracks". Raises InputError for boxes that the format cannot
-            hold, and OutputError.
-    """
-
-    target: str
-    write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
 
 
 class CsvWriter(GrowingFile):
@@ -69,7 +51,3 @@ def write_csv(boxes: BoxesFile, path: Path) -> int:
     """Write all boxes in their frame of reference; return their number. Raises OutputError."""
     with whole_file(path) as unfinished, CsvWriter(unfinished, name=path) as writer:
         return sum(writer.write(frame, boxes.frame_of_reference) for frame in boxes.frames)
-
-
-CSV = BoxFormat("boxes.csv", lambda boxes, target, *_: counted(write_csv(boxes, target), "boxes"))
-JSON = BoxFormat("boxes.json", lambda boxes, target, *_: counted(write_boxes(boxes, target), "boxes"))

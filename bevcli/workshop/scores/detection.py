@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.evaluation.matching import ERRORS, DetectionConfig, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
+from bevcli.geometry.matching import ERRORS, DetectionConfig, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.transforms import Array, wrap_angle
 
 RECALLS = np.linspace(0, 1, 101)

@@ -1,17 +1,35 @@
 """`export`: write the boxes of a run, a boxes file or a recording in another format."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bevcli.evaluation import ExportOptions
-from bevcli.evaluation.box_format import BoxFormat
 from bevcli.options import gather
+from bevcli.printing import counted
 from bevcli.registry import load_form
-from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes, write_boxes
+from bevcli.sequences.files.boxes_table import write_csv
+from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import read_recording
+from bevcli.workshop.formats import ExportOptions
 from bevcli.writing import check_output
+
+
+@dataclass(frozen=True)
+class BoxFormat:
+    """A format that boxes are exported in.
+
+    Attributes:
+        target: name of the file or folder that is written next to the boxes by default.
+        write: writes boxes to a path with the options of the export, given the file that the boxes are from, and
+            returns what it wrote, such as "20 frames, 3 tracks". Raises InputError for boxes that the format cannot
+            hold, and OutputError.
+    """
+
+    target: str
+    write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
 
 
 def export(
@@ -55,3 +73,11 @@ def _boxes_of(file: Path, report: Callable[[str], None]) -> BoxesFile:
         if whole != file:
             report(f"{file} is incomplete (its run was stopped or is still going)")
         return read_recording(whole)
+
+
+CSV = BoxFormat("boxes.csv", lambda boxes, target, *_: counted(write_csv(boxes, target), "boxes"))
+JSON = BoxFormat("boxes.json", lambda boxes, target, *_: counted(write_boxes(boxes, target), "boxes"))
+DETECTION = BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples"))
+TRACKING = BoxFormat(
+    "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
+)

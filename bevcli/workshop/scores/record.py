@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
-from bevcli.evaluation.matching import ranges_m
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.printing import counted
 from bevcli.recording.log_static import RecordedBoxes
@@ -18,6 +17,7 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, count_classes
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 
 MOST = 2  # models: each has a colour
 FAR_M = 150.0  # boxes that are all farther away are of another drive, or in another frame of reference

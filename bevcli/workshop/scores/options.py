@@ -1,0 +1,47 @@
+"""The options of `evaluate`."""
+
+from pathlib import Path
+
+from bevcli.options import option, options
+
+# Of every command that scores boxes.
+MAX_RANGE_HELP = (
+    "Score nothing beyond this distance from the ego vehicle, nor beyond nuScenes' range of the class. Default: where "
+    "the model's BEV grid ends."
+)
+
+
+@options()
+class EvaluationOptions:
+    """The options of `evaluate` for boxes and maps, and the folder of its plots."""
+
+    plot: Path | None = option(
+        default=None,
+        help="Write plots: precision and recall, errors by range, missed objects and false positives from above.",
+        metavar="DIR",
+    )
+    max_range: float | None = option(default=None, help=MAX_RANGE_HELP, metavar="METRES")
+    count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
+
+
+@options()
+class ResultOptions:
+    """Further results that are scored."""
+
+    tracking: bool = option(
+        default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
+    )
+    map: bool = option(default=False, help="Also score lines of the map: AP by Chamfer distance of 0.5, 1 and 1.5 m.")
+    motion: bool = option(default=False, help="Also score forecasts: EPA, minADE, minFDE and miss rate.")
+    plan: bool = option(
+        default=False,
+        help="Also score planned paths: distance to the driven path and collisions, up to 1, 2 and 3 s as VAD states "
+        "them, and at 1, 2 and 3 s as UniAD does.",
+    )
+    worst: int | None = option(
+        default=None,
+        help="List the N frames with most missed and most invented boxes. Default: none for one file of predictions, "
+        "3 for two.",
+        metavar="N",
+        minimum=1,
+    )
