@@ -112,7 +112,8 @@ class Comparison:
         """
         from bevcli.workshop.scores.plots import write_comparison
 
-        return write_comparison(self, Path(folder))
+        tables = [scores.detection.overall for scores in self.scores]
+        return write_comparison(tables, self.files, Path(folder))
 
 
 def _row(name: str, boxes: str, each: Difference) -> tuple[str, ...]:

@@ -117,7 +117,7 @@ class Scores(FrameScores):
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
         from bevcli.workshop.scores.plots import write_plots
 
-        return write_plots(self, Path(folder))
+        return write_plots(self.detection, self.pairs, Path(folder))
 
 
 def evaluate(

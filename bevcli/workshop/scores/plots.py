@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.matching import ERRORS, ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted
-from bevcli.workshop.scores.compare import Comparison
-from bevcli.workshop.scores.detection import RECALLS, ClassScores, DetectionScores
-from bevcli.workshop.scores.evaluate import Scores
+from bevcli.workshop.scores.detection import RECALLS, ClassScores, DetectionScores, ScoreTable
 from bevcli.workshop.scores.inputs import FramePairs
 from bevcli.workshop.scores.worst_frames import MODELS, Outcome, best_outcome
 from bevcli.writing import whole_file
@@ -41,19 +39,19 @@ _ERROR_TITLES = {
 }
 
 
-def write_plots(scores: Scores, folder: Path) -> list[Path]:
+def write_plots(detection: DetectionScores, pairs: FramePairs, folder: Path) -> list[Path]:
     """Write the plots of scores as PNG files into a folder; return their paths. Raises OutputError."""
     figures = {
-        "precision_recall.png": draw_precision_recall(scores.detection),
-        "errors_by_range.png": draw_errors_by_range(scores.detection),
-        "misses_and_false_alarms.png": draw_bev_sheet(scores.detection, scores.pairs),
+        "precision_recall.png": draw_precision_recall(detection),
+        "errors_by_range.png": draw_errors_by_range(detection),
+        "misses_and_false_alarms.png": draw_bev_sheet(detection, pairs),
     }
     return save_figures(figures, folder)
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:
+def write_comparison(tables: Sequence[ScoreTable], files: Sequence[Path], folder: Path) -> list[Path]:
     """Write the curves of two models as a PNG file into a folder; return its path. Raises OutputError."""
-    return save_figures({"precision_recall_of_both.png": draw_both(comparison)}, folder)
+    return save_figures({"precision_recall_of_both.png": draw_both(tables, files)}, folder)
 
 
 def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -> Figure:
@@ -94,10 +92,9 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
     return figure
 
 
-def draw_both(comparison: Comparison) -> Figure:
+def draw_both(tables: Sequence[ScoreTable], files: Sequence[Path]) -> Figure:
     """One panel for each class with ground truth, with the curves of A in blue and of B in orange."""
-    tables = [scores.detection.overall for scores in comparison.scores]
-    rows = zip(MODELS, tables, comparison.files, strict=True)
+    rows = zip(MODELS, tables, files, strict=True)
     subtitle = "      ".join(f"{model}: mAP {table.mean_ap:.3f}, {str(file)[-60:]}" for model, table, file in rows)
     figure = titled_figure((15, 7), "Precision and recall of two models by class", subtitle)
     counts = {name: scores.ground_truth_count for name, scores in tables[0].classes.items()}
@@ -107,7 +104,7 @@ def draw_both(comparison: Comparison) -> Figure:
         axes.set_title(name, fontsize=11, loc="left")
         for table, colors in zip(tables, (BLUES, ORANGES), strict=True):
             _draw_curves(axes, table.classes[name], colors)
-        of_a, of_b = comparison.classes[name].values
+        of_a, of_b = (table.classes[name].mean_ap for table in tables)
         _draw_remark(axes, f"{counted(counts[name], 'boxes')}, AP: A {of_a:.2f}, B {of_b:.2f}")
     lines, distances = panels[0, 0].get_legend_handles_labels()
     half = len(lines) // 2
