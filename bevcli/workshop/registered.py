@@ -31,8 +31,8 @@ OWN: dict[Group, dict[str, str]] = {
         "files": "bevcli.workshop.formats.poses:read_poses",
     },
     "bevcli.motion": {
-        "drive": "bevcli.workshop.odometry.run_option:with_measured_motion",
-        "live": "bevcli.workshop.odometry.live:LiveMotion",
+        "drive": "bevcli.workshop.odometry.drives:with_measured_motion",
+        "live": "bevcli.workshop.odometry.measure:LiveMotion",
     },
     "bevcli.drive_writers": {
         "mcap": "bevcli.workshop.formats.mcap_writer:OUTPUT",

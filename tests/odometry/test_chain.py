@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevcli.workshop.odometry.chain import Chain, leaps
+from bevcli.workshop.odometry.measure import Chain, leaps
 from bevcli.workshop.odometry.steps import Candidate
 
 

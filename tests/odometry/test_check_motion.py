@@ -16,9 +16,15 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.workshop.calibration import calibrate
 from bevcli.workshop.calibration.core_options import check_motion as check
-from bevcli.workshop.odometry import check_motion
-from bevcli.workshop.odometry.check_motion import chosen_places, stated_motion_findings, without_consequences
-from bevcli.workshop.odometry.compare import compare
+from bevcli.workshop.odometry import compare as comparing
+from bevcli.workshop.odometry.compare import (
+    SomeFrames,
+    chosen_frames,
+    compare,
+    stated_motion_findings,
+    without_consequences,
+)
+from bevcli.workshop.odometry.measure import measure_motion
 
 STREET = Path(__file__).parents[2] / "samples/street"
 OFF = Finding("calibration-off", "warning", "CAM_FRONT", "does not fit how the vehicle moves")
@@ -48,7 +54,7 @@ def shown(monkeypatch):
             drive.load(place)
         return SHOWN
 
-    monkeypatch.setattr(check_motion, "measure_motion", measure)
+    monkeypatch.setattr(comparing, "measure_motion", measure)
 
 
 @pytest.mark.parametrize("in_table", [True, False])
@@ -78,7 +84,7 @@ def test_frames_are_chosen_where_the_poses_turn():
     drive = MadeDrive(stated())
     times = drive.ego_motion.timestamps_ns
     drive.stamps = tuple(FrameStamp(place, "", int(time)) for place, time in enumerate(times[::10]))  # 5 Hz
-    places = chosen_places(drive)
+    places = chosen_frames(drive)
     assert len(places) == 9
     assert set(np.diff(places)) == {2}  # 0.4 s
     yaws = np.unwrap(2 * np.arctan2(drive.ego_motion.quaternions[:, 3], drive.ego_motion.quaternions[:, 0]))[::10]
@@ -87,16 +93,16 @@ def test_frames_are_chosen_where_the_poses_turn():
 
 
 def test_a_short_drive_and_the_longest_scene_are_taken():
-    assert chosen_places(MemoryDrive(4)) == [0, 1, 2, 3]
-    assert chosen_places(MemoryDrive(6, scenes="aabbbb")) == [2, 3, 4, 5]
-    assert chosen_places(MemoryDrive(0)) == []
+    assert chosen_frames(MemoryDrive(4)) == [0, 1, 2, 3]
+    assert chosen_frames(MemoryDrive(6, scenes="aabbbb")) == [2, 3, 4, 5]
+    assert chosen_frames(MemoryDrive(0)) == []
 
 
 def test_what_cannot_be_measured_is_said(monkeypatch):
     def refuse(drive):
         raise InputError("memory: has one frame")
 
-    monkeypatch.setattr(check_motion, "measure_motion", refuse)
+    monkeypatch.setattr(comparing, "measure_motion", refuse)
     (finding,) = stated_motion_findings(MemoryDrive(1))
     assert (finding.code, finding.severity) == ("motion-not-compared", "info")
     assert "memory: has one frame" in finding.message
@@ -109,7 +115,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch):
 def street():
     """The sample drive, and what its images show."""
     drive = bevcli.open_sequence(STREET, ground_truth=False)
-    return drive, check_motion.measure_motion(check_motion.SomeFrames(drive, chosen_places(drive)))
+    return drive, measure_motion(SomeFrames(drive, chosen_frames(drive)))
 
 
 @pytest.mark.slow

@@ -17,14 +17,12 @@ def measuring(monkeypatch):
     """A measurement that loads the frames of a drive, and gives the true motion."""
     true = motion_of(bevcli.open_sequence(STREET, frames=slice(0, FRAMES), ground_truth=False), guessed=(1,))
 
-    def measured(drive, options=None, after_step=lambda: None):
-        for place in range(len(drive.stamps)):
-            drive.load(place)
-        for _ in true.steps:
-            after_step()
-        return true
+    def measured(drive, options=None):
+        for index in range(len(drive.stamps)):
+            drive.load(index)
+        yield from true.steps
 
-    monkeypatch.setattr(measure, "measure_motion", measured)
+    monkeypatch.setattr(measure, "measure_steps", measured)
 
 
 def test_a_drive_without_poses_gets_four_files_and_a_table(tmp_path, measuring):

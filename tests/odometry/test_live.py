@@ -17,7 +17,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import FeatureWindow, FrameFeatures
-from bevcli.workshop.odometry import live
+from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredStep
 
 COUNT = 5
@@ -48,7 +48,7 @@ class Meter:
 
 @pytest.fixture
 def session(mini_model, monkeypatch):
-    monkeypatch.setattr(live, "MotionMeter", Meter)
+    monkeypatch.setattr(measure, "MotionMeter", Meter)
     return bevcli.Session(bevcli.Model(mini_model), MemoryDrive(1).rig)
 
 

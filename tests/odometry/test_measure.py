@@ -11,7 +11,8 @@ from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion, MeasuredStep, MotionMeter, measure_motion
+from bevcli.workshop.odometry.drives import MeasuredDrive
+from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, MotionMeter, measure_motion
 
 STREET = "samples/street"
 

@@ -6,7 +6,7 @@ from scipy.linalg import expm, logm
 
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep
-from bevcli.workshop.odometry.unknowns import exponential, logarithm
+from bevcli.workshop.odometry.step_views import exponential, logarithm
 
 SECOND = 1_000_000_000
 

@@ -10,7 +10,7 @@ import pytest
 
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.odometry.measure import measure_motion
+from bevcli.workshop.odometry.measure import measure_steps
 
 STREET = Path(__file__).parents[2] / "samples/street"
 STEPS, STEP_NS = 300, 500_000_000
@@ -42,9 +42,6 @@ class ToAndFro(DerivedDrive):
 @pytest.mark.timeout(3600)
 def test_memory_stays_flat_over_many_steps() -> None:
     drive = ToAndFro(open_sequence(STREET, ground_truth=False), 6, STEPS + 1)
-    peaks: list[float] = []
-    motion = measure_motion(
-        drive, after_step=lambda: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    )
-    assert len(motion.steps) == STEPS
+    peaks = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 for _ in measure_steps(drive)]
+    assert len(peaks) == STEPS
     assert peaks[-1] - peaks[STEPS // 3] < GROWS_MIB

@@ -18,9 +18,8 @@ from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch.job import Job
-from bevcli.workshop.odometry import measure
-from bevcli.workshop.odometry.measure import MeasuredDrive
-from bevcli.workshop.odometry.run_option import MOST_RATE_HZ, at_most_rate, with_measured_motion
+from bevcli.workshop.odometry import drives
+from bevcli.workshop.odometry.drives import MOST_RATE_HZ, MeasuredDrive, at_most_rate, with_measured_motion
 from bevcli.workshop.scores.inputs import pair_frames
 
 FRAMES = 4
@@ -42,16 +41,13 @@ def measuring(monkeypatch, true_motion):
     """Drives that were measured. A measurement gives the true motion."""
     seen = []
 
-    def measured(drive, options=None, after_step=lambda: None):
+    def measured(drive):
         seen.append(drive)
-        for _ in drive.stamps[1:]:
-            after_step()
-        places = np.searchsorted(true_motion.timestamps_ns, [stamp.timestamp_ns for stamp in drive.stamps])
-        poses = true_motion.poses[places]
-        steps = [replace(true_motion.steps[0], ego_a_from_ego_b=inverse(a) @ b) for a, b in pairwise(poses)]
-        return replace(true_motion, timestamps_ns=true_motion.timestamps_ns[places], steps=tuple(steps))
+        indices = np.searchsorted(true_motion.timestamps_ns, [stamp.timestamp_ns for stamp in drive.stamps])
+        for a, b in pairwise(true_motion.poses[indices]):
+            yield replace(true_motion.steps[0], ego_a_from_ego_b=inverse(a) @ b)
 
-    monkeypatch.setattr(measure, "measure_motion", measured)
+    monkeypatch.setattr(drives, "measure_steps", measured)
     return seen
 
 
@@ -103,7 +99,7 @@ def test_a_fast_drive_is_thinned(folder):
 
 def test_scenes_have_motions_of_their_own(monkeypatch):
     drive = MemoryDrive(5, scenes="aabbb")
-    monkeypatch.setattr(measure, "measure_motion", lambda scene, after_step: motion_of(scene))
+    monkeypatch.setattr(drives, "measure_steps", lambda scene: iter(motion_of(scene).steps))
     found = with_measured_motion(drive, drive)
     assert found.has_ego_motion
     assert len(found.notes) == 2

@@ -12,7 +12,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
 from bevcli.workshop.odometry.picture import GroundView, WatchedDrive, ground_cells, stitched, write_picture
 from bevcli.workshop.odometry.recording import write_recording
-from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
+from bevcli.workshop.odometry.steps import SeenPoints, seen_points
 
 SQUARE_M = 3.0
 

@@ -5,7 +5,7 @@ import pytest
 
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
-from bevcli.workshop.odometry.point_votes import CHANCE, point_votes, stands, under_the_road, ways_of_points
+from bevcli.workshop.odometry.votes import CHANCE, point_votes, stands, under_the_road, ways_of_points
 
 HEIGHT_M, FOCAL = 1.5, 1000.0
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])  # ego_from_camera

@@ -12,9 +12,11 @@ from bevcli.frame import CameraImage, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid, rotation_about_z
-from bevcli.workshop.odometry.above import CELL_M, SHAPE, RoadPicture, distance_votes, road_flow
+from bevcli.workshop.odometry.flow import road_flow
 from bevcli.workshop.odometry.measure import MeasuredStep, MotionMeter
-from bevcli.workshop.odometry.unknowns import motion_of, next_slopes
+from bevcli.workshop.odometry.step_views import motion_of, next_slopes
+from bevcli.workshop.odometry.views import CELL_M, SHAPE, RoadPicture
+from bevcli.workshop.odometry.votes import distance_votes
 
 TEXEL_M = 0.06
 WALLS_M = 7.0  # to both sides

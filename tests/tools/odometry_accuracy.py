@@ -23,7 +23,8 @@ from bevcli.inference.load import load_model
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion, measure_motion
+from bevcli.workshop.odometry.drives import MeasuredDrive
+from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
 from bevcli.workshop.training.options import ValidationOptions
 from bevcli.workshop.training.train import score_drives
 

@@ -17,7 +17,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
-from bevcli.workshop.odometry import check_motion, frames
+from bevcli.workshop.odometry import compare, views
 from bevcli.workshop.robustness.conditions import choose_conditions
 
 
@@ -269,8 +269,8 @@ def without_repetition() -> None:
         rig = [(one.intrinsics.tolist(), one.ego_from_camera.tolist()) for one in drive.rig.cameras]
         return hashlib.sha256(pixels + repr(rig).encode()).digest()
 
-    frames.features = once(frames.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
-    check_motion.measure_motion = once(check_motion.measure_motion, images_of)
+    views.features = once(views.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
+    compare.measure_motion = once(compare.measure_motion, images_of)
 
 
 def table(folders: list[str], rigs: int, minutes: float) -> None:

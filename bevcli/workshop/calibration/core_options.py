@@ -9,7 +9,7 @@ from bevcli.frame import Drive
 from bevcli.printing import say
 from bevcli.workshop.calibration import calibrate as calibration
 from bevcli.workshop.calibration.estimates import Verdict, change_text
-from bevcli.workshop.odometry.check_motion import stated_motion_findings, without_consequences
+from bevcli.workshop.odometry.compare import stated_motion_findings, without_consequences
 
 
 def corrected(drive: Drive) -> Drive:

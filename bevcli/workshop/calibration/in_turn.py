@@ -17,7 +17,7 @@ from bevcli.options import gather
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, calibrate
 from bevcli.workshop.calibration.estimates import RigEstimate
-from bevcli.workshop.odometry.run_option import with_measured_motion
+from bevcli.workshop.odometry.drives import with_measured_motion
 
 MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more

@@ -1,22 +1,18 @@
 """The vehicle's motion, measured from the images and the calibration alone.
 
 In the order of the work:
-    frames               what is kept of a frame: its images, their features, the road seen from above
-    above                how far the vehicle drove between two views of the road from above; points, and their residuals
-    point_votes          how far the vehicle drove, by matched points that lie on the road; whether it stands
-    unknowns             what is estimated of a step
-    steps                the motions that a step may have: those that fit matched points and points of the road
-    chain                the choice among them by the steps before and after
-    measure              the entry point: reads a drive frame by frame; the measured motion, and the drive with it
-    report               the measured motion in words and files, and against stated poses
-    seen_points          the points of a step that a recording shows
-    picture, recording   the way on the road, and curves
-    run_option           the option `odometry` of `open_sequence`
-    measured_steps       measured steps, and how far other steps are from them in standard deviations
-    stated               stated poses at the times of frames, and common mistakes in them, undone one by one
-    compare              stated poses against the measured motion: the mistake that explains their difference
-    check_motion         the check of `bevcli project-debug`: which steps are measured, and which findings are left out
-    live                 the motion of a live rig without poses, for `bevcli.Session`
+    views         what is kept of a frame: its images, their features, the road seen from above
+    votes         how far the vehicle drove: the votes of tiles of the road, and of matched points
+    flow          points of the road in two views from above
+    step_views    two frames: the points matched in both, and what is estimated of the step between them
+    steps         the motions that a step may have: those that fit matched points and points of the road
+    measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig
+    report        the measured motion in words and files, and against stated poses
+    picture       odometry.png: the way on the road, and curves
+    recording     odometry.rrd
+    drives        the option `odometry` of `open_sequence`: drives with their measured motion
+    stated        stated poses at the times of frames, and common mistakes in them, undone one by one
+    compare       stated poses against the measured motion, and the check of `bevcli project-debug`
 """
 
 from pathlib import Path

@@ -30,12 +30,12 @@ def odometry(
     """
     from bevcli.cli.progress import Progress
     from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.odometry import measure
     from bevcli.workshop.odometry.compare import compare
+    from bevcli.workshop.odometry.drives import at_most_rate
+    from bevcli.workshop.odometry.measure import MeasuredMotion, measure_steps
     from bevcli.workshop.odometry.picture import WatchedDrive, stitched, write_picture
     from bevcli.workshop.odometry.recording import write_recording
     from bevcli.workshop.odometry.report import against_stated, check_measured, report_text, to_json, write_report
-    from bevcli.workshop.odometry.run_option import at_most_rate
     from bevcli.writing import check_output
 
     reading = replace(source, ego_motion="measured")
@@ -43,8 +43,12 @@ def odometry(
     drive = WatchedDrive(found if source.rate_hz or source.every else at_most_rate(found))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
+    steps = []
     with Progress(len(drive.stamps) - 1, "steps", drive.notes) as progress:
-        motion = measure.measure_motion(drive, options, after_step=progress.advance)
+        for step in measure_steps(drive, options):
+            steps.append(step)
+            progress.advance()
+    motion = MeasuredMotion.of(drive, steps)
     check_measured(motion)
     stated = drive.stated_poses
     difference = None if stated is None else against_stated(motion, stated)

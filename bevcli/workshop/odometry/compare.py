@@ -1,22 +1,25 @@
-"""Stated poses against the measured motion: the mistake that explains their difference.
+"""Stated poses against the measured motion: the mistake that explains their difference; the check of `project-debug`.
 
-One rule: the common mistakes are undone in turn, and the stated steps then compared with the measured ones in standard
+The common mistakes are undone in turn, and the stated steps then compared with the measured ones in standard
 deviations. The mistake whose undoing fits best is named if it fits much better than the poses as they are.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.geometry.ego_motion import EgoMotion
-from bevcli.geometry.transforms import Array, rotation_about_z
+from bevcli.frame import Drive, Frame
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
+from bevcli.geometry.transforms import Array, Pose, rotation_about_z
 from bevcli.printing import counted
-from bevcli.workshop.odometry.measure import MeasuredMotion
-from bevcli.workshop.odometry.measured_steps import FREEDOMS, MeasuredSteps
-from bevcli.workshop.odometry.stated import Poses, mistakes, steps_between, turn_between
+from bevcli.sequences.open import Selection
+from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
+from bevcli.workshop.odometry.stated import FREEDOMS, MeasuredSteps, Poses, mistakes, steps_between, turn_between
 
 FEWEST_STEPS = 3  # that are measured
 FITS = 5.0  # largest distance of a step that fits, in deviations
@@ -53,19 +56,12 @@ SCALES = {
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Stated steps after something is undone.
+    """Stated steps after something is undone."""
 
-    Attributes:
-        steps: (K, 4, 4).
-        cost: of them, with that of the estimated parameters.
-        share: of the used steps that fit.
-        findings: what was undone; empty where it is nothing, or too small to be told.
-    """
-
-    steps: Array
-    cost: float
-    share: float
-    findings: tuple[Finding, ...] = ()
+    steps: Array  # (K, 4, 4)
+    cost: float  # of them, with that of the estimated parameters
+    share: float  # of the used steps that fit
+    findings: tuple[Finding, ...] = ()  # what was undone; empty where it is nothing, or too small to be told
 
 
 def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] | None = None) -> tuple[Finding, ...]:
@@ -87,15 +83,15 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         reasons = [step.reason for step in measured.steps if step.reason]
         return (not_compared(f"{counted(used, 'steps')} could be measured" + (f": {reasons[0]}" if reasons else "")),)
     steps = steps_between(poses)
-    found = as_it_is = _candidate(shown, steps)
+    chosen = as_it_is = _candidate(shown, steps)
     if not _stands(shown, shown.steps):  # else any scale near 0 fits
-        fitting = [each for each in (as_it_is, *_candidates(shown, rows, steps)) if each.share >= MOST]
-        least = min((each.cost for each in fitting), default=np.inf)
-        best = next((each for each in fitting if each.cost <= least + SAME), as_it_is)
-        found = best if as_it_is.cost - best.cost > MUCH else as_it_is
+        fitting = [candidate for candidate in (as_it_is, *_candidates(shown, rows, steps)) if candidate.share >= MOST]
+        least = min((candidate.cost for candidate in fitting), default=np.inf)
+        best = next((candidate for candidate in fitting if candidate.cost <= least + SAME), as_it_is)
+        chosen = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
-    if found.share >= MOST:
-        return found.findings or _jumps(shown, found.steps, numbers)
+    if chosen.share >= MOST:
+        return chosen.findings or _jumps(shown, chosen.steps, numbers)
     return (_wrong(shown, steps),)
 
 
@@ -128,12 +124,13 @@ def _candidates(measured: MeasuredSteps, rows: Poses, steps: Array) -> Iterator[
     yield from _of_another_time(measured, rows)
     yield _of_another_point(measured, steps)
     undone = list(mistakes(rows, measured.times_ns, measured.poses))
-    both = np.stack([steps, *(each.steps for each in undone)])
+    both = np.stack([steps, *(mistake.steps for mistake in undone)])
     fit, *counts = (measured.distances(both) < FITS)[:, measured.is_used].sum(1).tolist()
     mistaken: list[tuple[tuple[Finding, ...], Array]] = []
-    for each, count in zip(undone, counts, strict=True):
-        found = each.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
-        mistaken.append(((_error(each.code, each.message, found, each.expected, each.advice),), each.steps))
+    for mistake, count in zip(undone, counts, strict=True):
+        found = mistake.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
+        finding = _error(mistake.code, mistake.message, found, mistake.expected, mistake.advice)
+        mistaken.append(((finding,), mistake.steps))
     yield from _scaled(measured, mistaken)
 
 
@@ -154,13 +151,13 @@ def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Arr
     longer = stacked.copy()
     longer[..., :3, 3] *= scales[:, None, None]
     far, far_longer = measured.distances(stacked), measured.distances(longer)
-    for place, (findings, steps) in enumerate(undone):
+    for index, (findings, steps) in enumerate(undone):
+        scale, deviation = float(scales[index]), float(deviations[index])
         if findings:
-            yield _candidate(measured, steps, findings, 0, far[place])
-        if scales[place] > 0:
-            scale, deviation = float(scales[place]), float(deviations[place])
+            yield _candidate(measured, steps, findings, 0, far[index])
+        if scale > 0:
             told = (*findings, *_scale_finding(1 / scale, deviation / scale**2))
-            yield _candidate(measured, longer[place], told, 1, far_longer[place])
+            yield _candidate(measured, longer[index], told, 1, far_longer[index])
 
 
 def _scale_finding(factor: float, deviation: float) -> tuple[Finding, ...]:
@@ -283,7 +280,7 @@ def _wrong(measured: MeasuredSteps, steps: Array) -> Finding:
     """The finding where nothing fits: one of both stands still, or the poses are those of another drive."""
     used = measured.is_used
     fits = int((measured.distances(steps) < FITS)[used].sum())
-    stated, shown = (np.linalg.norm(each[used, :3, 3], axis=1) for each in (steps, measured.steps))
+    stated, shown = (np.linalg.norm(motion[used, :3, 3], axis=1) for motion in (steps, measured.steps))
     code, both = "motion-stands", f"{stated.sum():.1f} m in the poses, {shown.sum():.1f} m in the images"
     if _stands(measured, steps):
         message, advice = "the poses stand still, but the images move", "give the poses of the drive, or measure them"
@@ -310,12 +307,12 @@ def _jumps(measured: MeasuredSteps, steps: Array, frames: Sequence[int]) -> tupl
     large = (np.linalg.norm(off[:, 3:5], axis=1) > metres) | (np.abs(off[:, 2]) > radians)
     is_jump = measured.is_used & large & (measured.distances(steps) > deviations)
     is_jump &= _roughness(measured.times_ns, steps) > 2 * _roughness(measured.times_ns, measured.steps)
-    places = np.flatnonzero(is_jump)
-    if not len(places):
+    jumps = np.flatnonzero(is_jump)
+    if not len(jumps):
         return ()
-    between = ", ".join(f"{frames[place]} and {frames[place + 1]}" for place in places[:5])
-    more = f" and {len(places) - 5} more" if len(places) > 5 else ""
-    worst = places[np.linalg.norm(off[places, 3:5], axis=1).argmax()]
+    between = ", ".join(f"{frames[index]} and {frames[index + 1]}" for index in jumps[:5])
+    more = f" and {len(jumps) - 5} more" if len(jumps) > 5 else ""
+    worst = jumps[np.linalg.norm(off[jumps, 3:5], axis=1).argmax()]
     distance, turn_deg = np.linalg.norm(off[worst, 3:5]), np.degrees(abs(off[worst, 2]))
     found = f"between frames {between}{more}; {distance:.1f} m, {turn_deg:.1f}°"
     message, advice = "the poses jump, and the images do not", "correct these poses, or leave the frames out"
@@ -329,3 +326,87 @@ def _roughness(times_ns: NDArray[np.int64], steps: Array) -> Array:
     rates = np.column_stack([steps[:, 0, 3], steps[:, 1, 3], 10 * yaws]) / seconds
     padded = np.concatenate([rates[1:2], rates, rates[-2:-1]])
     return np.linalg.norm(rates - (padded[:-2] + padded[2:]) / 2, axis=1)
+
+
+STEPS = 8  # that are measured
+BETWEEN_NS = 400_000_000  # between two frames
+MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to this, radians; and that it moves
+
+
+class SomeFrames(Selection):
+    """Some frames of a drive. It keeps the poses of those that were loaded, by their times."""
+
+    def __init__(self, drive: Drive, indices: list[int]) -> None:
+        super().__init__(drive, indices)
+        self.poses: dict[int, Pose] = {}
+
+    def load(self, index: int) -> Frame:
+        frame = super().load(index)
+        self.poses[frame.stamp.timestamp_ns] = frame.world_from_ego
+        return frame
+
+    @property
+    def stated(self) -> EgoMotion:
+        """The poses of the drive: in its table, or of the frames that were loaded."""
+        if self.ego_motion is not None:
+            return self.ego_motion
+        times, poses = zip(*sorted(self.poses.items()), strict=True)
+        rows = (
+            np.array(times),
+            np.stack([pose.translation for pose in poses]),
+            np.stack([pose.quaternion for pose in poses]),
+        )
+        return EgoMotion(*rows, *derive_kinematics(*rows), velocities_are_stated=False)
+
+
+def stated_motion_findings(drive: Drive, steps: int = STEPS) -> tuple[Finding, ...]:
+    """Findings about the stated poses of a drive, from a few measured steps; none for a drive without poses."""
+    if not drive.has_ego_motion:
+        return ()
+    some = SomeFrames(drive, chosen_frames(drive, steps))
+    try:
+        measured = measure_motion(some)
+    except InputError as error:
+        return (not_compared(str(error)),)
+    return compare(some.stated, measured, [stamp.index for stamp in some.stamps])
+
+
+def chosen_frames(drive: Drive, steps: int = STEPS) -> list[int]:
+    """The indices of at most steps + 1 frames of the longest scene, those between which the poses turn most."""
+    times = [stamp.timestamp_ns for stamp in drive.stamps]
+    scenes = [list(scene) for _, scene in groupby(range(len(times)), lambda index: drive.stamps[index].scene)]
+    indices: list[int] = []
+    for index in max(scenes, key=len, default=[]):
+        if not indices or times[index] - times[indices[-1]] >= BETWEEN_NS:
+            indices.append(index)
+    starts = len(indices) - steps
+    if starts <= 1:
+        return indices
+    worth = np.zeros(len(indices) - 1)
+    if drive.ego_motion is not None:
+        worth = _worth(drive.ego_motion, np.array([times[index] for index in indices]))
+    sums = np.convolve(worth, np.ones(steps), mode="valid")
+    start = int(sums.argmax()) if np.ptp(sums) > 0 else starts // 2
+    return indices[start : start + steps + 1]
+
+
+def _worth(motion: EgoMotion, times_ns: NDArray[np.int64]) -> Array:
+    """(F - 1,) what the steps between frames tell of mistakes."""
+    steps = steps_between(Poses.of(motion).at(times_ns)[0])
+    turns = np.abs(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))
+    return np.minimum(turns, MOST_TURN) + MOVING * (np.linalg.norm(steps[:, :3, 3], axis=1) > MOVES_M)
+
+
+def without_consequences(
+    motion: tuple[Finding, ...], calibration: tuple[Finding, ...], cameras: int
+) -> tuple[Finding, ...]:
+    """The findings about poses, none of them an error, and about the calibration measured with them: one cause each.
+
+    A small difference, such as a scale, may come from single cameras that are off: it is taken for that where fewer
+    than half of the cameras are. If nothing could be measured, the calibration says why.
+    """
+    off = [finding for finding in calibration if finding.code == "calibration-off"]
+    if any(finding.severity == "warning" for finding in motion):
+        return calibration if 0 < len(off) < cameras / 2 else motion
+    is_measured = any(finding.severity != "info" for finding in calibration) or not calibration
+    return (*motion, *calibration) if is_measured else calibration

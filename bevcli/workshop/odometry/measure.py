@@ -1,22 +1,24 @@
-"""The measured motion of a drive, and the drive with it."""
+"""The measured motion of a drive, frame by frame, and that of a live rig without poses.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+Of the motions that each step may have one is chosen by the votes of the road, and because speed and yaw rate are
+smooth. A step is decided when the next one is measured: Viterbi's search with a delay of one step.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedDrive, Drive, Frame
-from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
-from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.frame import Drive, Frame
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics, RecentPoses, motion_of_keyframes
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.workshop.odometry import OdometryOptions
-from bevcli.workshop.odometry.chain import Chain, leaps
-from bevcli.workshop.odometry.frames import FrameView, Viewer
-from bevcli.workshop.odometry.seen_points import SeenPoints
-from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, StepViews, candidates, is_measured, reason_of
-from bevcli.workshop.odometry.unknowns import SLOPES, exponential, logarithm, motion_of, next_slopes
+from bevcli.workshop.odometry.step_views import SLOPES, StepViews, exponential, logarithm, motion_of, next_slopes
+from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, SeenPoints, candidates, is_measured, reason_of
+from bevcli.workshop.odometry.views import FrameView, Viewer
 
 LEAPS = "its length contradicts the steps before and after, and few points of the road match"
 SUBSTEP_NS = 25_000_000  # between the poses of `MeasuredMotion.ego_motion`
@@ -32,22 +34,15 @@ UNKNOWN = 4.0  # factor of the deviations of a guess where nothing was measured 
 class MeasuredStep:
     """The motion of the vehicle between two frames.
 
-    Attributes:
-        ego_a_from_ego_b: (4, 4) from the second frame to the first one; metres.
-        covariance: (6, 6) of rotation (radians, in the ego frame of the first) and translation (metres).
-        reason: why the step could not be measured: then it is a guess of constant velocity with a wide deviation; "" if
-            it was measured.
-        matches: number of matched points that were used.
-        road_points: number of points of the road that were used.
-        seen: some of both, for recordings; None where nothing was measured.
+    A step that could not be measured is a guess of constant velocity with a wide deviation.
     """
 
-    ego_a_from_ego_b: Array
-    covariance: Array
-    reason: str = ""
-    matches: int = 0
-    road_points: int = 0
-    seen: SeenPoints | None = None
+    ego_a_from_ego_b: Array  # (4, 4) from the second frame to the first one; metres
+    covariance: Array  # (6, 6) of rotation (radians, in the ego frame of the first) and translation (metres)
+    reason: str = ""  # why the step could not be measured; "" if it was
+    matches: int = 0  # number of matched points that were used
+    road_points: int = 0  # number of points of the road that were used
+    seen: SeenPoints | None = None  # some of both, for recordings; None where nothing was measured
 
     @property
     def deviations(self) -> Array:
@@ -57,17 +52,17 @@ class MeasuredStep:
 
 @dataclass(frozen=True)
 class MeasuredMotion:
-    """The motion of a drive of F frames.
+    """The motion of a drive of F frames."""
 
-    Attributes:
-        name: of the drive.
-        timestamps_ns: (F,) int64 of the frames, increasing.
-        steps: F - 1, from each frame to the next one.
-    """
+    name: str  # of the drive
+    timestamps_ns: NDArray[np.int64]  # (F,) of the frames, increasing
+    steps: tuple[MeasuredStep, ...]  # F - 1, from each frame to the next one
 
-    name: str
-    timestamps_ns: NDArray[np.int64]
-    steps: tuple[MeasuredStep, ...]
+    @classmethod
+    def of(cls, drive: Drive, steps: Iterable[MeasuredStep]) -> "MeasuredMotion":
+        """The motion of a drive with these steps."""
+        times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
+        return cls(drive.name, times, tuple(steps))
 
     @cached_property
     def poses(self) -> Array:
@@ -95,6 +90,69 @@ class MeasuredMotion:
         return motion_of_keyframes(_table(list(zip(times.tolist(), poses, strict=True))), _table(between))
 
 
+def _table(poses: Sequence[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
+    """Times, translations and quaternions of N poses, as `motion_of_keyframes` takes them."""
+    matrices = [Pose.from_matrix(matrix) for _, matrix in poses]
+    translations = np.array([pose.translation for pose in matrices]).reshape(-1, 3)
+    quaternions = np.array([pose.quaternion for pose in matrices]).reshape(-1, 4)
+    return np.array([time for time, _ in poses], dtype=np.int64), translations, quaternions
+
+
+VOTES = 6.0  # cost of a motion with 1/e of the votes
+ACCELERATION, TURN = 2.0, np.radians(15.0)  # usual changes a second of speed (m/s) and of yaw rate (radians a second)
+LEAP, LEAP_M = 2.0, 0.5  # m/s² and metres, of a way that differs from those of both neighbours alike
+SURE = 60  # points of the road, of a motion that may leap all the same
+
+
+def leaps(before: Candidate, candidate: Candidate, after: Candidate, seconds: tuple[float, float, float]) -> bool:
+    """True for a motion with few points of the road whose speed is far above, or below, that of both neighbours."""
+    steps = zip((before, candidate, after), seconds, strict=True)
+    first, speed, last = (float(motion.speed_and_rate(time)[0]) for motion, time in steps)
+    apart = min(abs(speed - first), abs(speed - last)) * seconds[1]
+    alike = (speed - first) * (speed - last) > 0
+    return candidate.road_points < SURE and alike and apart > LEAP_M + LEAP * seconds[1] ** 2
+
+
+@dataclass
+class Chain:
+    """The undecided step, and what its motions cost so far."""
+
+    _seconds: float = 0.0
+    _candidates: Sequence[Candidate] = ()
+    _costs: Array = field(default_factory=lambda: np.zeros(0))
+
+    def add(self, candidates: Sequence[Candidate], seconds: float) -> Candidate | None:
+        """Take the motions (one or more) of a step of some seconds; return that of the step before, if there is one."""
+        most = max(candidate.votes for candidate in candidates)
+        by_votes = np.array([VOTES * np.log(max(most, 1e-6) / max(motion.votes, 1e-6)) for motion in candidates])
+        before, costs = self._candidates, by_votes
+        decided = None
+        if before:
+            changes = np.array([[self._change(a, b, seconds) for b in candidates] for a in before])
+            index = int(np.argmin(self._costs + (changes + by_votes).min(-1)))
+            decided, costs = before[index], changes[index] + by_votes
+        self._seconds, self._candidates, self._costs = seconds, candidates, costs
+        return decided
+
+    @property
+    def likeliest(self) -> Candidate | None:
+        """The motion of the undecided step that is the likeliest so far."""
+        return self._candidates[int(np.argmin(self._costs))] if self._candidates else None
+
+    def end(self) -> Candidate | None:
+        """The motion of the last step; the chain starts anew."""
+        decided = self.likeliest
+        self._candidates, self._costs = (), np.zeros(0)
+        return decided
+
+    def _change(self, before: Candidate, after: Candidate, seconds: float) -> float:
+        """The cost of a change of speed and yaw rate."""
+        mean = (self._seconds + seconds) / 2
+        slow, fast = before.speed_and_rate(self._seconds), after.speed_and_rate(seconds)
+        changes = (fast - slow) / (mean * np.array([ACCELERATION, TURN]))
+        return float(np.log1p(changes**2).sum())
+
+
 class MotionMeter:
     """Measures the motion frame by frame. It keeps the views of the last frame, and one step that is not decided."""
 
@@ -113,13 +171,13 @@ class MotionMeter:
         self._last = view
         if last is None:
             return []
-        seconds = (view.timestamp_ns - last.timestamp_ns) / 1e9
         step = StepViews(last, view)
-        found = candidates(step, Guess(self._expected(seconds), self._options.height_m))
-        if not found:
+        seconds = step.seconds
+        motions = candidates(step, Guess(self._expected(seconds), self._options.height_m))
+        if not motions:
             before, self._guessed = self.finish(), self._guessed + 1
             return [*before, self._guess(seconds, reason_of(step))]
-        decided = self._chain.add(found, seconds)
+        decided = self._chain.add(motions, seconds)
         likeliest = self._chain.likeliest
         assert likeliest is not None
         steps = [] if decided is None else [self._decided(decided, (likeliest, seconds))]
@@ -155,13 +213,8 @@ class MotionMeter:
         """A motion as measured, or a guess where the images do not tell it."""
         if not is_measured(candidate):
             return self._guess(self._seconds, NOT_TOLD)
-        return MeasuredStep(
-            motion_of(candidate.state),
-            candidate.covariance,
-            matches=candidate.matches,
-            road_points=candidate.road_points,
-            seen=candidate.seen,
-        )
+        of_points = candidate.matches, candidate.road_points, candidate.seen
+        return MeasuredStep(motion_of(candidate.state), candidate.covariance, "", *of_points)
 
     def _expected(self, seconds: float) -> Array | None:
         """(8,) the state of a step at constant velocity."""
@@ -180,9 +233,23 @@ class MotionMeter:
         return MeasuredStep(motion, np.diag(deviations**2), reason)
 
 
-def measure_motion(
-    drive: Drive, options: OdometryOptions | None = None, after_step: Callable[[], None] = lambda: None
-) -> MeasuredMotion:
+def measure_steps(drive: Drive, options: OdometryOptions | None = None) -> Iterator[MeasuredStep]:
+    """Measure the motion of a drive of one scene: each step as soon as it is certain.
+
+    Raises InputError where the drive has one frame, or several scenes.
+    """
+    scenes = {stamp.scene for stamp in drive.stamps}
+    if len(scenes) > 1:
+        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one): choose a `scene`")
+    if len(drive.stamps) < 2:
+        raise InputError(f"{drive.name}: has {len(drive.stamps)} frames (expected 2 or more): choose more frames")
+    meter = MotionMeter(options)
+    for index in range(len(drive.stamps)):
+        yield from meter.add(drive.load(index))
+    yield from meter.finish()
+
+
+def measure_motion(drive: Drive, options: OdometryOptions | None = None) -> MeasuredMotion:
     """Measure the motion of a drive from its images and its calibration.
 
         motion = measure_motion(open_sequence("my_drive"))
@@ -193,60 +260,47 @@ def measure_motion(
     Args:
         drive: of `open_sequence`, one scene.
         options: see `OdometryOptions`.
-        after_step: called after each frame but the first.
 
     Raises InputError where the drive has one frame, or several scenes.
     """
-    scenes = {stamp.scene for stamp in drive.stamps}
-    if len(scenes) > 1:
-        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one): choose a `scene`")
-    if len(drive.stamps) < 2:
-        raise InputError(f"{drive.name}: has {len(drive.stamps)} frames (expected 2 or more): choose more frames")
-    meter, steps = MotionMeter(options), list[MeasuredStep]()
-    for place in range(len(drive.stamps)):
-        steps += meter.add(drive.load(place))
-        if place:
-            after_step()
-    steps += meter.finish()
-    times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
-    return MeasuredMotion(drive.name, times, tuple(steps))
+    return MeasuredMotion.of(drive, measure_steps(drive, options))
 
 
-def _table(poses: Sequence[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
-    """Times, translations and quaternions of N poses, as `motion_of_keyframes` takes them."""
-    matrices = [Pose.from_matrix(matrix) for _, matrix in poses]
-    translations = np.array([pose.translation for pose in matrices]).reshape(-1, 3)
-    quaternions = np.array([pose.quaternion for pose in matrices]).reshape(-1, 4)
-    return np.array([time for time, _ in poses], dtype=np.int64), translations, quaternions
+KEPT_POSES = 8  # of a live rig, from which the kinematics follow
 
 
-class MeasuredDrive(DerivedDrive):
-    """A drive with its measured motion: poses and kinematics of every frame, and poses at each camera's own time.
+class LiveMotion:
+    """Measures the motion to each frame at once, and once more when the next frame is there.
 
-    Ground truth in the world frame is moved with the vehicle.
+    The world frame is the ego frame of the first frame.
+
+    Attributes:
+        step: the newest step, to the newest frame; None for the first frame.
+        kinematics: at the newest frame, from the best known poses.
     """
 
-    def __init__(self, sequence: Drive, motion: MeasuredMotion) -> None:
-        super().__init__(sequence)
-        self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
-        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
+    def __init__(self, meter: MotionMeter | None = None) -> None:
+        """meter: measures the steps. Default: a new one."""
+        self._meter = MotionMeter() if meter is None else meter
+        self._path: list[tuple[int, Pose]] = []
+        self._open = 0  # steps at the end of the path that are not certain
+        self.step: MeasuredStep | None = None
+        self.kinematics: Kinematics | None = None
 
-    def load(self, index: int) -> Frame:
-        return self._moved(self.sequence.load(index))
-
-    def ground_truth_frame(self, index: int) -> Frame:
-        return self._moved(self.sequence.ground_truth_frame(index))
-
-    def _moved(self, frame: Frame) -> Frame:
-        motion, time = self.motion.ego_motion, frame.stamp.timestamp_ns
-        times = {name: frame.images[name].timestamp_ns if name in frame.images else time for name in frame.rig.names}
-        pose, truth = motion.pose_at(time), frame.ground_truth
-        moved = pose.matrix @ inverse(frame.world_from_ego.matrix)
-        return replace(
-            frame,
-            world_from_ego=pose,
-            ground_truth=None if truth is None else truth.transformed(moved),
-            world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
-            kinematics=motion.kinematics_at(time),
-            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
-        )
+    def add(self, frame: Frame) -> tuple[Pose | None, Pose]:
+        """world_from_ego of the frame before as it is known now, None for the first frame; and of this frame."""
+        steps = self._meter.add(frame)
+        self._path.append((frame.stamp.timestamp_ns, Pose.identity()))
+        if len(self._path) > 1:
+            self._open += 1
+            certain, newest = len(steps), self._meter.newest
+            if certain < self._open and newest is not None:
+                steps = [*steps, newest]
+            for index, step in zip(range(-self._open, 0), steps, strict=True):
+                before = self._path[index - 1][1].matrix
+                self._path[index] = self._path[index][0], Pose.from_matrix(before @ step.ego_a_from_ego_b)
+            self._open -= certain
+            self.step = steps[-1]
+        self._path = self._path[-KEPT_POSES:]
+        self.kinematics = RecentPoses(tuple(self._path)).kinematics()
+        return (self._path[-2][1] if len(self._path) > 1 else None), self._path[-1][1]

@@ -20,9 +20,9 @@ from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.road import sampled
-from bevcli.workshop.odometry.above import nearest_cameras
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg
+from bevcli.workshop.odometry.views import nearest_cameras
 from bevcli.writing import whole_file
 
 Pixels = NDArray[np.uint8]

@@ -15,7 +15,7 @@ from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rat
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.picture import JPEG, SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
-from bevcli.workshop.odometry.seen_points import SeenPoints
+from bevcli.workshop.odometry.steps import SeenPoints
 
 WAY, ROAD, CAMERAS = "way", "road", "cameras"
 CURVES = {"speed": "speed, m/s", "yaw_rate": "yaw rate, °/s"}

@@ -1,4 +1,4 @@
-"""Stated poses at the times of measured frames, and the common mistakes undone one by one."""
+"""What stated poses are compared by: measured steps with their deviations, and common mistakes, undone one by one."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, inverse, rotation_about_z
+from bevcli.workshop.odometry.measure import MeasuredMotion
 
 DEGREES = 180 / np.pi
 DIRECTIONS = (("forward", "backward"), ("left", "right"), ("up", "down"))  # of the axes of the ego frame, + and -
@@ -28,17 +29,11 @@ CLOCKWISE = {
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of T rows, for arithmetic.
+    """Poses of T rows, for arithmetic with many times at once."""
 
-    Attributes:
-        times_ns: (T,) int64, strictly increasing.
-        rotations: (T, 3, 3) of world_from_ego.
-        positions: (T, 3) metres, world frame.
-    """
-
-    times_ns: NDArray[np.int64]
-    rotations: Array
-    positions: Array
+    times_ns: NDArray[np.int64]  # (T,) strictly increasing
+    rotations: Array  # (T, 3, 3) of world_from_ego
+    positions: Array  # (T, 3) metres, world frame
 
     @cached_property
     def quaternions(self) -> Array:
@@ -121,8 +116,8 @@ def signed_permutations() -> list[Array]:
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
-    seen = [matrix for matrix in matrices if not np.array_equal(matrix[:2, :2], np.eye(2))]
-    return sorted(seen, key=lambda matrix: (matrix[2, 2] != 1, np.linalg.det(matrix) < 0))
+    changing = [matrix for matrix in matrices if not np.array_equal(matrix[:2, :2], np.eye(2))]
+    return sorted(changing, key=lambda matrix: (matrix[2, 2] != 1, np.linalg.det(matrix) < 0))
 
 
 def _axes(steps: Array) -> Iterator[Mistake]:
@@ -133,8 +128,8 @@ def _axes(steps: Array) -> Iterator[Mistake]:
         undone[:, :3, 3] = steps[:, :3, 3] @ stated_from_ego
         names = []
         for axis, row in zip("xyz", stated_from_ego, strict=True):
-            place = int(np.abs(row).argmax())
-            names.append(f"{axis} {DIRECTIONS[place][int(row[place] < 0)]}")
+            column = int(np.abs(row).argmax())
+            names.append(f"{axis} {DIRECTIONS[column][int(row[column] < 0)]}")
         flat = abs(stated_from_ego[2, 2]) == 1  # the ground: whether z is up or down is not told
         is_mirrored = np.linalg.det(stated_from_ego[:2, :2]) < 0 if flat else np.linalg.det(stated_from_ego) < 0
         message = "the axes of the poses are not those of the ego frame"
@@ -152,7 +147,7 @@ def _position_axes(poses: Array) -> Iterator[Mistake]:
         undone[:, :3, 3] = poses[:, :3, 3] @ stated_from_world
         order = [int(np.abs(row).argmax()) for row in stated_from_world]
         signs = ["-" if row.min() < 0 else "" for row in stated_from_world]
-        held = ", ".join(sign + "xyz"[place] for sign, place in zip(signs, order, strict=True))
+        held = ", ".join(sign + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
         message = "axes of the positions are swapped" if order != [0, 1, 2] else "axes of the positions are negated"
         found = f"x, y, z of the positions hold {held} of the rotations' world"
         yield Mistake(
@@ -212,5 +207,61 @@ def _aligned(steps: Array, measured: Array) -> Array:
 
 def turn_between(steps: Array, measured: Array, weights: Array) -> float:
     """The angle about z, radians, from the translations of steps (K, 4, 4) to the measured ones; weights: (K,)."""
-    flat, shown = (each[:, 0, 3] + 1j * each[:, 1, 3] for each in (steps, measured))
+    flat, shown = (motion[:, 0, 3] + 1j * motion[:, 1, 3] for motion in (steps, measured))
     return float(np.angle((weights * shown * flat.conj()).sum()))
+
+
+WIDEST = np.radians(2.0), 0.2, 0.3  # deviations of a step that counts as measured: yaw; length in its own, or metres
+# Deviations of sound poses: roll, pitch and yaw of a step; its translation, and that in its length.
+POSE_DEVIATIONS, LENGTH_DEVIATION = np.array([np.radians(1.0)] * 2 + [np.radians(0.1)] + [0.02, 0.02, 0.1]), 0.01
+FREEDOMS = 6  # of a step
+
+
+@dataclass(frozen=True)
+class MeasuredSteps:
+    """K measured steps, and how far other steps are from them in standard deviations."""
+
+    times_ns: NDArray[np.int64]  # (K + 1,) of the frames
+    poses: Array  # (K + 1, 4, 4) world_from_ego
+    steps: Array  # (K, 4, 4)
+    precisions: Array  # (K, 6, 6) of the difference to a sound stated step
+    is_used: NDArray[np.bool_]  # (K,) measured well, and covered by the stated poses
+
+    @classmethod
+    def of(cls, motion: MeasuredMotion) -> "MeasuredSteps":
+        """The steps of a measured motion; those without a reason and with small deviations are used."""
+        steps = np.stack([step.ego_a_from_ego_b for step in motion.steps])
+        covariances = np.stack([step.covariance for step in motion.steps])
+        lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+        deviations = np.broadcast_to(POSE_DEVIATIONS, (len(steps), 6)).copy()
+        deviations[:, 3:5] = np.hypot(deviations[:, 3:5], LENGTH_DEVIATION * lengths[:, None])
+        yaw, share, metres = WIDEST
+        spread = np.sqrt(covariances[:, 3, 3] + covariances[:, 4, 4])
+        is_used = (np.sqrt(covariances[:, 2, 2]) < yaw) & (spread < np.maximum(share * lengths, metres))
+        is_used &= [not step.reason for step in motion.steps]
+        precisions = np.linalg.inv(covariances + np.einsum("ki,ij->kij", deviations**2, np.eye(6)))
+        return cls(motion.timestamps_ns, motion.poses, steps, precisions, is_used)
+
+    def differences(self, steps: Array) -> Array:
+        """(..., K, 6) rotation and translation of steps (..., K, 4, 4) minus the measured ones."""
+        turns = steps[..., :3, :3] @ np.swapaxes(self.steps[:, :3, :3], 1, 2)
+        vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*steps.shape[:-2], 3)
+        return np.concatenate([vectors, steps[..., :3, 3] - self.steps[:, :3, 3]], axis=-1)
+
+    def distances(self, steps: Array) -> Array:
+        """(..., K) the length of the differences in standard deviations."""
+        return np.sqrt(self.squared(self.differences(steps)))
+
+    def squared(self, differences: Array) -> Array:
+        """(..., K) squared distances of differences (..., K, 6)."""
+        return np.einsum("...ki,kij,...kj->...k", differences, self.precisions, differences)
+
+    def cost(self, distances: Array, is_used: NDArray[np.bool_] | None = None) -> Array:
+        """(...) robust cost of distances (..., K): that of the steps in use, times the number of all that are used."""
+        used = self.is_used if is_used is None else self.is_used & is_used
+        of_used = np.where(used, FREEDOMS * np.log1p(distances**2 / FREEDOMS), 0).sum(-1)
+        return of_used * self.is_used.sum() / np.maximum(used.sum(-1), 1)
+
+    def weights(self, squared: Array) -> Array:
+        """(..., K) robust weights of squared distances."""
+        return self.is_used / (1 + squared / FREEDOMS)

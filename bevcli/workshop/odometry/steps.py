@@ -1,37 +1,35 @@
-"""The motion between two frames: matched points, starts, and the motion that fits points and road best."""
+"""The motion between two frames: starts from matched points and votes, and what fits points and road best."""
 
+from collections.abc import Sequence as Items
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.correspondence.points import matched, neighbours
-from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, Residuals, RoadResiduals
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, Indices, Residuals, RoadResiduals
 from bevcli.workshop.correspondence.road import RoadPoints, road_points
 from bevcli.workshop.correspondence.solver import Term, honest_covariance, solve, spread, values
-from bevcli.workshop.odometry.above import (
-    CELL_M,
-    GroundResiduals,
-    RoadPicture,
-    distance_votes,
-    rays_and_weights,
-    road_flow,
-)
-from bevcli.workshop.odometry.frames import FrameView
-from bevcli.workshop.odometry.point_votes import point_votes, stands, under_the_road, ways_of_points
-from bevcli.workshop.odometry.seen_points import SeenPoints, seen_points
-from bevcli.workshop.odometry.unknowns import (
+from bevcli.workshop.odometry.flow import GroundResiduals, rays_and_weights, road_flow
+from bevcli.workshop.odometry.step_views import (
     CHANGE_RAD,
     COUNT,
+    PARTS,
     PLACE,
     SHORTEST_M,
     SLOPE_RAD,
     SLOPES,
     STATE,
     StepUnknowns,
+    StepViews,
     deviations_at,
+    match_points,
     next_slopes,
+    still_points,
 )
+from bevcli.workshop.odometry.views import CELL_M, RoadPicture
+from bevcli.workshop.odometry.votes import distance_votes, point_votes, stands, under_the_road, ways_of_points
 
 YAWS = np.radians(np.arange(-60, 60.1, 3.0))  # that are tried, besides those of the last step
 FEWEST, FEWEST_OF_ROAD = 30, 60  # matched points, and points of the road in the images
@@ -59,94 +57,53 @@ FLOOR = np.diag([*[np.radians(0.002)] * 3, *[0.0005] * 3]) ** 2  # of the covari
 STILL_FLOOR = np.diag([*[np.radians(0.01)] * 3, *[0.005] * 3]) ** 2  # the same of a vehicle that stands or creeps
 SURE_OF_ROAD, UNSURE = 15, 2.0  # points of the road, and the factor of all deviations where there are fewer
 MANY = 3  # cameras, whose agreement tells the deviations too
-PARTS = 6  # of a pair of images, whose agreement tells the deviations
 NO_POINTS = RoadPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0))
+MOST_SEEN = 60  # points for recordings, of each camera and kind
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Some of the points that a step was measured from, in the images of its second frame: what a recording shows."""
+
+    camera: NDArray[np.int16]  # (N,) index in the rig
+    at: NDArray[np.float32]  # (N, 2) position in the image of the second frame, as shares of its width and height
+    residuals_px: NDArray[np.float32]  # (N,) distance from where the measured motion puts it, of the reduced image
+    is_road: NDArray[np.bool_]  # (N,) True for a point of the road, False for a matched one
+
+
+def seen_points(cameras: Items[Camera], *kinds: tuple[Indices, Array, Array]) -> SeenPoints:
+    """An even choice of points.
+
+    cameras: of the second frame. kinds: matched points and points of the road, each with the camera (n,), the ray
+    (n, 3) in its frame, and the residual (n, D).
+    """
+    columns: list[tuple[Indices, Array, Array, NDArray[np.bool_]]] = []
+    for is_road, (of, rays, residuals) in enumerate(kinds):
+        for index, camera in enumerate(cameras):
+            mine = np.flatnonzero(of == index)
+            chosen = mine[:: max(1, -(-len(mine) // MOST_SEEN))]
+            pixels, _ = camera.project(rays[chosen])
+            sizes = np.linalg.norm(residuals[chosen], axis=-1)
+            roads = np.full(len(chosen), bool(is_road))
+            columns.append((np.full(len(chosen), index), pixels / (camera.width, camera.height), sizes, roads))
+    camera_of, at, sizes, roads = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return SeenPoints(camera_of.astype(np.int16), at.astype(np.float32), sizes.astype(np.float32), roads)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A motion that a step may have.
+    """A motion that a step may have."""
 
-    Attributes:
-        state: (8,), see `StepUnknowns`.
-        covariance: (6, 6) of rotation and translation.
-        votes: of the road for its distance.
-        matches: number of matched points.
-        road_points: number of points of the road.
-        seen: some of both, for recordings.
-    """
-
-    state: Array
-    covariance: Array
-    votes: float
-    matches: int
-    road_points: int
-    seen: SeenPoints | None = None
+    state: Array  # (8,), see `StepUnknowns`
+    covariance: Array  # (6, 6) of rotation and translation
+    votes: float  # of the road for its distance
+    matches: int  # number of matched points
+    road_points: int  # number of points of the road
+    seen: SeenPoints | None = None  # some of both
 
     def speed_and_rate(self, seconds: float) -> Array:
         """(2,) the speed (m/s, negative backwards) and the yaw rate (radians a second) of a step of some seconds."""
         return np.array([np.copysign(np.hypot(*self.state[3:5]), self.state[3]), self.state[2]]) / seconds
-
-
-@dataclass(frozen=True)
-class StepViews:
-    """Two frames of C cameras. Their images form C x C groups, and each group has PARTS."""
-
-    first: FrameView
-    second: FrameView
-
-    @property
-    def cameras(self) -> int:
-        """Number of cameras."""
-        return len(self.first.cameras)
-
-    def pair(self, group: Indices) -> tuple[Indices, Indices]:
-        """The cameras of the first and of the second images of groups."""
-        return np.divmod(group // PARTS, self.cameras)
-
-    def group(self, first: Indices | int, second: Indices | int, rays_a: Array) -> Indices:
-        """(n,) the groups of points with rays (n, 3) in images of a first and of a second camera."""
-        part = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
-        return np.asarray((first * self.cameras + second) * PARTS + part, dtype=np.int64)
-
-    def of_single_cameras(self, points: EpipolarResiduals) -> EpipolarResiduals:
-        """The points whose images are of the same camera."""
-        return points.where(np.equal(*self.pair(points.group)))
-
-    def geometry(self, state: Array) -> GroupGeometry:
-        """The geometry of all groups for a state (8,)."""
-        unknowns = self.unknowns(state, np.ones(COUNT))
-        return unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
-
-    def unknowns(self, start: Array, deviations: Array) -> StepUnknowns:
-        """The unknowns about a start (8,)."""
-        groups = self.pair(np.arange(self.cameras**2 * PARTS))
-        views, seconds = (self.first, self.second), (self.second.timestamp_ns - self.first.timestamp_ns) / 1e9
-        a, b = (
-            np.stack([camera.ego_from_camera for camera in view.cameras])[index]
-            for view, index in zip(views, groups, strict=True)
-        )
-        shares = [
-            side + view.late_s[index] / seconds for side, (view, index) in enumerate(zip(views, groups, strict=True))
-        ]
-        return StepUnknowns((a, b), np.stack(shares, -1), start, deviations)
-
-
-def match_points(step: StepViews) -> EpipolarResiduals:
-    """The matched points of each camera with itself and with its neighbours."""
-    nothing = np.zeros((0, 3))
-    group, a, b, focal = [np.zeros(0, dtype=np.int64)], [nothing], [nothing], [np.zeros(0)]
-    for i, j in [(index, index) for index in range(step.cameras)] + neighbours(step.first.cameras):
-        first, second = step.first.features[i], step.second.features[j]
-        if first is None or second is None:
-            continue
-        rays_a, rays_b = matched(first, second, step.first.cameras[i], step.second.cameras[j])
-        group.append(step.group(i, j, rays_a))
-        a.append(rays_a)
-        b.append(rays_b)
-        focal.append(np.full(len(rays_a), step.first.cameras[i].intrinsics[0, 0]))
-    columns = np.concatenate(group), np.concatenate(a), np.concatenate(b), np.concatenate(focal)
-    return EpipolarResiduals(*columns).sorted()
 
 
 def along_arc(distance: float, yaw: float, slopes: Array) -> Array:
@@ -156,17 +113,11 @@ def along_arc(distance: float, yaw: float, slopes: Array) -> Array:
 
 @dataclass(frozen=True)
 class Guess:
-    """What is expected of a step from the one before.
+    """What is expected of a step from the one before."""
 
-    Attributes:
-        state: (8,), see `StepUnknowns`; None where nothing is known.
-        height_m: standard deviation of the stated heights of the cameras.
-        still: whether the vehicle stands, as all points show.
-    """
-
-    state: Array | None
-    height_m: float
-    still: bool = False
+    state: Array | None  # (8,), see `StepUnknowns`; None where nothing is known
+    height_m: float  # standard deviation of the stated heights of the cameras
+    still: bool = False  # whether the vehicle stands, as all points show
 
     @property
     def slopes(self) -> Array:
@@ -180,19 +131,13 @@ class Guess:
         return np.minimum(result, STANDING) if self.still else result
 
 
-def is_still(step: StepViews, points: EpipolarResiduals) -> bool:
-    """True where the matched points of single cameras stay where they are in the image."""
-    inside = _still(step, points)
-    poses = np.stack([camera.ego_from_camera for camera in step.first.cameras])
-    return stands(inside, poses[step.pair(inside.group)[0]])
-
-
 def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array:
     """(8,) the motion that fits the matched points of single cameras; its length is that of the guess, if any."""
     inside = step.of_single_cameras(points)
-    known = guess.state is not None and np.hypot(*guess.state[3:5]) > SHORTEST_M
-    length = float(guess.state[3]) if known and guess.state is not None else USUAL_M
-    starts = [along_arc(length, yaw, guess.slopes) for yaw in YAWS] + ([] if guess.state is None else [guess.state])
+    expected, length = guess.state, USUAL_M
+    if expected is not None and np.hypot(*expected[3:5]) > SHORTEST_M:
+        length = float(expected[3])
+    starts = [along_arc(length, yaw, guess.slopes) for yaw in YAWS] + ([] if expected is None else [expected])
     costs = []
     for start in starts:
         unknowns = step.unknowns(start, guess.deviations(start, known_distance=True))
@@ -211,15 +156,15 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
 def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
     """The motions that a step may have, those with most votes first; none where the images do not tell it."""
     points = match_points(step)
-    if is_still(step, points):
+    inside, poses = still_points(step, points), np.stack([camera.ego_from_camera for camera in step.first.cameras])
+    if stands(inside, poses[step.pair(inside.group)[0]]):
         start = np.concatenate([np.zeros(6), guess.slopes])
         return [measured(step, points, start, replace(guess, still=True), 1.0, None)]
     if len(points.group) < FEWEST:
         return []
     rough = direction(step, points, guess)
     heading = float(np.arctan2(rough[4] * np.sign(rough[3]), abs(rough[3])))
-    seconds = (step.second.timestamp_ns - step.first.timestamp_ns) / 1e9
-    cells = int(-BACK * seconds / CELL_M) - 4, int(FASTEST * seconds / CELL_M) + 4
+    cells = int(-BACK * step.seconds / CELL_M) - 4, int(FASTEST * step.seconds / CELL_M) + 4
     sense, ways = _sense(step, points, rough), _ways(step, points, rough)
     points = points.where(~under_the_road(ways))
     roads = step.first.road(rough[SLOPES]), step.second.road(next_slopes(rough))
@@ -233,12 +178,12 @@ def candidates(step: StepViews, guess: Guess) -> list[Candidate]:
         start[3:5] = distance * np.array([np.cos(heading), np.sin(heading)])
         starts.append((start, float(votes[index])))
     # Without road, two cameras may still tell the distance.
-    found = [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
+    motions = [measured(step, points, start, guess, vote, roads) for start, vote in starts or [(rough, 1.0)]]
     # Where matched points tell a far longer way, the points of the road are drops on the lens, or the own shadow.
     least = SHORT * float(np.nanmedian(ways)) if np.isfinite(ways).any() else 0.0
-    counts = [each.road_points if np.hypot(*each.state[3:5]) > least else 0 for each in found]
+    counts = [motion.road_points if np.hypot(*motion.state[3:5]) > least else 0 for motion in motions]
     shares = (FEW + np.array(counts)) / (FEW + max(counts))
-    return [replace(each, votes=each.votes * float(share)) for each, share in zip(found, shares, strict=True)]
+    return [replace(motion, votes=motion.votes * float(share)) for motion, share in zip(motions, shares, strict=True)]
 
 
 def _sense(step: StepViews, points: EpipolarResiduals, rough: Array) -> int:
@@ -260,12 +205,11 @@ def _ways(step: StepViews, points: EpipolarResiduals, state: Array) -> Array:
 def _peaks(votes: Array) -> list[int]:
     """The indices of the distances with most votes, most first."""
     left, apart = votes.copy(), round(APART_M / CELL_M)
-    found: list[int] = []
+    peaks: list[int] = []
     while left.max() > 0 and left.max() >= LEAST_VOTES * votes.max():
-        best = int(left.argmax())
-        found.append(best)
-        left[max(0, best - apart) : best + apart + 1] = 0
-    return found
+        peaks.append(int(left.argmax()))
+        left[max(0, peaks[-1] - apart) : peaks[-1] + apart + 1] = 0
+    return peaks
 
 
 def _top(votes: Array, index: int) -> int:
@@ -287,45 +231,33 @@ def measured(
     deviations = guess.deviations(start)
     unknowns, x = step.unknowns(start, deviations), np.zeros(len(deviations))
     for most_m, most_px in zip(MOST_M, MOST_PX, strict=True):
-        fitting = _still(step, points) if guess.still else _common(step, unknowns, points, x, most_px)
+        fitting = still_points(step, points) if guess.still else _common(step, unknowns, points, x, most_px)
         road: GroundResiduals | RoadResiduals = _road_in_images(step, unknowns, x, ROAD_PX * most_m)
         if len(road.group) < FEWEST_OF_ROAD and roads is not None:
             road = _road(step, unknowns, x, roads, most_m)
         terms = _terms(step, unknowns, (fitting, road), x)
-        x = solve(unknowns, [(each, np.clip(scale, LEAST_SPREAD, MOST_SPREAD)) for each, scale in terms], x).x
+        x = solve(unknowns, [(term, np.clip(scale, LEAST_SPREAD, MOST_SPREAD)) for term, scale in terms], x).x
     solution = solve(unknowns, _terms(step, unknowns, (fitting, road), x), x)
     groups = np.arange(len(unknowns.columns))
     covariances = [honest_covariance(unknowns, solution, parts) for parts in (groups, step.pair(groups)[0])]
-    covariance = max(covariances[: 1 + (step.cameras >= MANY)], key=lambda each: float(np.trace(each[PLACE, PLACE])))
+    covariance = max(
+        covariances[: 1 + (step.cameras >= MANY)], key=lambda matrix: float(np.trace(matrix[PLACE, PLACE]))
+    )
     if len(road.group) < SURE_OF_ROAD and not guess.still:
         covariance = UNSURE**2 * covariance
     state = start + solution.x[STATE]
     floor = STILL_FLOOR if guess.still or np.hypot(*state[3:5]) < LEAST_M else FLOOR
     motion = unknowns.covariance(solution.x, covariance) + floor
-    kinds = [(step.pair(each.group)[1], each.rays_b, values(unknowns, each, solution.x)) for each in (fitting, road)]
-    seen = seen_points(step.second.cameras, *kinds)
+    seen = seen_points(
+        step.second.cameras,
+        *((step.pair(term.group)[1], term.rays_b, values(unknowns, term, solution.x)) for term in (fitting, road)),
+    )
     return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
-
-
-@dataclass(frozen=True)
-class StillPoints(EpipolarResiduals):
-    """Points that stay where they are in the image: they tell the rotation, since there is no direction of driving."""
-
-    def of(self, geometry: GroupGeometry) -> Array:
-        """(N, 3) pixels."""
-        turns = geometry.camera_b_from_camera_a[self.group, :3, :3]
-        return self.focal[:, None] * (np.einsum("nij,nj->ni", turns, self.rays_a) - self.rays_b)
-
-
-def _still(step: StepViews, points: EpipolarResiduals) -> StillPoints:
-    """The points of single cameras."""
-    inside = step.of_single_cameras(points)
-    return StillPoints(inside.group, inside.rays_a, inside.rays_b, inside.focal)
 
 
 def _terms(step: StepViews, unknowns: StepUnknowns, residuals: tuple[Residuals, ...], x: Array) -> list[Term]:
     """The residuals with the spread of those of each pair of cameras."""
-    return [(each, spread(unknowns, each, x, each.group // PARTS)) for each in residuals if len(each.group)]
+    return [(term, spread(unknowns, term, x, term.group // PARTS)) for term in residuals if len(term.group)]
 
 
 def _common(

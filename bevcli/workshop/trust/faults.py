@@ -23,9 +23,9 @@ from bevcli.inference.options import TORCH
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.open import select
-from bevcli.workshop.odometry.check_motion import SomeFrames, chosen_places, stated_motion_findings
-from bevcli.workshop.odometry.frames import Viewer
+from bevcli.workshop.odometry.compare import SomeFrames, chosen_frames, stated_motion_findings
 from bevcli.workshop.odometry.stated import Poses
+from bevcli.workshop.odometry.views import Viewer
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
 from bevcli.workshop.trust.figures import figures_of
@@ -73,7 +73,7 @@ def find_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
 
 def input_faults(drive: Drive) -> tuple[Finding, ...]:
     """Faults of cameras and poses, which need no model."""
-    part, viewer = SomeFrames(drive, chosen_places(drive, STEPS)), Viewer()
+    part, viewer = SomeFrames(drive, chosen_frames(drive, STEPS)), Viewer()
     views, small = [], list[dict[str, Array]]()
     for place in range(len(part.stamps)):
         frame = part.load(place)

@@ -1,17 +1,50 @@
 """The option `odometry` of `open_sequence`: a drive with the motion that its images show."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from bevcli.frame import DerivedDrive, Drive, Frame
+from bevcli.geometry.transforms import inverse
 from bevcli.sequences.open import select, select_rate
-from bevcli.workshop.odometry import measure
-from bevcli.workshop.odometry.measure import MeasuredDrive, MeasuredMotion
+from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.workshop.odometry.report import check_measured, measured_note
 
 MOST_RATE_HZ = 10.0  # a faster drive is measured at this rate: shorter steps cost time and add errors
 FASTER = 1.5  # times this rate is thinned to it
+
+
+class MeasuredDrive(DerivedDrive):
+    """A drive with its measured motion: poses and kinematics of every frame, and poses at each camera's own time.
+
+    Ground truth in the world frame is moved with the vehicle.
+    """
+
+    def __init__(self, sequence: Drive, motion: MeasuredMotion) -> None:
+        super().__init__(sequence)
+        self.motion, self.ego_motion, self.has_ego_motion = motion, motion.ego_motion, True
+        self.facts = replace(sequence.facts, geo_origin=None, motion_measured=True)
+
+    def load(self, index: int) -> Frame:
+        return self._moved(self.sequence.load(index))
+
+    def ground_truth_frame(self, index: int) -> Frame:
+        return self._moved(self.sequence.ground_truth_frame(index))
+
+    def _moved(self, frame: Frame) -> Frame:
+        motion, time = self.motion.ego_motion, frame.stamp.timestamp_ns
+        times = {name: frame.images[name].timestamp_ns if name in frame.images else time for name in frame.rig.names}
+        pose, truth = motion.pose_at(time), frame.ground_truth
+        moved = pose.matrix @ inverse(frame.world_from_ego.matrix)
+        return replace(
+            frame,
+            world_from_ego=pose,
+            ground_truth=None if truth is None else truth.transformed(moved),
+            world_from_ego_at={name: motion.pose_at(at) for name, at in times.items()},
+            kinematics=motion.kinematics_at(time),
+            sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
+        )
 
 
 class MeasuredScenes(DerivedDrive):
@@ -43,7 +76,16 @@ def with_measured_motion(
     """
     scenes, notes = dict[str, MeasuredDrive](), list(drive.notes)
     for scene in dict.fromkeys(stamp.scene for stamp in drive.stamps):
-        motion = measured(at_most_rate(frames_between(drive, whole, scene)), after_step)
+        part = at_most_rate(frames_between(drive, whole, scene))
+        steps, total = list[MeasuredStep](), len(part.stamps) - 1
+        if after_step is not None and total:
+            after_step(0, total)
+        for step in measure_steps(part):
+            steps.append(step)
+            if after_step is not None:
+                after_step(len(steps), total)
+        motion = MeasuredMotion.of(part, steps)
+        check_measured(motion)
         scenes[scene] = MeasuredDrive(drive, motion)
         notes.append(measured_note(motion))
     result = MeasuredScenes(scenes) if len(scenes) > 1 else next(iter(scenes.values()))
@@ -54,14 +96,8 @@ def with_measured_motion(
 def frames_between(drive: Drive, whole: Drive, scene: str) -> Drive:
     """The frames of `whole` from the first to the last frame of `drive` in a scene."""
     times = [stamp.timestamp_ns for stamp in drive.stamps if stamp.scene == scene]
-    return select(
-        whole,
-        [
-            place
-            for place, stamp in enumerate(whole.stamps)
-            if stamp.scene == scene and times[0] <= stamp.timestamp_ns <= times[-1]
-        ],
-    )
+    between = [stamp.scene == scene and times[0] <= stamp.timestamp_ns <= times[-1] for stamp in whole.stamps]
+    return select(whole, np.flatnonzero(between).tolist())
 
 
 def at_most_rate(drive: Drive) -> Drive:
@@ -70,20 +106,3 @@ def at_most_rate(drive: Drive) -> Drive:
     if not len(steps) or np.median(steps) * FASTER * MOST_RATE_HZ > 1e9:
         return drive
     return select_rate(drive, MOST_RATE_HZ)
-
-
-def measured(drive: Drive, after_step: Callable[[int, int], None] | None = None) -> MeasuredMotion:
-    """The motion of a drive. after_step: as in `with_measured_motion`. Raises InputError where no step is measured."""
-    total, done = len(drive.stamps) - 1, 0
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        if after_step is not None:
-            after_step(done, total)
-
-    if after_step is not None and total:
-        after_step(0, total)
-    motion = measure.measure_motion(drive, after_step=advance)
-    check_measured(motion)
-    return motion

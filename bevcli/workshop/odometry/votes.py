@@ -1,14 +1,66 @@
-"""How far the vehicle drove, by matched points: each tells the way with which it lies on the road, or it stays.
+"""How far the vehicle drove between two frames: the votes of tiles of the road, and those of matched points.
 
-Points of the road agree. Higher ones tell a longer way, and vehicles ahead a shorter one. Drops on a lens tell nothing:
-they have no matches that move. So these votes hold where the road from above shows drops, or a bonnet.
+Tiles of the first road picture are compared with the second one at all distances along the way; those that look alike
+vote. Each matched point tells the way with which it lies on the road, or it stays. Points of the road agree. Higher
+ones tell a longer way, and vehicles ahead a shorter one. Drops on a lens tell nothing: they have no matches that move.
+So the votes of points hold where the road from above shows drops, or a bonnet.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
+from bevcli.workshop.odometry.views import BEGIN_M, CELL_M, SHAPE, RoadPicture, moved_picture
+
+TILE, ASIDE = 25, 2  # cells: side of a tile, and by how much it may lie beside the way
+LEAST_SEEN, LEAST_CONTRAST = 0.8, 8.0  # of a tile: share, and grey levels of standard deviation
+NOTHING, MOST = 0.15, 2.0  # of the vote of a tile, less of which is chance, and which is the largest
+WAY_M = 5.0  # tiles farther beside the vehicle count less: they are less often road
+
+
+def distance_votes(
+    first: RoadPicture, second: RoadPicture, heading: float, yaw: float, cells: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Distances (D,) in metres, and the votes (D,) of the tiles of the road for each.
+
+    heading: direction of the way in the first ego frame. yaw: by which the vehicle turned. cells: least and largest
+    distance, a negative one is driven backwards.
+    """
+    turns = (first, heading), (second, heading - yaw)
+    a, b = (moved_picture(picture, angle, np.zeros(2)) for picture, angle in turns)  # the way is along x
+    shifts = np.arange(cells[0], cells[1] + 1)
+    distances = np.asarray(CELL_M * shifts, dtype=np.float64)
+    correlations, weights = [], []
+    (height, width), last = SHAPE, SHAPE[1] - TILE
+    for row in range(ASIDE, height - TILE - ASIDE + 1, TILE):
+        strip = np.ascontiguousarray(b.texture[row - ASIDE : row + TILE + ASIDE])
+        covered = cv2.boxFilter(b.seen[row : row + TILE].mean(0, dtype=np.float32)[None], -1, (TILE, 1), anchor=(0, 0))
+        beside = BEGIN_M[1] + (row + TILE / 2) * CELL_M
+        for column in range(0, width - TILE + 1, TILE):
+            part = np.s_[row : row + TILE, column : column + TILE]
+            if a.seen[part].mean() < LEAST_SEEN or a.texture[part].std() < LEAST_CONTRAST:
+                continue
+            found = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[part]), cv2.TM_CCOEFF_NORMED).max(0)
+            at = column - shifts
+            inside = (at >= 0) & (at <= last)
+            usable = inside & (covered[0, at.clip(0, last)] >= LEAST_SEEN)
+            correlations.append(np.where(usable, found[at.clip(0, last)], np.nan))
+            weights.append(np.exp(-((beside / WAY_M) ** 2)))
+    if not correlations:
+        return distances, np.zeros(len(shifts))
+    return distances, _summed(np.stack(correlations), np.array(weights))
+
+
+def _summed(correlations: Array, weights: Array) -> Array:
+    """(D,) votes of tiles with correlations (tiles, D): what a tile says of a distance beyond what it says of all."""
+    seen = np.isfinite(correlations)
+    votes = -np.log(1.001 - np.clip(np.nan_to_num(correlations), 0, 1))
+    usual = np.array([np.median(vote[mask]) if mask.any() else 0.0 for vote, mask in zip(votes, seen, strict=True)])
+    votes = np.where(seen, np.clip(votes - usual[:, None] - NOTHING, 0, MOST), 0)
+    return np.asarray((weights[:, None] * votes).sum(0) / np.sqrt(1 + (weights[:, None] * seen).sum(0)))
+
 
 LEAST_PX = 1.5  # of the way in the image that is due to driving, without the turn
 LEAST_DOWN = 0.03  # sine of the angle below the horizon

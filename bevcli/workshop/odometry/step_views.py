@@ -1,6 +1,7 @@
-"""The unknowns of a step: the motion of the vehicle, the slope of the road, and the height of the cameras over it.
+"""Two frames: the points matched in both, and the unknowns of the step between them.
 
-The motion along a part of a step is the exponential of that part of its twist.
+The unknowns are the motion of the vehicle, the slope of the road, and the height of the cameras over it. The motion
+along a part of a step is the exponential of that part of its twist.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.transforms import Array, inverse, rigid
-from bevcli.workshop.correspondence.residuals import GroupGeometry, Indices
+from bevcli.workshop.correspondence.points import matched, neighbours
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices
+from bevcli.workshop.odometry.views import FrameView
 
 TURN, PLACE, SLOPES, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 8), 8  # the indices of the unknowns
 COUNT = 9
@@ -121,3 +124,80 @@ def logarithm(motion: Array) -> Array:
     """(6,) the twist of a motion (4, 4): its inverse."""
     turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
     return np.concatenate([turn, np.linalg.solve(_along(turn), motion[:3, 3])])
+
+
+PARTS = 6  # of a pair of images, whose agreement tells the deviations
+
+
+@dataclass(frozen=True)
+class StepViews:
+    """Two frames of C cameras. Their images form C x C groups, and each group has PARTS."""
+
+    first: FrameView
+    second: FrameView
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.first.cameras)
+
+    @property
+    def seconds(self) -> float:
+        """Between the frames."""
+        return (self.second.timestamp_ns - self.first.timestamp_ns) / 1e9
+
+    def pair(self, group: Indices) -> tuple[Indices, Indices]:
+        """The cameras of the first and of the second images of groups."""
+        return np.divmod(group // PARTS, self.cameras)
+
+    def group(self, first: Indices | int, second: Indices | int, rays_a: Array) -> Indices:
+        """(n,) the groups of points with rays (n, 3) in images of a first and of a second camera."""
+        part = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
+        return np.asarray((first * self.cameras + second) * PARTS + part, dtype=np.int64)
+
+    def of_single_cameras(self, points: EpipolarResiduals) -> EpipolarResiduals:
+        """The points whose images are of the same camera."""
+        return points.where(np.equal(*self.pair(points.group)))
+
+    def geometry(self, state: Array) -> GroupGeometry:
+        """The geometry of all groups for a state (8,)."""
+        unknowns = self.unknowns(state, np.ones(COUNT))
+        return unknowns.geometry(np.zeros((len(unknowns.shares), COUNT)))
+
+    def unknowns(self, start: Array, deviations: Array) -> StepUnknowns:
+        """The unknowns about a start (8,)."""
+        groups = self.pair(np.arange(self.cameras**2 * PARTS))
+        sides = list(zip((self.first, self.second), groups, strict=True))
+        a, b = (np.stack([camera.ego_from_camera for camera in view.cameras])[index] for view, index in sides)
+        shares = [side + view.late_s[index] / self.seconds for side, (view, index) in enumerate(sides)]
+        return StepUnknowns((a, b), np.stack(shares, -1), start, deviations)
+
+
+def match_points(step: StepViews) -> EpipolarResiduals:
+    """The matched points of each camera with itself and with its neighbours."""
+    nothing = np.zeros((0, 3))
+    parts = [(np.zeros(0, dtype=np.int64), nothing, nothing, np.zeros(0))]
+    for i, j in [(index, index) for index in range(step.cameras)] + neighbours(step.first.cameras):
+        first, second = step.first.features[i], step.second.features[j]
+        if first is None or second is None:
+            continue
+        rays_a, rays_b = matched(first, second, step.first.cameras[i], step.second.cameras[j])
+        focal = np.full(len(rays_a), step.first.cameras[i].intrinsics[0, 0])
+        parts.append((step.group(i, j, rays_a), rays_a, rays_b, focal))
+    return EpipolarResiduals(*map(np.concatenate, zip(*parts, strict=True))).sorted()
+
+
+@dataclass(frozen=True)
+class StillPoints(EpipolarResiduals):
+    """Points that stay where they are in the image: they tell the rotation, since there is no direction of driving."""
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 3) pixels."""
+        turns = geometry.camera_b_from_camera_a[self.group, :3, :3]
+        return self.focal[:, None] * (np.einsum("nij,nj->ni", turns, self.rays_a) - self.rays_b)
+
+
+def still_points(step: StepViews, points: EpipolarResiduals) -> StillPoints:
+    """The points of single cameras."""
+    inside = step.of_single_cameras(points)
+    return StillPoints(inside.group, inside.rays_a, inside.rays_b, inside.focal)
