@@ -21,7 +21,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.registry import entries, hub_of, known_models, load
+from bevcli.published import hub_model, is_of_hub, read_sources
+from bevcli.registry import entries, known_models, load
 
 T = TypeVar("T")
 
@@ -122,16 +123,12 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
         of a hub, such as "hf:OWNER/NAME".
     Raises ConfigError where there is no such file, or where it is no TOML, and WeightsError for a hub.
     """
-    if hub_of(name):
-        from bevcli.published import hub_model
-
+    if is_of_hub(name):
         of_hub = hub_model(name)
         return dict(of_hub.contents), str(of_hub.file)
     models, published = known_models(), {}
     has_own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file()
     if not name.endswith(".toml") and not has_own_weights:  # a name of the package is not in the table
-        from bevcli.published import read_sources
-
         published = read_sources()
     of_weights = published[name].model if name in published else ""
     file = model = of_weights or name

@@ -17,7 +17,6 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
 from bevcli.printing import counted, valid_text
-from bevcli.registry import load
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -107,8 +106,8 @@ class GroundLines:
 class FrameResult:
     """A further result of a model for one frame, or its ground truth.
 
-    Each type of results is a subclass, which is registered under `bevcli.results` by its kind. It brings its file, its
-    drawing and its entries of the legend; `ModelConfig.results` states the types that a model has, with their names.
+    Each type of results is a subclass. It brings its file, its drawing and its entries of the legend;
+    `ModelConfig.results` states the types that a model has, with their names.
 
     Attributes:
         kind: last part of its entities in a recording, such as "map_lines".
@@ -452,8 +451,9 @@ class Prediction:
 
         Raises InputError for an unknown camera or color order, and where `frame` is None.
         """
-        drawn: NDArray[np.uint8] = load("bevcli.plots", "prediction")(self, image, score, color_order)
-        return drawn
+        from bevcli.viewer.plot import plot
+
+        return plot(self, image, score, color_order)
 
     @property
     def failure(self) -> str:

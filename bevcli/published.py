@@ -18,7 +18,6 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.registry import hub_of, load
 from bevcli.writing import user_cache, user_folder, write_whole
 
 FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
@@ -169,13 +168,19 @@ class HubModel:
     source: str
 
 
+def is_of_hub(name: str) -> bool:
+    """True for the name of a model of the Hugging Face Hub, "hf:OWNER/NAME"."""
+    return name.startswith("hf:")
+
+
 def hub_model(name: str, *, fetch: bool = False) -> HubModel:
     """The model of a hub, downloaded if it is not on this machine.
 
-    name: of which `hub_of` gives the hub. fetch: look for a newer version of a model that is here. Raises BevcliError.
+    name: as of `is_of_hub`. fetch: look for a newer version of a model that is here. Raises BevcliError.
     """
-    model: HubModel = load("bevcli.hubs", hub_of(name))(name, fetch=fetch)
-    return model
+    from bevcli.workshop.hub.download import open_model
+
+    return open_model(name, fetch=fetch)
 
 
 def own_table() -> Path:

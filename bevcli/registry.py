@@ -1,23 +1,63 @@
-"""Models, formats, engines and commands by name: those of the core, of the workshop, and of other packages.
+"""Models, formats of drives, engines and commands by name: bevcli's own, and those of other packages.
 
 An installed package adds one by an entry point of a group (docs/extend.md). Nothing is imported before it is used.
 """
 
 from functools import cache
-from importlib import import_module, resources
+from importlib import resources
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from bevcli.errors import BevcliError, InputError
-from bevcli.registered import Group
+from bevcli.errors import BevcliError
 
-FLOORS = ("bevcli.registered", "bevcli.workshop.registered")
+Group = Literal["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.commands"]
 
-
-def own(group: Group) -> dict[str, str]:
-    """The entries of a group that bevcli has: name -> "module:attribute"."""
-    return {name: value for floor in FLOORS for name, value in import_module(floor).OWN.get(group, {}).items()}
+# Group -> name -> "module:attribute".
+OWN: dict[Group, dict[str, str]] = {
+    "bevcli.models": {
+        "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
+        "BEVFormerV2": "bevcli.workshop.bevformer_v2.bevformer_v2:BEVFormerV2",
+        "UniAD": "bevcli.workshop.uniad.uniad:UniAD",
+        "VAD": "bevcli.workshop.vad.vad:VAD",
+    },
+    "bevcli.sequences": {
+        "argoverse2": "bevcli.workshop.formats:ARGOVERSE2",
+        "dgp": "bevcli.workshop.formats:DGP",
+        "native": "bevcli.sequences.native:FORMAT",
+        "nuscenes": "bevcli.sequences.nuscenes:FORMAT",
+        "ros": "bevcli.workshop.formats:ROS",
+        "t4": "bevcli.workshop.formats:T4",
+        "video": "bevcli.workshop.formats:VIDEO",
+    },
+    "bevcli.engines": {
+        "onnxruntime": "bevcli.workshop.engines.engine:OnnxRuntimeEngine",
+        "openvino": "bevcli.workshop.engines.engine:OpenVinoEngine",
+    },
+    "bevcli.commands": {
+        "batch": "bevcli.workshop.batch.commands:batch",
+        "bench": "bevcli.workshop.benchmark.commands:bench",
+        "calibrate": "bevcli.workshop.calibration.commands:calibrate",
+        "checks": "bevcli.workshop.checks.commands:checks",
+        "convert": "bevcli.workshop.formats.commands:convert",
+        "demo": "bevcli.workshop.synth.commands:demo",
+        "eval": "bevcli.workshop.scores.commands:evaluate",
+        "export": "bevcli.workshop.formats.commands:export",
+        "export-onnx": "bevcli.workshop.engines.commands:export_onnx",
+        "odometry": "bevcli.workshop.odometry.commands:odometry",
+        "project-debug": "bevcli.cli.commands:project_debug",
+        "quantize": "bevcli.workshop.engines.commands:quantize",
+        "render": "bevcli.workshop.synth.commands:render",
+        "reproduce": "bevcli.workshop.batch.commands:reproduce",
+        "run": "bevcli.cli.run:run",
+        "samples": "bevcli.cli.commands:samples",
+        "stress": "bevcli.workshop.robustness.commands:stress",
+        "train": "bevcli.workshop.training.commands:train",
+        "validate": "bevcli.workshop.training.commands:validate",
+        "viz": "bevcli.cli.commands:viz",
+        "weights": "bevcli.cli.weights:weights_app",
+    },
+}
 
 
 @cache
@@ -29,7 +69,7 @@ def installed() -> Any:
 @cache
 def entries(group: Group) -> dict[str, EntryPoint]:
     """The entries of a group by name, in the order of their names. Raises BevcliError where two have the same name."""
-    by_name = {name: EntryPoint(name, value, group) for name, value in own(group).items()}
+    by_name = {name: EntryPoint(name, value, group) for name, value in OWN[group].items()}
     for entry in installed().select(group=group):
         if entry.value.startswith("bevcli."):  # of an earlier version, which an editable install may still list
             continue
@@ -54,19 +94,6 @@ def load(group: Group, name: str) -> Any:
         raise BevcliError(
             f"entry point {group}: {name} = {registered[name].value} cannot be imported: {error}"
         ) from error
-
-
-def load_form(group: Group, form: str) -> Any:
-    """The format of files to write, as `load` gives it. form: its name, an option. Raises InputError."""
-    if form not in entries(group):
-        raise InputError(f"`form={form}`: unknown format (expected {', '.join(entries(group))})")
-    return load(group, form)
-
-
-def hub_of(name: str) -> str:
-    """The hub that the name of a model begins with, such as "hf" of "hf:OWNER/NAME"; "" for another name."""
-    hub, colon, _ = name.partition(":")
-    return hub if colon and hub in entries("bevcli.hubs") else ""
 
 
 def known_models() -> tuple[str, ...]:

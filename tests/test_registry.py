@@ -1,25 +1,28 @@
 """The registry: bevcli's own entries need no installation, and a fault of another package's is one clear line."""
 
+import re
 import tomllib
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import get_args
 
 import pytest
+from typer.testing import CliRunner
 
 from bevcli import registry
+from bevcli.cli.main import app
 from bevcli.errors import BevcliError
-from bevcli.registered import OWN, Group
+from bevcli.registry import OWN, Group
 
 GROUP = "bevcli.sequences"
 
 
 @pytest.fixture
 def installed(monkeypatch):
-    """Makes entry points of a group those of the given name -> object."""
+    """Makes the given (name, object) the entry points of a group."""
 
-    def install(*entries):
-        found = [EntryPoint(name, value, GROUP) for name, value in entries]
+    def install(*entries, group=GROUP):
+        found = [EntryPoint(name, value, group) for name, value in entries]
         monkeypatch.setattr(registry, "installed", lambda: EntryPoints(found))
         registry.entries.cache_clear()
         registry.load.cache_clear()
@@ -33,8 +36,8 @@ def installed(monkeypatch):
 @pytest.mark.parametrize("group", get_args(Group))
 def test_own_entries_need_no_metadata_of_an_installation(group, installed):
     installed()
-    assert list(registry.entries(group)) == sorted(registry.own(group))
-    assert all(registry.load(group, name) is not None for name in registry.own(group))
+    assert list(registry.entries(group)) == sorted(OWN[group])
+    assert all(registry.load(group, name) is not None for name in OWN[group])
 
 
 def test_bevcli_states_no_entry_points_of_its_own():
@@ -50,7 +53,7 @@ def test_a_new_format_of_bevcli_works_at_once(installed, monkeypatch):
 
 def test_metadata_of_an_earlier_version_of_bevcli_are_ignored(installed):
     installed(("native", "bevcli.native:FORMAT"), ("gone", "bevcli.sequences.gone:FORMAT"))
-    assert list(registry.entries(GROUP)) == sorted(registry.own(GROUP))
+    assert list(registry.entries(GROUP)) == sorted(OWN[GROUP])
     assert registry.load(GROUP, "native").expected
 
 
@@ -71,10 +74,23 @@ def test_two_packages_with_the_same_name_are_refused(installed):
     with pytest.raises(BevcliError, match='two packages register "one"'):
         registry.entries(GROUP)
     installed(("one", "json:loads"), ("one", "json:loads"))
-    assert list(registry.entries(GROUP)) == sorted([*registry.own(GROUP), "one"])
+    assert list(registry.entries(GROUP)) == sorted([*OWN[GROUP], "one"])
 
 
 def test_a_package_cannot_replace_a_format_of_bevcli(installed):
     installed(("ros", "json:loads"))
     with pytest.raises(BevcliError, match=r'two packages register "ros": bevcli.workshop.formats:ROS and json:'):
         registry.entries(GROUP)
+
+
+def test_a_broken_command_of_a_package_costs_a_warning(installed):
+    installed(("broken", "a_package_that_is_missing:run"), group="bevcli.commands")
+    shown = CliRunner().invoke(app, ["--help"])
+    assert shown.exit_code == 0
+    assert "  export " in shown.stdout
+    assert "  broken " not in shown.stdout
+    (warning,) = shown.stderr.splitlines()
+    assert re.match("warning: .*broken = a_package_that_is_missing:run cannot be imported: ", warning)
+    assert CliRunner().invoke(app, ["export", "--help"]).exit_code == 0
+    with pytest.raises(BevcliError, match="a_package_that_is_missing:run cannot be imported"):
+        CliRunner().invoke(app, ["broken"], catch_exceptions=False)

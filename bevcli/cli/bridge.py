@@ -20,7 +20,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
 from bevcli.printing import one_line, say
-from bevcli.registry import hub_of
+from bevcli.published import is_of_hub
 from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
@@ -188,7 +188,7 @@ def _require(value: Any, flag: _Flag) -> None:
     """
     reads, complete = flag.option.reads, flag.option.complete
     for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
-        if not text or "://" in text or (reads == "path or name" and hub_of(text)):
+        if not text or "://" in text or (reads == "path or name" and is_of_hub(text)):
             continue
         try:
             Path(text).stat()

@@ -222,7 +222,6 @@ def project_debug(
     """
     from bevcli.config import load_config
     from bevcli.inference.training_rigs import training_rig_notes
-    from bevcli.registry import load
     from bevcli.rig.check_calibration import check_calibration
     from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
     from bevcli.sequences.open import open_sequence
@@ -242,7 +241,9 @@ def project_debug(
 
             check = replace(check, report=with_findings(check.report, check_motion(open_drive)))
         if options.model is not None or options.against is not None:
-            gap = load("bevcli.comparisons", "rigs")(check, model, options.against, open_drive)
+            from bevcli.workshop.trust.gap_option import gap_of_rigs
+
+            gap = gap_of_rigs(check, model, options.against, open_drive)
             check = replace(check, further={"rig_gap": gap.to_dict()})
     folder = options.out or Path("runs") / f"{check.name}-project-debug"
     written = check.write(folder) + (gap.write(folder) if gap else [])

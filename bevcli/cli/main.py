@@ -135,7 +135,11 @@ class _Group(TyperGroup):
         """Write the commands by panels, with the summaries of their docstrings."""
         panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
         for name, entry in entries(GROUP).items():
-            command = load(GROUP, name)
+            try:
+                command = load(GROUP, name)
+            except BevcliError as error:  # of another package
+                say(f"warning: {error}", err=True)
+                continue
             text = command.info.help if isinstance(command, typer.Typer) else command.__doc__
             summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
             panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])

@@ -59,10 +59,9 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.published import hub_model, named_weights
-    from bevcli.registry import hub_of
+    from bevcli.published import hub_model, is_of_hub, named_weights
 
-    if hub_of(name):
+    if is_of_hub(name):
         found = hub_model(name, fetch=True)
         say(f"{found.source}\n{found.weights}\nnext: bevcli run SEQUENCE --model {name}")
         return
@@ -168,9 +167,9 @@ def pack(
     huggingface_hub does that. `--model hf:OWNER/NAME` then loads the model, equal to the last bit, and
     `--model hf:./DIR` before.
     """
-    from bevcli.registry import load
+    from bevcli.workshop.hub.pack import pack_model
 
-    files, notes = load("bevcli.packings", "hf")(name, out, options)
+    files, notes = pack_model(name, out, options)
     for note in notes:
         print_note(note)
     for file in files:

@@ -31,7 +31,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.registry import entries, hub_of, load
+from bevcli.published import all_weights, hub_model, is_of_hub, named_weights, weights_folder
+from bevcli.registry import entries, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
 from bevcli.weights import DownloadReport
@@ -282,9 +283,7 @@ def load_model(
         raise WeightsError(f"`model={chosen.model}`: is a file of weights: pass it as `weights={chosen.model}`")
     name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
     of_hub = None
-    if hub_of(name):  # here, because `fetch` looks for a newer version
-        from bevcli.published import hub_model
-
+    if is_of_hub(name):  # here, because `fetch` looks for a newer version
         of_hub = hub_model(name, fetch=chosen.fetch)
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
@@ -317,15 +316,11 @@ def load_model(
 def weights_file(path_or_name: Path) -> Path:
     """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
     name = str(path_or_name)
-    if hub_of(name):
-        from bevcli.published import hub_model
-
+    if is_of_hub(name):
         return hub_model(name).weights
     if path_or_name.suffix or path_or_name.is_file():
         return path_or_name
     if name not in known_models():
-        from bevcli.published import named_weights
-
         named_weights(name)  # raises WeightsError that lists the names
     return bundled_weights(name) or _published(name, ModelOptions())
 
@@ -337,8 +332,6 @@ def _published(
 
     otherwise: ends the message of the WeightsError where there are none.
     """
-    from bevcli.published import all_weights, weights_folder
-
     named = all_weights(options.weights_dir).get(name)
     if named is not None and named.here is not None:
         return named.here

@@ -20,7 +20,6 @@ from bevcli.inference.frames_from_memory import (
 )
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState, one_command, read_commands
-from bevcli.registry import load
 
 
 def run(
@@ -234,7 +233,9 @@ class Session:
         """
         gap_ns = 0 if self._last_ns is None else frame.stamp.timestamp_ns - self._last_ns
         if self._meter is None or gap_ns > self._runner.config.max_gap_s * 1e9:
-            self._meter = load("bevcli.motion", "live")()
+            from bevcli.workshop.odometry.measure import LiveMotion
+
+            self._meter = LiveMotion()
         before, pose = self._meter.add(frame)
         # A frame without images has left the memory as it was.
         if before is not None and self.frame is not None and self._state.stamp == self.frame.stamp:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.object_classes import Color, ObjectClass
-from bevcli.registry import entries
 
 WORLD = "world"
 EGO = "world/ego"
@@ -65,6 +64,11 @@ LEGEND = "legend"
 EVENTS = "events"
 RUN = "run"
 FUTURES = "futures"  # a kind of lines on the ground
+# Last parts of the entities below "bev" that are no lines of a model's results.
+OTHER_BELOW_BEV = {
+    *("features", "segmentation", "history", "range_rings", "vehicle", "boxes", "tracks", "ground_truth", "probes"),
+    "models",
+}
 
 FRAME_TIMELINE = "frame"
 TIME_TIMELINE = "time"
@@ -135,9 +139,10 @@ def overlay(name: str, kind: str) -> str:
     return f"{camera(name)}/{kind}"
 
 
-def line_kinds() -> tuple[str, ...]:
-    """The last parts of the entities of lines on the ground, such as "map_lines"."""
-    return (*entries("bevcli.results"), FUTURES)
+def line_kinds(recorded: Iterable[str]) -> list[str]:
+    """Kinds of lines on the ground among the entities of a recording, such as "map_lines"; futures come last."""
+    below = {entity.removeprefix(f"{BEV}/").partition("/")[0] for entity in recorded if entity.startswith(f"{BEV}/")}
+    return [*sorted(below - OTHER_BELOW_BEV - {FUTURES}), FUTURES]
 
 
 def class_colors(classes: Iterable[ObjectClass]) -> dict[str, Color]:

@@ -1,4 +1,4 @@
-"""Format: an input format, registered under `bevcli.sequences`."""
+"""Format: an input format, of the group "bevcli.sequences" of the registry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.options import defaults
-from bevcli.parsing.files import is_there
 from bevcli.registry import entries, load
 from bevcli.sequences.options import FormatOptions, InputOptions
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 TrueResult = Callable[["Frame"], "FrameResult | None"]  # of a frame with its pose, in its bev frame
 GROUP: Final = "bevcli.sequences"
-TRUE_RESULTS: Final = "bevcli.true_results"
 ROOT_DEPTH = 2  # levels of folders between a data set's root and its drives, such as ROOT/val/LOG
 FEW = 4  # names in a message
 
@@ -102,22 +100,6 @@ def format_of(path: Path) -> Format:
     if others:
         raise InputError(f"{path}: is {first.name} and {others[0].name}: keep the files of one format there")
     return first
-
-
-def true_result_files(form: str) -> list[str]:
-    """Names of the files and folders with further ground truth that a drive of a format may have."""
-    return [name.removeprefix(f"{form}/") for name in entries(TRUE_RESULTS) if name.startswith(f"{form}/")]
-
-
-def true_results(form: str, folder: Path, **facts: Any) -> tuple[TrueResult, ...]:
-    """Readers of the further ground truth in the folder of a drive.
-
-    facts: of the drive, which those of this format take beside the path. Raises InputError.
-    """
-    from bevcli.sequences.files.incremental_json import existing  # imports OpenCV, which `--help` must not
-
-    names = [name for name in true_result_files(form) if is_there(existing(folder / name))]
-    return tuple(load(TRUE_RESULTS, f"{form}/{name}")(folder / name, **facts) for name in names)
 
 
 def is_drive(path: Path) -> bool:

@@ -13,7 +13,6 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
-from bevcli.registry import load
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive
 from bevcli.sequences.options import InputOptions
@@ -80,8 +79,9 @@ def open_sequence(path: str | Path, options: InputOptions | None = None, **chang
         sequence = select_range(sequence, options.frames)
     if not options.odometry:
         return sequence
-    measured: Drive = load("bevcli.motion", "drive")(sequence, whole, options.after_step)
-    return measured
+    from bevcli.workshop.odometry.drives import with_measured_motion
+
+    return with_measured_motion(sequence, whole, options.after_step)
 
 
 def _drive_of(root: Path, name: str) -> Path | None:

@@ -1,1 +1,1 @@
-"""The workshop: what stands beside a run, in wings. Each is found by `registered.py`; the core does not know them."""
+"""The workshop: what stands beside a run, in wings. The core imports one in a function that needs it."""

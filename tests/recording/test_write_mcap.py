@@ -19,8 +19,8 @@ from bevcli.geometry.transforms import rotation_from_quaternion
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import WriteOptions
+from bevcli.workshop.formats.convert import open_writer
 from bevcli.workshop.formats.mcap_writer import Messages
-from bevcli.workshop.formats.output import open_writer
 
 
 class Truthful(MemoryDrive):

@@ -1,4 +1,4 @@
-"""A new type of results: one class, its name in the registry, and the model that has it."""
+"""A new type of results: one class, and the model that has it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from memory_drive import MemoryDrive
 
-from bevcli import registry
 from bevcli.frame import FrameResult, Ground, GroundLines
 from bevcli.inference.load import Model
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelOutputs
 from bevcli.recording import entities
-from bevcli.registered import OWN
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.viewer.recording_reader import RecordingReader
@@ -68,15 +65,7 @@ class Stopping(BEVFormer):
         yield StopLine(10.0)
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    monkeypatch.setitem(OWN["bevcli.results"], "stop_line", f"{__name__}:StopLine")
-    registry.entries.cache_clear()
-    yield
-    registry.entries.cache_clear()
-
-
-def test_a_new_result_has_a_file_a_drawing_and_a_legend(registered, mini_config, tmp_path):
+def test_a_new_result_has_a_file_a_drawing_and_a_legend(mini_config, tmp_path):
     settings = {field.name: getattr(mini_config, field.name) for field in fields(ModelConfig)}
     model = Model(Stopping(StoppingConfig(**settings)).eval())
     run_into_folder(model, MemoryDrive(2), tmp_path / "out")
@@ -87,10 +76,3 @@ def test_a_new_result_has_a_file_a_drawing_and_a_legend(registered, mini_config,
         assert frame.texts(entities.RUN, "line_names")[0] == "stop line"
         from_above = draw_frame(frame, tiles(frame), CameraImages())[:, 1280:].astype(int)
         assert (np.abs(from_above - RED[::-1]).max(-1) < 60).sum() > 10
-
-
-def test_types_of_results_are_registered_by_their_kind_and_file():
-    kinds = {name: registry.load("bevcli.results", name) for name in registry.entries("bevcli.results")}
-    assert {name: kind.kind for name, kind in kinds.items()} == {name: name for name in kinds}
-    files = {f"native/{kind.true_file}" for kind in kinds.values() if kind.true_file}
-    assert files == {name for name in registry.entries("bevcli.true_results") if name.startswith("native/")}

@@ -17,7 +17,8 @@ from bevcli.frame import BevMap
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import NativeWriter, open_writer
+from bevcli.workshop.formats.convert import open_writer
+from bevcli.workshop.formats.output import NativeWriter
 
 
 def convert(*arguments):

@@ -12,7 +12,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.map_lines import LINE_CLASSES, TRUE_LINES, read_lines
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, read_lines
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive, render as render_sequence
 from bevcli.workshop.synth.looks import WEATHER_NAMES
@@ -47,7 +47,7 @@ def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDri
 
 def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive, Path]):
     drive, folder = written
-    lines = read_lines(folder / TRUE_LINES)
+    lines = read_lines(folder / LINES_FILE)
     assert (lines.frame_of_reference, lines.classes, len(lines.frames)) == ("world", LINE_CLASSES, 2)
     rendered = drive.frame(1)
     world_from_bev = rendered.world_from_ego.matrix @ drive.rig.ego_from_bev

@@ -1,6 +1,6 @@
 """calibration.json: the cameras of the rig, the bev frame in which the model predicts, and facts of the drive.
 
-`draft_rig` reads calibrations of other programs too, by the readers of the group "bevcli.calibrations".
+`draft_rig` reads calibrations of other programs too, by the wing `formats`.
 """
 
 import json
@@ -18,7 +18,6 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
-from bevcli.registry import load
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
 from bevcli.writing import write_whole
 
@@ -83,8 +82,9 @@ def draft_rig(path: Path | None, drive: Path | None = None, **how: Any) -> RigDr
     how = {name: value for name, value in how.items() if value is not None}
     file = None if path is None else _own_file(path)
     if file is None:
-        made: RigDraft = load("bevcli.calibrations", "files")(path, drive, **how)
-        return made
+        from bevcli.workshop.formats.calibrations import read_rig
+
+        return read_rig(path, drive, **how)
     for name in how:
         raise InputError(f"{file}: states all of the rig: remove `{name}`")
     return draft_calibration(file)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,8 @@ from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there, open_regular
-from bevcli.registry import entries, load
 from bevcli.sequences.options import RigOptions
 
-GROUP: Final = "bevcli.poses"
 TRANSLATION = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ACCELERATION = ("ax", "ay", "az")
@@ -66,17 +63,17 @@ class ReadPoses:
 
 
 def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
-    """The poses of ego_motion.csv, or of a file of a kind that is registered under `bevcli.poses`.
+    """The poses of ego_motion.csv, or of a file of another program, by the wing `formats`.
 
-    Each entry of that group is a function of the same arguments, which returns None for a file that it does not know.
     Raises InputError, and FrameTimesNeeded for a file whose times only those of the frames can explain.
     """
     if _is_own(path):
         return ReadPoses(read_ego_motion(path))
-    for name in entries(GROUP):
-        found: ReadPoses | None = load(GROUP, name)(path, drive)
-        if found is not None:
-            return found
+    from bevcli.workshop.formats.poses import read_poses as read_poses_of_others
+
+    poses = read_poses_of_others(path, drive)
+    if poses is not None:
+        return poses
     try:
         return ReadPoses(read_ego_motion(path))
     except InputError as error:

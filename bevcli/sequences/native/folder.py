@@ -22,13 +22,14 @@ from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft
 from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_poses
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
-from bevcli.sequences.format import true_results
+from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.options import EgoMotionUse, InputOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
+LINES_FILE = "ground_truth_lines.json"
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
 NO_IMAGE = "no image in frames.csv"
 
@@ -74,7 +75,7 @@ class FolderDrive(ListedDrive):
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
-        self._true_results = true_results("native", path) if has_truth else ()
+        self._true_lines = _true_lines(path) if has_truth else None
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
@@ -101,10 +102,8 @@ class FolderDrive(ListedDrive):
         boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
         bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
         frame = replace(super()._frame(place, entry), ground_truth=boxes, ground_truth_map=bev_map)
-        if not self.has_ego_motion:
-            return frame
-        results = (result for of_frame in self._true_results if (result := of_frame(frame)) is not None)
-        return replace(frame, ground_truth_results=tuple(results))
+        lines = self._true_lines(frame) if self._true_lines and self.has_ego_motion else None
+        return frame if lines is None else replace(frame, ground_truth_results=(lines,))
 
     def _true_boxes(self, index: int, world_from_ego: Pose | None) -> Boxes3D | None:
         """A frame's boxes in the world frame, or without pose in the ego frame; None if the file lacks the frame.
@@ -121,6 +120,15 @@ class FolderDrive(ListedDrive):
         else:
             boxes = self._boxes.in_ego(truth)
         return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
+
+
+def _true_lines(folder: Path) -> TrueResult | None:
+    """The reader of the lines of the map; None without their file. Raises InputError."""
+    if not is_there(existing(folder / LINES_FILE)):
+        return None
+    from bevcli.workshop.formats.map_lines import TrueLines
+
+    return TrueLines(folder / LINES_FILE)
 
 
 def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:

@@ -14,8 +14,9 @@ from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.format import true_results
+from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import (
@@ -192,16 +193,14 @@ class NuScenesDrive(TableDrive):
         tables = tables_of(root, own.version)
         super().__init__(root, tables, common, NUSCENES, own)
         self.name = common.scene or own.split or tables.name
-        self._true_results = true_results("nuscenes", root, tables=tables) if common.ground_truth else ()
+        self._true_lines = _true_lines(root, tables) if common.ground_truth else None
         note = self._can_bus_note()
         self.notes = (*self.notes, note) if note else self.notes
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
         frame = super()._frame(entry, with_images=with_images)
-        if entry.sample is None:
-            return frame
-        results = (result for of_frame in self._true_results if (result := of_frame(frame)) is not None)
-        return replace(frame, ground_truth_results=tuple(results))
+        lines = self._true_lines(frame) if self._true_lines and entry.sample is not None else None
+        return frame if lines is None else replace(frame, ground_truth_results=(lines,))
 
     def _can_bus_note(self) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in self.scenes]
@@ -210,6 +209,16 @@ class NuScenesDrive(TableDrive):
             return ""
         which = without[0] if len(without) == 1 else f"{len(without)} of {len(names)} scenes"
         return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"
+
+
+def _true_lines(root: Path, tables: Path) -> TrueResult | None:
+    """The reader of the lines of the map; None for a root without the map expansion. Raises InputError."""
+    folder = root / "maps/expansion"
+    if not is_there(folder):
+        return None
+    from bevcli.workshop.formats.map_lines import MapExpansion
+
+    return MapExpansion(folder, tables)
 
 
 def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:

@@ -10,7 +10,6 @@ from typing import Literal
 
 from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
-from bevcli.registry import entries
 from bevcli.sequences.format import Format
 from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.options import FormatOptions, RigOptions
@@ -93,11 +92,10 @@ class WriteOptions:
 
     form: str = option(
         default="native",
-        help="native: a sequence folder. nuscenes: a nuScenes root. mcap: one file for Foxglove and ROS 2, with boxes. "
-        "Or the format of an installed package.",
+        help="native: a sequence folder. nuscenes: a nuScenes root. mcap: one file for Foxglove and ROS 2, with boxes.",
         flag="--format",
         metavar="NAME",
-        complete=lambda incomplete: list(entries("bevcli.drive_writers")),
+        complete=lambda incomplete: ["mcap", "native", "nuscenes"],
     )
     force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
     boxes: Path | None = option(
@@ -114,10 +112,10 @@ class ExportOptions:
 
     form: str = option(
         help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
-        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. Or the format of an installed package.",
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json.",
         flag="--format",
         metavar="NAME",
-        complete=lambda incomplete: list(entries("bevcli.box_formats")),
+        complete=lambda incomplete: ["csv", "json", "kitti", "nuscenes", "nuscenes-tracking"],
     )
     out: Path | None = option(
         default=None, help="Default: a name that depends on the format, such as boxes.csv, next to PREDICTIONS."

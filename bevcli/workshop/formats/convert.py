@@ -6,18 +6,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import IMPOSSIBLE
 from bevcli.options import spread
 from bevcli.printing import counted
-from bevcli.registry import load
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats import LabelOptions, WriteOptions
+from bevcli.workshop.formats import LabelOptions, WriteOptions, mcap_writer, nuscenes_writer
 from bevcli.workshop.formats.labels import WithLabels
-from bevcli.workshop.formats.output import GROUP, open_writer
+from bevcli.workshop.formats.output import NATIVE, DriveWriter, OutputFormat
+
+DRIVE_FORMATS: dict[str, OutputFormat] = {
+    "mcap": mcap_writer.OUTPUT,
+    "native": NATIVE,
+    "nuscenes": nuscenes_writer.OUTPUT,
+}
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,20 @@ def drive_to_convert(source: Path, out: Path, common: InputOptions, labels: Labe
     return sequence if labels.labels is None else WithLabels(sequence, labels.labels, labels)
 
 
+def open_writer(path: Path, sequence: Drive, options: WriteOptions) -> DriveWriter:
+    """The writer of a path in the format `options.form`.
+
+    Raises InputError for an unknown format, an option of another format or a drive that the format cannot hold, and
+    OutputError where the path cannot be written.
+    """
+    if options.form not in DRIVE_FORMATS:
+        raise InputError(f"`form={options.form}`: unknown format (expected {', '.join(DRIVE_FORMATS)})")
+    chosen = DRIVE_FORMATS[options.form]
+    if options.boxes is not None and not chosen.takes_boxes:
+        raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
+    return chosen.opener(path, sequence, options)
+
+
 def write_drive(
     sequence: Drive, out: Path, written: WriteOptions, on_frame: Callable[[Frame], None] = lambda frame: None
 ) -> Converted:
@@ -81,7 +100,7 @@ def write_drive(
     gaps, images, boxes = 0, 0, 0
     left_out, reasons = set[str](), dict[str, str]()
     with open_writer(out, sequence, written) as writer:
-        form = load(GROUP, written.form)
+        form = DRIVE_FORMATS[written.form]
         for place in range(len(sequence.stamps)):
             frame = sequence.load(place)
             gaps, reasons = gaps + len(frame.dropped), reasons | dict(frame.dropped)

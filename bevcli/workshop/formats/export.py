@@ -5,15 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bevcli.errors import InputError
 from bevcli.options import gather
 from bevcli.printing import counted
-from bevcli.registry import load_form
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes, write_boxes
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import read_recording
 from bevcli.workshop.formats import ExportOptions
+from bevcli.workshop.formats.kitti import export_kitti
 from bevcli.writing import check_output
 
 
@@ -30,6 +31,17 @@ class BoxFormat:
 
     target: str
     write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
+
+
+BOX_FORMATS = {
+    "csv": BoxFormat("boxes.csv", lambda boxes, to, *_: counted(write_csv(boxes, to), "boxes")),
+    "json": BoxFormat("boxes.json", lambda boxes, to, *_: counted(write_boxes(boxes, to), "boxes")),
+    "kitti": BoxFormat("kitti", export_kitti),
+    "nuscenes": BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples")),
+    "nuscenes-tracking": BoxFormat(
+        "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
+    ),
+}
 
 
 def export(
@@ -57,7 +69,9 @@ def export(
     """
     given = Path(predictions)
     chosen = gather(ExportOptions, options, changes)
-    form: BoxFormat = load_form("bevcli.box_formats", chosen.form)
+    if chosen.form not in BOX_FORMATS:
+        raise InputError(f"`form={chosen.form}`: unknown format (expected {', '.join(BOX_FORMATS)})")
+    form = BOX_FORMATS[chosen.form]
     file = given / "predictions.json" if given.is_dir() else given
     target = chosen.out or file.parent / form.target
     check_output(target, file)
@@ -73,11 +87,3 @@ def _boxes_of(file: Path, report: Callable[[str], None]) -> BoxesFile:
         if whole != file:
             report(f"{file} is incomplete (its run was stopped or is still going)")
         return read_recording(whole)
-
-
-CSV = BoxFormat("boxes.csv", lambda boxes, target, *_: counted(write_csv(boxes, target), "boxes"))
-JSON = BoxFormat("boxes.json", lambda boxes, target, *_: counted(write_boxes(boxes, target), "boxes"))
-DETECTION = BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples"))
-TRACKING = BoxFormat(
-    "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
-)

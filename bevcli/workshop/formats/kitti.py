@@ -22,8 +22,7 @@ from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.workshop.formats import ExportOptions, LabelOptions
-from bevcli.workshop.formats.export import BoxFormat
-from bevcli.workshop.formats.labels import LabelFormat, LabelledFrame, Labels, Moment
+from bevcli.workshop.formats.label_format import LabelFormat, LabelledFrame, Labels, Moment
 from bevcli.workshop.formats.markup import parse_xml
 from bevcli.writing import write_whole
 
@@ -108,7 +107,7 @@ def _recognises(path: Path) -> bool:
 LABELS = LabelFormat("KITTI labels (.txt, or a folder of these)", _recognises, read_kitti_labels)
 
 
-def _export(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
+def export_kitti(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     """Write the labels of a camera, with the calibration that a run and a sequence folder have next to the boxes."""
     path = options.calibration or source.parent / CALIBRATION
     if options.calibration is None and not path.is_file():
@@ -124,9 +123,6 @@ def _export(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path
         raise InputError(f'{path}: has no camera "{name}" (expected one of {", ".join(rig.names)})')
     labels = write_kitti(boxes, rig[name], rig.ego_from_bev, target)
     return f"{counted(len(boxes.frames), 'frames')}, {counted(labels, 'labels')} of {name}"
-
-
-BOXES = BoxFormat("kitti", _export)
 
 
 def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""LabelFormat: a format of labels, registered under `bevcli.label_formats`; a drive with the boxes of such a file.
+"""A drive with the boxes of a file of labels.
 
 Here is the format of CSV tables with the columns of `bevcli export --format csv`.
 """
@@ -7,11 +7,11 @@ import codecs
 import csv
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby, pairwise, zip_longest
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -23,68 +23,17 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted
-from bevcli.registry import entries, load
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.open import scenes_of
-from bevcli.workshop.formats import LabelOptions, UnlistedFrames
+from bevcli.workshop.formats import LabelOptions, UnlistedFrames, kitti
+from bevcli.workshop.formats.label_format import LabelFormat, LabelledFrame, Labels, Moment
 
-GROUP = "bevcli.label_formats"
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
-FrameOfReference = Literal["world", "ego", "bev"]
-Moment = tuple[int | None, int | None]  # index and time of a frame, ns, as in LabelledFrame
-
-
-@dataclass(frozen=True)
-class LabelledFrame:
-    """The boxes of one frame.
-
-    Attributes:
-        index: of the frame; None if the file has times only.
-        timestamp_ns: of the frame; None if the file has indices only.
-        boxes: in the frame of reference of the file.
-    """
-
-    index: int | None
-    timestamp_ns: int | None
-    boxes: Boxes3D
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The contents of a file of labels.
-
-    Attributes:
-        frame_of_reference: of all boxes.
-        frames: in the order of the file.
-        lists_empty: frames without boxes are in the file, too. If not, a frame of the drive that the file does not
-            have may be empty or not labelled.
-        notes: what was assumed, for the user.
-    """
-
-    frame_of_reference: FrameOfReference
-    frames: tuple[LabelledFrame, ...]
-    lists_empty: bool
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class LabelFormat:
-    """A format of labels.
-
-    Attributes:
-        name: with an article, for messages.
-        recognises: whether a file has this format; looks at its name, or at a few bytes.
-        read: reads a file of a drive with this rig. Raises InputError.
-    """
-
-    name: str
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path, CameraRig, LabelOptions], Labels]
 
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     """The labels of a file of any known format. rig: of the drive. Raises InputError."""
-    formats: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
+    formats = (CSV, kitti.CVAT, kitti.LABELS, kitti.TRACKLETS)
     form = next((form for form in formats if form.recognises(path)), None)
     if form is None:
         raise InputError(f"{path}: is no file of labels (expected {' or '.join(form.name for form in formats)})")

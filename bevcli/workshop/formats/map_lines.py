@@ -24,12 +24,12 @@ from bevcli.parsing.documents import read_json
 from bevcli.recording.entities import map_colors
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import array_of_numbers
+from bevcli.sequences.native.folder import LINES_FILE
 from bevcli.sequences.nuscenes.tables import read_rows
 
 FORMAT = "bevcli-map-lines/1"
 # The classes of the true lines of drives, which are those of the published VAD.
 LINE_CLASSES = ("divider", "ped_crossing", "boundary")
-TRUE_LINES = "ground_truth_lines.json"  # of a native sequence folder
 DECIMALS = 3  # millimetres
 _FRAMES_OF_REFERENCE = ("world", "ego")
 # Bright, because lines of the map are thin.
@@ -84,7 +84,7 @@ class MapLines(FrameResult):
     kind = "map_lines"
     file_name = "map_lines.json"
     writer = LinesWriter
-    true_file = TRUE_LINES
+    true_file = LINES_FILE
     true_names = LINE_CLASSES
 
     points: tuple[Array, ...]
@@ -183,7 +183,7 @@ def _score(value: Any, where: str) -> float:
 class TrueLines:
     """The true lines of a native sequence folder: called with a frame, those in its bev frame, or None.
 
-    The pose of the frame must be known. file: `TRUE_LINES`. Raises InputError where it is wrong.
+    The pose of the frame must be known. file: `LINES_FILE`. Raises InputError where it is wrong.
     """
 
     def __init__(self, file: Path) -> None:

@@ -1,4 +1,4 @@
-"""OutputFormat: a format that drives are written in, registered under `bevcli.drive_writers`; native folders."""
+"""OutputFormat: a format that drives are written in; native folders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -20,18 +20,15 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of
-from bevcli.registry import load_form
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
-from bevcli.sequences.format import true_result_files
-from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER, FolderDrive
+from bevcli.sequences.native.folder import BOXES_FILE, LINES_FILE, MAPS_FOLDER, FolderDrive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import WriteOptions
 from bevcli.writing import output_errors, remove_parts, whole_file, write_whole
 
-GROUP: Final = "bevcli.drive_writers"
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
 SUFFIXES = {"jpeg": ".jpg", "png": ".png"}
 
@@ -146,20 +143,8 @@ class OutputFormat:
         return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 
-def open_writer(path: Path, sequence: Drive, options: WriteOptions) -> DriveWriter:
-    """The writer of a path in the format `options.form`.
-
-    Raises InputError for an unknown format, an option of another format or a drive that the format cannot hold, and
-    OutputError where the path cannot be written.
-    """
-    chosen: OutputFormat = load_form(GROUP, options.form)
-    if options.boxes is not None and not chosen.takes_boxes:
-        raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
-    return chosen.opener(path, sequence, options)
-
-
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
-PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
+PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, LINES_FILE)
 
 
 class NativeWriter(FolderWriter):
@@ -180,7 +165,7 @@ class NativeWriter(FolderWriter):
     def __init__(
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
-        super().__init__(folder, (*PARTS, *true_result_files("native")), force=force)
+        super().__init__(folder, PARTS, force=force)
         self._facts = facts or DriveFacts()
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None

@@ -19,7 +19,7 @@ from bevcli.printing import aligned, counted, number
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes import is_nuscenes_root
-from bevcli.workshop.formats.map_lines import LINE_CLASSES, TRUE_LINES, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, FrameLines, LinesFile, MapLines, read_lines
 from bevcli.workshop.scores.inputs import Compared, FramePairs, ScoredInput
 from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.vad import driving_metrics as metrics
@@ -178,7 +178,7 @@ def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> metrics.LineSco
 def _true_lines(truth: ScoredInput) -> LinesFile:
     """The true lines of the map: those next to a boxes file, or those of a drive in the world frame."""
     if truth.open_drive is None:
-        file = truth.path.with_name(TRUE_LINES)
+        file = truth.path.with_name(LINES_FILE)
         if not file.exists():
             raise InputError(
                 f"{file}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)"
