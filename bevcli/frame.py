@@ -277,27 +277,39 @@ Sequence = Drive  # the name that version 0.2 had for it
 
 
 class DerivedDrive(Drive):
-    """A sequence made from another one, with all that the other states. A subclass changes some of it."""
+    """A drive made from another one, with all that the other states. A subclass changes some of it.
 
-    def __init__(self, sequence: Drive) -> None:
-        self.sequence = sequence
-        self.name, self.rig, self.stamps = valid_text(sequence.name), sequence.rig, sequence.stamps
-        self.has_ego_motion, self.notes, self.facts = sequence.has_ego_motion, sequence.notes, sequence.facts
-        self.ego_motion = sequence.ego_motion
+    A subclass that changes frames overrides `change`, or `load`, which then gives the frames for scoring too.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self.name, self.rig, self.stamps = valid_text(drive.name), drive.rig, drive.stamps
+        self.has_ego_motion, self.notes, self.facts = drive.has_ego_motion, drive.notes, drive.facts
+        self.ego_motion = drive.ego_motion
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        return self.sequence.input_files
+        return self.drive.input_files
 
     @property
     def class_counts(self) -> Mapping[str, int]:
-        return self.sequence.class_counts
+        return self.drive.class_counts
 
     def image_files(self, index: int) -> tuple[Path, ...]:
-        return self.sequence.image_files(index)
+        return self.drive.image_files(index)
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        """The frame at an index with its changes; for scoring it may have no images."""
+        return frame
+
+    def ground_truth_frame(self, index: int) -> Frame:
+        if type(self).load is not DerivedDrive.load:
+            return self.load(index)
+        return self.change(index, self.drive.ground_truth_frame(index))
 
     def load(self, index: int) -> Frame:
-        return self.sequence.load(index)
+        return self.change(index, self.drive.load(index))
 
 
 @dataclass(frozen=True)

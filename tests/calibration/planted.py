@@ -19,9 +19,9 @@ class ThroughLens(DerivedDrive):
         self.rig = replace(self.rig, cameras=tuple(_with_lens(each, lens, zoom) for each in self.rig.cameras))
 
     def load(self, index: int) -> Frame:
-        frame = self.sequence.load(index)
+        frame = self.drive.load(index)
         images = {}
-        for plain, camera in zip(self.sequence.rig.cameras, self.rig.cameras, strict=True):
+        for plain, camera in zip(self.drive.rig.cameras, self.rig.cameras, strict=True):
             pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
             source = plain.project(camera.rays(pixels))[0].astype(np.float32)
             seen = frame.images[camera.name]
@@ -38,7 +38,7 @@ class BlackImages(DerivedDrive):
     """A drive with black images."""
 
     def load(self, index: int) -> Frame:
-        frame = self.sequence.load(index)
+        frame = self.drive.load(index)
         black = {name: replace(one, pixels_bgr=np.zeros_like(one.pixels_bgr)) for name, one in frame.images.items()}
         return replace(frame, images=black)
 

@@ -18,8 +18,9 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.calibration import calibrate as calibrating, in_turn
-from bevcli.workshop.calibration.calibrate import DriveWithRig, findings_of
+from bevcli.workshop.calibration.calibrate import findings_of
 from bevcli.workshop.calibration.estimates import Verdict, common_delay_text, either_text
 from bevcli.workshop.calibration.views import match_points
 
@@ -52,7 +53,7 @@ def result(street, matched):
     drive, _, wrong = street
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrating, "match_points", lambda views: matched.append(match_points(views)) or matched[-1])
-        return bevcli.calibrate(DriveWithRig(drive, wrong))
+        return bevcli.calibrate(DriveView(drive, rig=wrong))
 
 
 def test_a_planted_rotation_is_found(street, result):
@@ -90,10 +91,10 @@ def test_errors_are_within_four_standard_deviations(street, result):
 def test_lens_distortion_is_respected(street, lens, zoom):
     _, right, wrong = street
     drive = bevcli.open_sequence(STREET, frames=slice(5, 17), ground_truth=False)
-    seen = ThroughLens(DriveWithRig(drive, right), lens, zoom)
+    seen = ThroughLens(DriveView(drive, rig=right), lens, zoom)
     poses = {each.name: each.ego_from_camera for each in wrong.cameras}
     stated = tuple(replace(each, ego_from_camera=poses[each.name]) for each in seen.rig.cameras)
-    found = bevcli.calibrate(DriveWithRig(seen, replace(seen.rig, cameras=stated)))
+    found = bevcli.calibrate(DriveView(seen, rig=replace(seen.rig, cameras=stated)))
     assert angle_deg(right, found.rig, TURNED) < 0.3
     assert found[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
 
@@ -201,7 +202,7 @@ def test_a_folder_without_ego_motion_is_refused(tmp_path):
 
 
 def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):
-    drive = DriveWithRig(DriveWithRig(street[0], street[2]), result.rig)
+    drive = DriveView(DriveView(street[0], rig=street[2]), rig=result.rig)
     assert drive.rig is result.rig
     assert drive.load(0).rig is result.rig
 
@@ -253,7 +254,7 @@ def test_motion_and_calibration_are_measured_until_both_stand(result, street, mo
         return replace(result, rig=turned_by(street[1], left_deg[-1]))
 
     monkeypatch.setattr(in_turn, "calibrate", halved)
-    drive, steps = DriveWithRig(street[0], turned_by(street[1], 0.12)), []
+    drive, steps = DriveView(street[0], rig=turned_by(street[1], 0.12)), []
     found = in_turn.calibrate_in_turn(drive, with_motion=with_motion, after_step=lambda: steps.append(1))
     assert left_deg == [0.12, 0.06, 0.03, 0.015]  # the last change is less than 0.02°
     assert (found.rounds, len(steps)) == (3, 3 * in_turn.MOTION_STEPS)

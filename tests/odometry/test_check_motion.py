@@ -14,11 +14,11 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
+from bevcli.sequences.view import select
 from bevcli.workshop.calibration import calibrate
 from bevcli.workshop.calibration.core_options import check_motion as check
 from bevcli.workshop.odometry import compare as comparing
 from bevcli.workshop.odometry.compare import (
-    SomeFrames,
     chosen_frames,
     compare,
     stated_motion_findings,
@@ -115,7 +115,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch):
 def street():
     """The sample drive, and what its images show."""
     drive = bevcli.open_sequence(STREET, ground_truth=False)
-    return drive, measure_motion(SomeFrames(drive, chosen_frames(drive)))
+    return drive, measure_motion(select(drive, chosen_frames(drive)))
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.odometry.drives import MeasuredDrive
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, MotionMeter, measure_motion
 
 STREET = "samples/street"
@@ -38,7 +38,7 @@ def test_the_motion_of_a_rendered_drive_is_found() -> None:
     way = sum(float(np.linalg.norm(step[:3, 3])) for step in true)
     end = inverse(inverse(drive.load(0).world_from_ego.matrix) @ drive.load(7).world_from_ego.matrix) @ motion.poses[-1]
     assert np.linalg.norm(end[:3, 3]) < 0.005 * way
-    moved = MeasuredDrive(drive, motion).load(4)
+    moved = DriveView(drive, motions={drive.stamps[0].scene: motion.ego_motion}).load(4)
     np.testing.assert_allclose(moved.kinematics.velocity, drive.load(4).kinematics.velocity, atol=0.15)
 
 
@@ -65,7 +65,8 @@ def test_boxes_stay_where_they_are_seen() -> None:
     drive = open_sequence(STREET)
     times = np.array([stamp.timestamp_ns for stamp in drive.stamps])
     steps = tuple(MeasuredStep(step, np.eye(6)) for step in true_steps(drive))
-    before, after = drive.load(5), MeasuredDrive(drive, MeasuredMotion("street", times, steps)).load(5)
+    motion = MeasuredMotion("street", times, steps).ego_motion
+    before, after = drive.load(5), DriveView(drive, motions={drive.stamps[0].scene: motion}).load(5)
     assert before.ground_truth is not None
     assert after.ground_truth is not None
     seen = [each.ground_truth.transformed(inverse(each.world_from_ego.matrix)) for each in (before, after)]

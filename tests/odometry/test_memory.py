@@ -30,7 +30,7 @@ class ToAndFro(DerivedDrive):
         self.rig = replace(sequence.rig, cameras=(sequence.rig.cameras[0].scaled(0.5),))
 
     def load(self, index: int) -> Frame:
-        frame, stamp, (camera,) = self.sequence.load(self._places[index]), self.stamps[index], self.rig.cameras
+        frame, stamp, (camera,) = self.drive.load(self._places[index]), self.stamps[index], self.rig.cameras
         image = frame.images[camera.name]
         half = cv2.resize(image.pixels_bgr, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         images = {camera.name: replace(image, timestamp_ns=stamp.timestamp_ns, pixels_bgr=half.astype(np.uint8))}

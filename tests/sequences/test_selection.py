@@ -1,17 +1,25 @@
 """Parts of a sequence: frame ranges, every N-th frame, and thinning to a frame rate."""
 
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.frame import Drive, FrameStamp
-from bevcli.sequences.open import open_sequence, select_every, select_range, select_rate
+from bevcli.frame import DerivedDrive, Drive, FrameStamp
+from bevcli.rig.sequence_checks import CheckedDrive
+from bevcli.sequences import images
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.view import DriveView, select_every, select_range, select_rate
+from bevcli.workshop.trust.faults import ReversedColors
 
 START_NS = 1_533_151_603_000_000_000
 
 
 class MadeDrive(Drive):
-    """A sequence of frames at given seconds. `load` returns the frame's position."""
+    """A sequence of frames at given seconds. `load` returns what tells the frame's position."""
 
     name, rig, has_ego_motion = "drive", None, True
 
@@ -23,12 +31,12 @@ class MadeDrive(Drive):
         )
 
     def load(self, place):
-        return place
+        return SimpleNamespace(position=place, ground_truth=None)
 
 
 def kept(sequence):
     """Positions in the original sequence."""
-    return [sequence.load(place) for place in range(len(sequence.stamps))]
+    return [sequence.load(place).position for place in range(len(sequence.stamps))]
 
 
 @pytest.mark.parametrize(("rate", "step"), [(12, 6), (10, 5), (4, 2), (30, 15)])
@@ -111,6 +119,45 @@ def test_range_counts_the_frames_that_are_left_after_thinning(drive):
 def test_invalid_rate_is_an_error(drive, options):
     with pytest.raises(InputError, match="`rate_hz"):
         open_sequence(drive, **options)
+
+
+def test_views_of_views_are_one_view_of_the_drive(drive):
+    whole = open_sequence(drive)
+    view = open_sequence(drive, every=2, frames=slice(1, 2))
+    assert view.drive is not None
+    assert not isinstance(view.drive, DerivedDrive)
+    assert [stamp.index for stamp in view.stamps] == [12]
+    assert view.load(0).stamp == whole.load(2).stamp
+    assert view.image_files(0) == whole.image_files(2)
+
+
+def test_a_selection_counts_the_boxes_of_its_frames(drive):
+    boxes = [{"class": "Car", "center": [9 + index, 0, 1], "size_lwh": [4, 2, 1.5], "yaw": 0} for index in range(3)]
+    frames = [
+        {"frame": 10 + index, "timestamp_ns": 10**9 + index * 5 * 10**8, "boxes": boxes[:index]} for index in range(4)
+    ]
+    content = {"format": "bevcli-boxes/1", "frame_of_reference": "ego", "frames": frames}
+    (drive / "ground_truth.json").write_text(json.dumps(content))
+    assert open_sequence(drive).class_counts == {"car": 6}
+    assert open_sequence(drive, every=2).class_counts == {"car": 2}
+    assert open_sequence(drive, frames=slice(3, 4)).class_counts == {"car": 3}
+
+
+class Reversed(DerivedDrive):
+    """A derived drive that states its frames whole."""
+
+    def load(self, index):
+        return self.drive.load(len(self.stamps) - 1 - index)
+
+
+def test_derived_drives_decode_no_image_for_scoring(drive, monkeypatch):
+    whole = open_sequence(drive)
+    turned = DriveView(whole, rig=replace(whole.rig, ego_from_bev=np.eye(4)))
+    assert Reversed(whole).ground_truth_frame(0).stamp.index == 13  # what only states `load`
+    monkeypatch.setattr(images, "decode_image", None)  # as each image would be
+    for derived in (DerivedDrive(whole), turned, ReversedColors(whole), CheckedDrive(whole), DriveView(turned, [1])):
+        assert not derived.ground_truth_frame(0).images
+    assert (turned.ground_truth_frame(0).rig.ego_from_bev == np.eye(4)).all()
 
 
 def test_invalid_step_is_an_error(drive):

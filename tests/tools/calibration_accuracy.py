@@ -77,7 +77,7 @@ class WrongTimes(DerivedDrive):
         self._camera, self._late_ns = camera, round(late_ms * 1e6)
 
     def load(self, index: int) -> Frame:
-        frame, name, motion = self.sequence.load(index), self._camera, self.ego_motion
+        frame, name, motion = self.drive.load(index), self._camera, self.ego_motion
         if name not in frame.images or motion is None:
             return frame
         time = frame.images[name].timestamp_ns + self._late_ns

@@ -25,7 +25,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
-from bevcli.sequences.open import select
+from bevcli.sequences.view import select
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition
 from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.synth.drives import RenderedDrives

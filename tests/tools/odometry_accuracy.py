@@ -23,7 +23,7 @@ from bevcli.inference.load import load_model
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.odometry.drives import MeasuredDrive
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
 from bevcli.workshop.training.options import ValidationOptions
 from bevcli.workshop.training.train import score_drives
@@ -93,7 +93,7 @@ class WithoutPoses(DerivedDrive):
         self.has_ego_motion, self.ego_motion = False, None
 
     def load(self, index: int) -> Frame:
-        frame, nowhere = self.sequence.load(index), Pose.from_matrix(np.eye(4))
+        frame, nowhere = self.drive.load(index), Pose.from_matrix(np.eye(4))
         still = replace(frame.kinematics, angular_rate=np.zeros(3), velocity=np.zeros(3))
         return replace(
             frame,
@@ -192,7 +192,10 @@ def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iter
     loaded = load_model(model)
     options, chosen = InputOptions(every=1, classes=loaded.config.classes), ValidationOptions(each=True)
     right = [open_sequence(path, options) for path in paths]
-    measured_drives = [MeasuredDrive(drive, motion) for drive, motion in zip(right, motions, strict=True)]
+    measured_drives = [
+        DriveView(drive, motions=dict.fromkeys((stamp.scene for stamp in drive.stamps), motion.ego_motion))
+        for drive, motion in zip(right, motions, strict=True)
+    ]
     found = []
     for name, drives in (("right", right), ("measured", measured_drives)):
         opened = OpenDrives(list(drives))

@@ -29,7 +29,7 @@ class Planted(DerivedDrive):
         self.change, self.rig = change, rig or drive.rig
 
     def load(self, index: int) -> Frame:
-        return replace(self.change(self.sequence, index, self.sequence.load(index)), rig=self.rig)
+        return replace(self.change(self.drive, index, self.drive.load(index)), rig=self.rig)
 
 
 def with_pixels(image: CameraImage, pixels) -> CameraImage:
@@ -131,7 +131,7 @@ class OtherPoses(DerivedDrive):
         return Pose.from_matrix(self._change(self._start, matrix))
 
     def load(self, index: int) -> Frame:
-        frame = self.sequence.load(index)
+        frame = self.drive.load(index)
         at = {name: self._changed(pose.matrix) for name, pose in frame.world_from_ego_at.items()}
         return replace(frame, world_from_ego=self._changed(frame.world_from_ego.matrix), world_from_ego_at=at)
 
@@ -236,7 +236,7 @@ class Standing(DerivedDrive):
         self.ego_motion = replace(motion, **poses, **still)
 
     def load(self, index: int) -> Frame:
-        frame, first = self.sequence.load(index), self.sequence.load(0)
+        frame, first = self.drive.load(index), self.drive.load(0)
         random = np.random.default_rng(index)
         images = {}
         for name, image in first.images.items():

@@ -15,7 +15,7 @@ from bevcli.frame import Drive
 from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.sequences.open import select_range
+from bevcli.sequences.view import select_range
 from bevcli.workshop.synth.drives import FolderDrives
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.validation import validate

@@ -91,6 +91,13 @@ class ClassNames:
             return boxes
         return replace(boxes, classes=np.array([names[name] for name in boxes.classes.tolist()]))
 
+    def counts(self, counts: Mapping[str, int]) -> Counter[str]:
+        """Numbers of boxes by the file's names -> the same by the names of known classes."""
+        renamed: Counter[str] = Counter()
+        for name, count in counts.items():
+            renamed[self[name]] += count
+        return renamed
+
     def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
         """A note about boxes whose class is not known, if there are any.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import DerivedDrive, Drive, DriveFacts, Frame
+from bevcli.frame import Drive, DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
@@ -234,17 +234,6 @@ class CalibrationResult:
         write_whole(report, f"{self.to_json()}\n".encode(), parents=True)
         write_calibration(rig, self.rig, self.facts)
         return [rig, report]
-
-
-class DriveWithRig(DerivedDrive):
-    """A drive with another rig in every frame."""
-
-    def __init__(self, sequence: Drive, rig: CameraRig) -> None:
-        super().__init__(sequence)
-        self.rig = rig
-
-    def load(self, index: int) -> Frame:
-        return replace(self.sequence.load(index), rig=self.rig)
 
 
 def calibrate(

@@ -7,6 +7,7 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.printing import say
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.calibration import calibrate as calibration
 from bevcli.workshop.calibration.estimates import Verdict, change_text
 from bevcli.workshop.odometry.compare import stated_motion_findings, without_consequences
@@ -19,7 +20,7 @@ def corrected(drive: Drive) -> Drive:
     for camera in result.cameras:
         reason = change_text(camera) if camera.verdict is Verdict.CORRECTED else camera.reason
         say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
-    return calibration.DriveWithRig(drive, result.rig)
+    return DriveView(drive, rig=result.rig)
 
 
 def check_motion(open_drive: Callable[[], Drive]) -> tuple[Finding, ...]:

@@ -14,8 +14,9 @@ from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, DriveWithRig, calibrate
+from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, calibrate
 from bevcli.workshop.calibration.estimates import RigEstimate
 from bevcli.workshop.odometry.drives import with_measured_motion
 
@@ -49,8 +50,8 @@ def calibrate_in_turn(
     measured = with_motion or (lambda drive, after_step: with_measured_motion(drive, drive, after_step))
     rounds, still = 0, False
     while rounds < MOST_ROUNDS and not still:
-        moving = measured(DriveWithRig(drive, rig), _in_parts(after_step))
-        result = calibrate(DriveWithRig(moving, drive.rig), chosen, after_step=after_step)
+        moving = measured(DriveView(drive, rig=rig), _in_parts(after_step))
+        result = calibrate(DriveView(moving, rig=drive.rig), chosen, after_step=after_step)
         rounds, still, rig = rounds + 1, stands_still(rig, result.rig), result.rig
     whole, motion, places = _without_scale(result, chosen), moving.ego_motion, range(len(moving.stamps))
     poses = [

@@ -35,7 +35,8 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
-from bevcli.sequences.open import open_sequence, select_range
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.view import select_range
 from bevcli.workshop.engines import OnnxOptions
 from bevcli.workshop.engines.export_form import export_form
 from bevcli.workshop.engines.export_onnx import (

@@ -24,7 +24,7 @@ from bevcli.parsing.documents import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import count_classes
-from bevcli.sequences.open import scenes_of
+from bevcli.sequences.view import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames, kitti
 from bevcli.workshop.formats.label_format import LabelFormat, LabelledFrame, Labels, Moment
 
@@ -71,13 +71,7 @@ class WithLabels(DerivedDrive):
     def class_counts(self) -> Mapping[str, int]:
         return count_classes(self._boxes.values())
 
-    def ground_truth_frame(self, index: int) -> Frame:
-        return self._labelled(self.sequence.ground_truth_frame(index), index)
-
-    def load(self, index: int) -> Frame:
-        return self._labelled(self.sequence.load(index), index)
-
-    def _labelled(self, frame: Frame, index: int) -> Frame:
+    def change(self, index: int, frame: Frame) -> Frame:
         return replace(frame, ground_truth=self._boxes.get(index), impossible_boxes=0)
 
     def _summary(self) -> str:

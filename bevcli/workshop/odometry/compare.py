@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
-from bevcli.frame import Drive, Frame
+from bevcli.frame import Drive
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
-from bevcli.geometry.transforms import Array, Pose, rotation_about_z
+from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
-from bevcli.sequences.open import Selection
+from bevcli.sequences.view import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
 from bevcli.workshop.odometry.stated import FREEDOMS, MeasuredSteps, Poses, mistakes, steps_between, turn_between
 
@@ -333,42 +333,26 @@ BETWEEN_NS = 400_000_000  # between two frames
 MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to this, radians; and that it moves
 
 
-class SomeFrames(Selection):
-    """Some frames of a drive. It keeps the poses of those that were loaded, by their times."""
-
-    def __init__(self, drive: Drive, indices: list[int]) -> None:
-        super().__init__(drive, indices)
-        self.poses: dict[int, Pose] = {}
-
-    def load(self, index: int) -> Frame:
-        frame = super().load(index)
-        self.poses[frame.stamp.timestamp_ns] = frame.world_from_ego
-        return frame
-
-    @property
-    def stated(self) -> EgoMotion:
-        """The poses of the drive: in its table, or of the frames that were loaded."""
-        if self.ego_motion is not None:
-            return self.ego_motion
-        times, poses = zip(*sorted(self.poses.items()), strict=True)
-        rows = (
-            np.array(times),
-            np.stack([pose.translation for pose in poses]),
-            np.stack([pose.quaternion for pose in poses]),
-        )
-        return EgoMotion(*rows, *derive_kinematics(*rows), velocities_are_stated=False)
-
-
 def stated_motion_findings(drive: Drive, steps: int = STEPS) -> tuple[Finding, ...]:
     """Findings about the stated poses of a drive, from a few measured steps; none for a drive without poses."""
     if not drive.has_ego_motion:
         return ()
-    some = SomeFrames(drive, chosen_frames(drive, steps))
+    some = DriveView(drive, chosen_frames(drive, steps))
     try:
         measured = measure_motion(some)
     except InputError as error:
         return (not_compared(str(error)),)
-    return compare(some.stated, measured, [stamp.index for stamp in some.stamps])
+    return compare(stated_poses(some), measured, [stamp.index for stamp in some.stamps])
+
+
+def stated_poses(drive: Drive) -> EgoMotion:
+    """The poses of a drive: in its table, or of its frames."""
+    if drive.ego_motion is not None:
+        return drive.ego_motion
+    times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
+    poses = [drive.ground_truth_frame(index).world_from_ego for index in range(len(times))]
+    rows = times, np.stack([pose.translation for pose in poses]), np.stack([pose.quaternion for pose in poses])
+    return EgoMotion(*rows, *derive_kinematics(*rows), velocities_are_stated=False)
 
 
 def chosen_frames(drive: Drive, steps: int = STEPS) -> list[int]:

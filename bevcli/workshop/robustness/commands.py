@@ -38,7 +38,8 @@ def stress(
     from bevcli.cli.progress import Progress, load_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
-    from bevcli.sequences.open import open_sequence, select_range
+    from bevcli.sequences.open import open_sequence
+    from bevcli.sequences.view import select_range
     from bevcli.workshop.robustness.conditions import choose_conditions
     from bevcli.workshop.robustness.stress import read_results, stress, stress_table
     from bevcli.workshop.synth.drives import RenderedDrives

@@ -16,7 +16,7 @@ from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics, motion_during
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.sequences.open import select
+from bevcli.sequences.view import select
 from bevcli.workshop.robustness.options import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
@@ -51,13 +51,6 @@ class ChangedDrive(DerivedDrive):
     def __init__(self, sequence: Drive, level: Level, draws: Draws, lost_images: LostImage = "black") -> None:
         super().__init__(sequence)
         self._level, self._draws, self._lost_images = level, draws, lost_images
-
-    def load(self, index: int) -> Frame:
-        return self.change(index, self.sequence.load(index))
-
-    def change(self, index: int, frame: Frame) -> Frame:
-        """The frame at an index with its change."""
-        raise NotImplementedError
 
     def random(self, stamp: FrameStamp, *keys: str | int) -> np.random.Generator:
         """A generator for the scene of a frame and further keys; it does not depend on where the drive is stored."""
@@ -182,7 +175,7 @@ class EgoMotionLost(ChangedDrive):
     def change(self, index: int, frame: Frame) -> Frame:
         last = self._last_arrived(index)
         if last not in self._arrived:
-            earlier = frame if last == index else self.sequence.load(last)
+            earlier = frame if last == index else self.drive.load(last)
             self._arrived[last] = earlier.world_from_ego, earlier.kinematics
         if last == index:
             return frame

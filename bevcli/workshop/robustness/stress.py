@@ -21,8 +21,8 @@ from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
-from bevcli.sequences.open import scenes_of, select
-from bevcli.workshop.calibration.calibrate import DriveWithRig, calibrate
+from bevcli.sequences.view import DriveView, scenes_of, select
+from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.scores.detection import evaluate_detections, known_mean
@@ -299,7 +299,7 @@ class _StressRun:
 def _calibrated(sequence: Drive) -> Drive:
     """The sequence with the rig that it shows; itself where it shows none."""
     try:
-        return DriveWithRig(sequence, calibrate(sequence).rig)
+        return DriveView(sequence, rig=calibrate(sequence).rig)
     except InputError:
         return sequence
 

@@ -326,10 +326,10 @@ class KeptFrames(DerivedDrive):
         self._memory, self._key = memory, key
 
     def ground_truth_frame(self, index: int) -> Frame:
-        return self.sequence.ground_truth_frame(index)
+        return self.drive.ground_truth_frame(index)
 
     def load(self, index: int) -> Frame:
-        return self._memory.load(self.sequence, self._key, index)
+        return self._memory.load(self.drive, self._key, index)
 
 
 class KeptDrives:

@@ -22,8 +22,8 @@ from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
-from bevcli.sequences.open import select
-from bevcli.workshop.odometry.compare import SomeFrames, chosen_frames, stated_motion_findings
+from bevcli.sequences.view import select
+from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.views import Viewer
 from bevcli.workshop.synth.rig import nuscenes_like_rig
@@ -47,8 +47,7 @@ BETTER = 0.015  # confidence, that the right order of colours gains; the wrong o
 class ReversedColors(DerivedDrive):
     """A drive whose images have their colour channels in reverse order."""
 
-    def load(self, index: int) -> Frame:
-        frame = self.sequence.load(index)
+    def change(self, index: int, frame: Frame) -> Frame:
         return replace(frame, images={name: _reversed(image) for name, image in frame.images.items()})
 
 
@@ -73,7 +72,7 @@ def find_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
 
 def input_faults(drive: Drive) -> tuple[Finding, ...]:
     """Faults of cameras and poses, which need no model."""
-    part, viewer = SomeFrames(drive, chosen_frames(drive, STEPS)), Viewer()
+    part, viewer = select(drive, chosen_frames(drive, STEPS)), Viewer()
     views, small = [], list[dict[str, Array]]()
     for place in range(len(part.stamps)):
         frame = part.load(place)
@@ -83,7 +82,7 @@ def input_faults(drive: Drive) -> tuple[Finding, ...]:
     if not drive.has_ego_motion or len(views) < 2:
         return findings
     broken = {finding.camera for finding in findings}
-    rows = Poses.of(part.stated)
+    rows = Poses.of(stated_poses(part))
     points = {name: each for name, each in points_of(views, rows).items() if name not in broken}
     motion = stated_motion_findings(drive, POSE_STEPS)
     return (*findings, *one_cause(motion, camera_findings(points, rows, drive.rig), len(points)))
