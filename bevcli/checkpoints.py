@@ -1,5 +1,6 @@
 """Weights files: reads the official .pth and our .safetensors into the state dict of our model."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
+from bevcli.parsing.pth import Placeholder, read_pth
 from bevcli.printing import counted
 from bevcli.writing import check_output, write_whole
 
@@ -26,6 +28,7 @@ INTEGER_KEY = "num_batches_tracked"
 PREFIXES = r"(?:(?:module|model)\.)*"  # of all names: DistributedDataParallel, Lightning
 AVERAGES = r"ema[_.]|n_averaged$"  # MMCV's EMAHook, PyTorch's AveragedModel
 AVERAGED_PREFIXES = r"(?:(?:ema_)?(?:module|model)\.|ema[_.])*"  # where a file has averages only
+LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
 WRAPPERS = ("state_dict", "model", "model_state_dict")  # keys that a file may hold its state dict under
 LEAST_SHARE = 0.5  # of a model's tensors, that a file must hold for a difference in words
 OFFICIAL = ("img_backbone.", "img_neck.", "pts_bbox_head.")  # of names in the released files
@@ -269,29 +272,45 @@ def expected_state(config: ModelConfig) -> dict[str, Tensor]:
 
 
 def _read_pth(path: Path, left_out: list[str]) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
-    from bevcli.parsing.pth import Placeholder, StoredTensor, read_pth
-
     file = read_pth(path)
     contents = state = file.contents
     if isinstance(contents, dict):
-        wrapper = next((key for key in WRAPPERS if not isinstance(contents.get(key), StoredTensor | None)), "")
+        wrapper = next((key for key in WRAPPERS if not isinstance(contents.get(key), Tensor | None)), "")
         state = contents[wrapper] if wrapper else contents
         left_out += [f'everything but "{wrapper}"'] if wrapper not in ("", WRAPPERS[0]) else []
     named = state if isinstance(state, dict) else {"": state}
-    hidden = [f"{key}: {each.made_by}".removeprefix(": ") for key, each in named.items() if type(each) is Placeholder]
+    placeholders = {key: value for key, value in named.items() if isinstance(value, Placeholder)}
+    hidden = [f"{key}: {value.made_by}".removeprefix(": ") for key, value in placeholders.items()]
     if hidden:
         raise WeightsError(
             f"{path}: is not safe to read: its tensors are hidden behind code ({hidden[0]:.100}), which was not run "
             "(expected tensors by name, at the top level or under state_dict or model)"
         )
-    is_named = isinstance(state, dict) and all(isinstance(key, str) for key in named)
-    if not (state and is_named and all(isinstance(each, StoredTensor) for each in named.values())):
+    tensors = {key: tensor for key, tensor in named.items() if isinstance(key, str)}
+    if not tensors or not all(isinstance(value, Tensor) for value in tensors.values()):
         raise WeightsError(
             f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict or model)"
         )
+    size = path.stat().st_size
+    for name, tensor in tensors.items():
+        # A tensor may repeat numbers by a stride of 0, but not by overlapping rows: those only inflate a small file.
+        has_numbers = tensor.layout == torch.strided and not tensor.is_meta
+        distinct = (
+            math.prod(n for n, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
+            if has_numbers
+            else 0
+        )
+        if not has_numbers or distinct > size or tensor.numel() > LARGEST_SIZE:
+            raise WeightsError(
+                f"{path}: tensor {name}: its shape {tuple(tensor.shape)} reaches beyond its numbers in the file"
+            )
     meta = contents.get("meta")
     facts = {key: _fact(meta.get(key)) for key in ("epoch", "iter", "time")} if isinstance(meta, dict) else {}
-    return file.with_tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
+    return (
+        {key: tensor.detach() for key, tensor in tensors.items()},
+        {key: fact for key, fact in facts.items() if fact},
+        file.left_out,
+    )
 
 
 def _fact(value: object) -> str:

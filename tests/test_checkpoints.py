@@ -133,8 +133,8 @@ def test_weights_inspect_names_objects_that_were_not_read(tmp_path: Path) -> Non
     path = tmp_path / "small.pth"
     torch.save({"state_dict": small_model().state_dict(), "meta": {"date": datetime.datetime(2022, 8, 16)}}, path)
     answer = CliRunner().invoke(app, ["weights", "inspect", str(path)], catch_exceptions=False)
-    assert "not read        _codecs.encode, datetime.datetime (objects that are no weights" in answer.stdout
-    assert read_checkpoint(path).not_read == ("_codecs.encode", "datetime.datetime")
+    assert "not read        datetime.datetime (objects that are no weights" in answer.stdout
+    assert read_checkpoint(path).not_read == ("datetime.datetime",)
 
 
 def test_a_state_dict_fits_its_own_model_alone() -> None:

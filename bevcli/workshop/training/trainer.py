@@ -332,7 +332,7 @@ def load_checkpoint(
     if file.left_out:
         raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")
     try:
-        contents = file.with_tensors()
+        contents = file.contents
         if contents["format"] != FORMAT:
             raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r:.60}')
         trained.load_state_dict(contents["model"])
