@@ -145,6 +145,17 @@ def test_files_that_opencv_writes(tmp_path, suffix):
     assert_is_the_street(read(tmp_path / "rig", None).rig, lens=True)
 
 
+@pytest.mark.parametrize(
+    ("head", "tail", "message"),
+    [('<!DOCTYPE x [<!ENTITY a "b">]>', "", "declares the entity a"), ("", "<open>", "broken XML: mismatched tag")],
+)
+def test_xml_with_entities_or_mistakes_is_refused_in_one_line(head, tail, message, tmp_path):
+    (tmp_path / "camera.xml").write_text(f"<?xml version='1.0'?>{head}<opencv_storage>{tail}</opencv_storage>")
+    with pytest.raises(InputError, match=message) as caught:
+        bevcli.read_calibration(tmp_path / "camera.xml")
+    assert "\n" not in str(caught.value)
+
+
 EUROC = """%YAML:1.0
 sensor_type: camera
 T_BS: {{cols: 4, rows: 4, data: {pose}}}

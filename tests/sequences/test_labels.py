@@ -1,8 +1,7 @@
-"""Ground truth from files of labelling tools: a CSV table as spreadsheets write it, KITTI's and CVAT's files."""
+"""Ground truth from files of labelling tools: a CSV table as spreadsheets write it, and KITTI's."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes,
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
-from bevcli.workshop.formats.labels import WithLabels, _labelled_frames, read_labels
+from bevcli.workshop.formats.labels import WithLabels, _labelled_frames
 from bevcli.workshop.formats.output import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
@@ -142,49 +141,6 @@ def test_a_wrong_table_is_one_clear_line(text: str, message: str, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
-def cvat_text(**changes: object) -> str:
-    """An export with two frames, the second empty, and a cuboid that is turned by 0.7 about the vertical."""
-    cuboid = {
-        "id": 0, "type": "cuboid_3d", "attributes": {"occluded": False, "track_id": 7}, "group": 0, "label_id": 1,
-        "position": [1, 2, 3], "rotation": [0, 0, 0.7], "scale": [4, 2, 1],
-    }  # fmt: skip
-    items = [
-        {"id": "000000", "annotations": [cuboid | changes], "attr": {"frame": 0}, "point_cloud": {"path": ""}},
-        {"id": "000001", "annotations": [{"type": "label", "label_id": 0}], "attr": {"frame": 1}},
-    ]
-    labels = [{"name": name, "parent": "", "attributes": []} for name in ("Lorry", "PKW")]
-    return json.dumps({"info": {}, "categories": {"label": {"labels": labels, "attributes": []}}, "items": items})
-
-
-def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
-    path, drive = tmp_path / "default.json", MadeDrive()
-    path.write_text(cvat_text())
-    labelled = WithLabels(drive, path)
-    box = labelled.load(0).ground_truth.transformed(np.linalg.inv(drive.load(0).world_from_ego.matrix))
-    np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [1, 2, 3, 4, 2, 1, 0.7], atol=1e-9)
-    assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["7"])
-    assert [len(labelled.load(1).ground_truth), labelled.load(2).ground_truth] == [0, None]
-    assert not any("tilted" in note for note in labelled.notes)
-    path.write_text(cvat_text(rotation=[0.2, 0, 0.7]))
-    assert any("1 cuboids are tilted by more than 5°" in note for note in WithLabels(drive, path).notes)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"categories": {', 'is not a CVAT export "Datumaro 3D"'),
-        (cvat_text().replace('"attr": {"frame": 1}', '"attr": {}'), 'item 000001: "attr" has no "frame"'),
-        (cvat_text(label_id=2), r"item 000000: label_id is 2 \(expected 0 to 1"),
-        (cvat_text(rotation=[1]), "expected three numbers each"),
-    ],
-)
-def test_a_wrong_export_of_cvat_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "default.json").write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
-        WithLabels(MadeDrive(), tmp_path / "default.json")
-    assert "\n" not in str(caught.value)
-
-
 def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
     drive = MadeDrive()
     given = boxes_of_drive(drive)
@@ -225,74 +181,9 @@ def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path
         WithLabels(MadeDrive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
 
 
-# As CVAT 2 exports a track of two frames with a gap of one between them: a PKW, 4 m long, 2 m wide and 1.5 m high.
-POSE = "<item><tx>{}</tx><ty>2</ty><tz>1</tz><rx>0</rx><ry>0</ry><rz>0.7</rz><truncation>{}</truncation></item>"
-CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
-<!DOCTYPE boost_serialization>
-<boost_serialization version="9" signature="serialization::archive">
-<tracklets version="0" tracking_level="0" class_id="0"><count>1</count><item_version>1</item_version>
-<item version="1" tracking_level="0" class_id="1">
-<objectType>PKW</objectType><h>2.0</h><w>4.0</w><l>1.5</l><first_frame>1</first_frame>
-<poses version="0" tracking_level="0" class_id="2"><count>3</count><item_version>0</item_version>
-{POSE.format(8, 0)}{POSE.format(8, 2)}{POSE.format(12, 0)}
-</poses><finished>1</finished></item></tracklets></boost_serialization>"""
-
-
-def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
-    path = tmp_path / "tracklet_labels.xml"
-    path.write_text(CVAT_TRACKLETS)
-    labels = read_labels(path, MadeDrive().rig, LabelOptions())
-    assert [frame.index for frame in labels.frames] == [1, 3]
-    box = labels.frames[1].boxes
-    np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [12, 2, 1, 4, 2, 1.5, 0.7])
-    assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["0"])
-    assert any("CVAT's version" in note for note in labels.notes)
-    path.write_text(CVAT_TRACKLETS.replace("<item_version>0", "<item_version>2").replace('"yes"', '"true"'))
-    as_kitti = read_labels(path, MadeDrive().rig, LabelOptions())
-    assert [frame.index for frame in as_kitti.frames] == [1, 2, 3]
-    np.testing.assert_allclose([*as_kitti.frames[0].boxes.centers[0]], [8, 2, 2])  # 1 m is the bottom
-    np.testing.assert_allclose([*as_kitti.frames[0].boxes.sizes_lwh[0]], [1.5, 4, 2])
-
-
-@pytest.mark.parametrize(
-    ("hwl", "sizes"),
-    [
-        ((1.6, 1.9, 4.5), [4.5, 1.9, 1.6]),  # a car that Datumaro converted from KITTI
-        ((1.75, 0.6, 0.8), [0.8, 0.6, 1.75]),  # a pedestrian likewise
-        ((1.9, 4.5, 1.6), [4.5, 1.9, 1.6]),  # a car of CVAT
-        ((0.6, 0.8, 1.75), [0.8, 0.6, 1.75]),
-    ],
-)
-def test_sizes_of_tracklets_have_the_shape_of_an_object(hwl: tuple, sizes: list, tmp_path: Path) -> None:
-    height, width, length = hwl
-    text = CVAT_TRACKLETS.replace("<h>2.0</h><w>4.0</w><l>1.5</l>", f"<h>{height}</h><w>{width}</w><l>{length}</l>")
-    (tmp_path / "tracklet_labels.xml").write_text(text)
-    labels = read_labels(tmp_path / "tracklet_labels.xml", MadeDrive().rig, LabelOptions())
-    assert labels.frames[0].boxes.sizes_lwh[0].tolist() == sizes
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("<!DOCTYPE boost_serialization>", '<!DOCTYPE x [<!ENTITY a "b">]>', "declares the entity a"),
-        ("</tracklets>", "", "broken XML: mismatched tag"),
-        ("<h>2.0</h>", "", "tracklet 0: w, h, l: expected a number for each"),
-        ("<h>2.0</h>", "<h>nan</h>", "tracklet 0: w, h, l: expected a number for each"),
-        ("<tx>12</tx>", "<tx>x</tx>", "tracklet 0: tx, ty, tz: expected"),
-        ("<first_frame>1", "<first_frame>7000", "the frame 7000 is not in the drive"),
-        ("PKW", "", "tracklet 0: objectType is missing"),
-    ],
-)
-def test_wrong_tracklets_are_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "labels.xml").write_text(CVAT_TRACKLETS.replace(old, new))
-    with pytest.raises(InputError, match=message) as caught:
-        WithLabels(MadeDrive(), tmp_path / "labels.xml")
-    assert "\n" not in str(caught.value)
-
-
 def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.xml").write_text("")
-    with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or CVAT tracklets"):
+    with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or KITTI labels"):
         WithLabels(MadeDrive(), tmp_path / "labels.xml")
 
 
@@ -316,9 +207,7 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
     ("name", "text", "kept"),
     [
         ("labels.csv", f"{HEAD}\n0,PKW,1,2,0,4,2,0,0\n0,PKW,1,2,0,4,2,1,0", 1),
-        ("default.json", cvat_text(scale=[1, 1, 0]), 0),
         ("0000.txt", "0 1 Car 0 0 0 0 0 9 9 0 2 4 0 1 20 0\n0 2 Car 0 0 0 0 0 9 9 1 2 4 0 1 20 0", 1),
-        ("labels.xml", CVAT_TRACKLETS.replace("<h>2.0</h>", "<h>0</h>"), 0),
     ],
 )
 def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, kept: int, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ class LabelOptions:
         reads="path",
         default=None,
         help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, "
-        "KITTI labels or tracklets, or CVAT's cuboids.",
+        "or KITTI labels.",
         metavar="FILE",
     )
     unlisted_frames: UnlistedFrames | None = option(

@@ -1,13 +1,9 @@
-"""LabelFormat: a format of labels, and the contents of such a file."""
+"""The contents of a file of labels."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
-from bevcli.workshop.formats import LabelOptions
 
 FrameOfReference = Literal["world", "ego", "bev"]
 Moment = tuple[int | None, int | None]  # index and time of a frame, ns, as in LabelledFrame
@@ -44,18 +40,3 @@ class Labels:
     frames: tuple[LabelledFrame, ...]
     lists_empty: bool
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class LabelFormat:
-    """A format of labels.
-
-    Attributes:
-        name: with an article, for messages.
-        recognises: whether a file has this format; looks at its name, or at a few bytes.
-        read: reads a file of a drive with this rig. Raises InputError.
-    """
-
-    name: str
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path, CameraRig, LabelOptions], Labels]

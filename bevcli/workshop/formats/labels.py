@@ -25,19 +25,22 @@ from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.view import scenes_of
-from bevcli.workshop.formats import LabelOptions, UnlistedFrames, kitti
-from bevcli.workshop.formats.label_format import LabelFormat, LabelledFrame, Labels, Moment
+from bevcli.workshop.formats import LabelOptions, UnlistedFrames
+from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
+from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
-    """The labels of a file of any known format. rig: of the drive. Raises InputError."""
-    formats = (CSV, kitti.CVAT, kitti.LABELS, kitti.TRACKLETS)
-    form = next((form for form in formats if form.recognises(path)), None)
-    if form is None:
-        raise InputError(f"{path}: is no file of labels (expected {' or '.join(form.name for form in formats)})")
-    labels = form.read(path, rig, options)
+    """The labels of a table in CSV, or in KITTI's format. rig: of the drive. Raises InputError."""
+    if path.suffix.lower() == ".csv":
+        labels = read_csv_labels(path)
+    elif is_kitti(path):
+        labels = read_kitti_labels(path, rig, options)
+    else:
+        expected = "a CSV table (.csv) or KITTI labels (.txt, or a folder of these)"
+        raise InputError(f"{path}: is no file of labels (expected {expected})")
     frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
@@ -298,8 +301,3 @@ def _frame_of_reference(path: Path, rows: list[CsvRow]) -> Any:
         found = ", ".join(sorted(stated))
         raise InputError(f"{path}: column frame_of_reference: expected world, ego or bev in all rows, found {found}")
     return stated.pop()
-
-
-CSV = LabelFormat(
-    "a CSV table (.csv)", lambda path: path.suffix.lower() == ".csv", lambda path, rig, options: read_csv_labels(path)
-)
