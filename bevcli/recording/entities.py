@@ -11,12 +11,17 @@ Colours are RGB, 0 to 255. rerun takes half a second to import, and is imported 
 import colorsys
 from collections.abc import Iterable, Mapping
 from itertools import cycle
+from struct import Struct
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.object_classes import Color, ObjectClass
+
+# An .rrd file: bytes of its header, and the kind and the length before each of its messages.
+FILE_HEADER, MESSAGE_HEADER = 12, Struct("<QQ")
+INDEX, MESSAGE_KINDS = 0, (1, 2, 3)  # facts of the recording, data, and the choice of a blueprint
 
 WORLD = "world"
 EGO = "world/ego"

@@ -1,149 +1,54 @@
-"""Recording: writes frames and predictions into an .rrd file, frame by frame."""
+"""Recording: writes frames and predictions into an .rrd file, frame by frame.
+
+The rows of a frame: poses, images, boxes, curves and events; then features, maps, probes and lines on the ground.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import select
 import threading
-import time
 import uuid
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from bevcli.errors import OutputError, WaitError
-from bevcli.frame import Frame, Prediction
-from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import Layout, recording_blueprint
-from bevcli.recording.frame_log import FileBoxes, FrameLog, FrameLogState
+from bevcli.errors import OutputError
+from bevcli.frame import BevMap, Frame, FrameStamp, GroundLines, Prediction, result_of
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import Color
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
+from bevcli.recording import entities, log_boxes, log_cameras, log_static
+from bevcli.recording.blueprint import recording_blueprint
+from bevcli.recording.components import any_values, components, log
+from bevcli.recording.log_cameras import ImageLayer, PosedCamera
+from bevcli.recording.log_ground import (
+    BevColors,
+    BevImages,
+    future_lines,
+    log_flat_image,
+    log_ground_lines,
+    log_on_ground,
+    log_probes,
+)
 from bevcli.recording.log_static import Recorded, RecordedBoxes, RecordedDrive, RecordedModel
 from bevcli.recording.options import RecordingOptions
+from bevcli.recording.seen_map import SeenCells
 from bevcli.sequences.files.incremental_json import GrowingFile
 
-BLOCK = 1 << 20  # bytes
-HEADER = 12  # bytes at the beginning of an .rrd file
-TIMEOUT_S = 20.0
+PosedCameras = tuple[PosedCamera, ...]
+FileBoxes = Sequence[Boxes3D | None]  # of each file, in the world frame; None where it lacks the frame
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
-INDEXED_FRAMES = 200  # a longer recording has no index, see `RrdFile`
-
-
-class RrdFile(GrowingFile):
-    """Receives the bytes of a recording, which a thread of ours writes.
-
-    rerun's own writer waits for ever when the disk is full. So rerun writes into a pipe, which never fails, and a
-    thread moves the bytes into the file. rerun keeps the index of a stream in memory until the stream ends, about
-    0.3 MB a frame. A long recording therefore consists of several streams, one after the other in one file without an
-    index.
-
-        file = RrdFile(path)
-        with file.sink() as sink:
-            stream.set_sinks(sink)
-
-    Attributes:
-        synced: bytes in the file at the last `sync`; all frames up to then are readable.
-    """
-
-    def __init__(self, path: Path, resume_at: int | None = None) -> None:
-        """As a GrowingFile. resume_at: `synced` of an earlier RrdFile of the same recording."""
-        super().__init__(path, resume_at)
-        self.synced = self.size
-        self._is_joined = resume_at is not None  # of several streams, so that the index of the last does not fit
-        self._error: OutputError | None = None
-        self._pipe = -1
-        self._busy = threading.Lock()
-        self._block = memoryview(bytearray(BLOCK))  # allocated here, where a lack of memory can be told
-
-    @contextlib.contextmanager
-    def sink(self) -> Iterator[rr.FileSink]:
-        """`with` the sink that rerun is to open in the block and writes to from then on; it ends when rerun closes it.
-
-        Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
-        """
-        pipe, self._pipe_in = os.pipe()
-        os.set_blocking(pipe, False)
-        with self._busy:
-            self._is_joined |= self._pipe >= 0
-            self._to_skip = HEADER if self.size else 0  # the file has its header already
-            self._pipe = pipe
-        self._thread = threading.Thread(target=self._move_all, args=(pipe,), name="rrd-file", daemon=True)
-        self._thread.start()
-        try:
-            yield rr.FileSink(f"/dev/fd/{self._pipe_in}")
-        finally:
-            os.close(self._pipe_in)
-
-    def sync(self) -> None:
-        """Waits until all that rerun has flushed is in the file.
-
-        Raises OutputError if it could not be written, and WaitError if the disk does not answer.
-        """
-        deadline = time.monotonic() + TIMEOUT_S
-        while self._error is None and self._thread.is_alive():
-            if not self._busy.acquire(timeout=TIMEOUT_S):
-                raise self._no_answer()
-            try:
-                if not select.select([self._pipe], [], [], 0)[0]:
-                    break
-            finally:
-                self._busy.release()
-            if time.monotonic() > deadline:
-                raise self._no_answer()
-            time.sleep(0.0005)
-        if self._error is not None:
-            raise self._error
-        self.synced = self.size
-
-    def leave_out_index(self) -> None:
-        """Call after the last `sync`, before rerun closes the sink: of several streams, the last has no index either.
-
-        It would count the bytes from the start of its stream, and readers would not find the frames before.
-        """
-        with self._busy:
-            if self._is_joined:
-                self._pipe = -1
-
-    def close(self) -> None:
-        """Waits until rerun has closed the sink, and closes the file. Raises OutputError as `sync` does."""
-        self._thread.join(TIMEOUT_S)
-        if self._thread.is_alive():
-            raise self._no_answer()
-        with self._file:
-            if self._error is not None or self._is_joined:  # there may be a cut message
-                with contextlib.suppress(OSError):
-                    self._file.truncate(self.synced)
-        if self._error is not None:
-            raise self._error
-
-    def _no_answer(self) -> WaitError:
-        return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
-
-    def _move_all(self, pipe: int) -> None:
-        """Moves a stream into the file, until rerun closes it."""
-        try:
-            while True:
-                select.select([pipe], [], [])  # as long as rerun has nothing to write
-                with self._busy:
-                    size = os.readv(pipe, [self._block])
-                    if not size:
-                        return
-                    if pipe != self._pipe:
-                        continue
-                    rest = self._block[self._to_skip : size]
-                    self._to_skip -= size - len(rest)
-                    # After an error the rest is read and thrown away, so that rerun never waits.
-                    try:
-                        if self._error is None:
-                            self.append(rest)
-                    except OutputError as error:
-                        self._error = error
-        finally:
-            os.close(pipe)
+SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
+GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
+# Has all columns of tracks, so that the trails of the frame before are cleared.
+NO_BOXES = replace(Boxes3D.empty(), scores=np.zeros(0), instances=np.zeros(0, np.str_))
 
 
 class LiveSink(Protocol):
@@ -156,25 +61,72 @@ class LiveSink(Protocol):
         """Called once, when the file is whole."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class RecordingState:
-    """The state of a recording after a frame, from which a later one goes on.
+    """What the frames so far leave behind for later ones, also for those of a resumed run.
 
     Attributes:
         recording_id: rerun's id of the recording.
-        size: bytes of the file that are kept.
-        frames: what the frames so far leave behind.
+        size: bytes of the file after the last frame.
+        origin: (3,) the recording's origin in the sequence's world, metres: the place of the first frame's ego vehicle.
+        scene: of the last frame.
+        world_from_ego: pose of the last frame in the sequence's world; None before the first one.
+        colors: of the BEV features, None where these are not drawn.
+        tracks: the trails.
     """
 
     recording_id: str
-    size: int
-    frames: FrameLogState
+    size: int = 0
+    origin: Array | None = None
+    scene: str = ""
+    world_from_ego: Pose | None = None
+    colors: BevColors | None = None
+    tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """The frames of reference of one frame's boxes.
+
+    Attributes:
+        moved: (4, 4) from the sequence's world into the recording's world.
+        pose: of the vehicle in the sequence's world.
+        ego_from_bev: (4, 4).
+    """
+
+    moved: Array
+    pose: Pose
+    ego_from_bev: Array
+
+    @property
+    def world_from_bev(self) -> Array:
+        """(4, 4) into the recording's world."""
+        return self.moved @ self.pose.matrix @ self.ego_from_bev
+
+    def in_bev(self, boxes: Boxes3D) -> Boxes3D:
+        """Boxes of the sequence's world in the bev frame."""
+        return boxes.transformed(self.moved).transformed(inverse(self.world_from_bev))
+
+    def away(self, boxes: Boxes3D) -> Array:
+        """(N,) distances on the ground from the vehicle to boxes of the bev frame, metres."""
+        in_ego = boxes.transformed(self.pose.matrix @ self.ego_from_bev).centers[:, :2]
+        return np.asarray(np.linalg.norm(in_ego - self.pose.matrix[:2, 3], axis=-1))
+
+    def within(self, boxes: Boxes3D, ranges_m: Mapping[str, float]) -> NDArray[np.bool_]:
+        """(N,) bool, the boxes of the bev frame that are nearer than the range of their class."""
+        return np.asarray(self.away(boxes) < [ranges_m.get(name, 0.0) for name in boxes.classes.tolist()])
+
+    def labels(self, boxes: Boxes3D, texts: list[str], count: int) -> list[str]:
+        """The texts of the boxes nearest to the vehicle, at most `count`; "" for others. boxes: in the bev frame."""
+        near = set(np.argsort(self.away(boxes))[:count].tolist())
+        return [text if i in near else "" for i, text in enumerate(texts)]
 
 
 class Recording:
     """Writes a recording: `with Recording(...) as recording: recording.log(frame, prediction)`, frames in order.
 
-    Each frame is on the disk when `log` returns, so a killed run keeps all frames up to then.
+    Each frame is on the disk when `log` returns, so a killed run keeps all frames up to then. The file has no index,
+    which rerun would keep in memory until the end, some 0.3 MB a frame.
 
     Args:
         path: the .rrd file to write; an existing one is replaced.
@@ -196,31 +148,35 @@ class Recording:
         live: LiveSink | None = None,
         resume: RecordingState | None = None,
     ) -> None:
-        self.path, self._live = Path(path), live
-        self._recorded = Recorded(sequence, model, RecordingOptions() if options is None else options)
-        self._recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
-        self._size = None if resume is None else resume.size
-        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait
-        # for a sink that hangs.
+        self.path, self._live, self._options = Path(path), live, RecordingOptions() if options is None else options
+        self._recorded = recorded = Recorded(sequence, model, self._options)
+        self._geo_origin = recorded.drive.facts.geo_origin
+        self._resume_at = None if resume is None else resume.size
+        self._kept = RecordingState(str(uuid.uuid4())) if resume is None else resume
+        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call.
         threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         batches = rr.ChunkBatcherConfig(flush_num_rows=ROWS_AT_ONCE)
-        self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id, batcher_config=batches)
-        self._frames = 0
-        frames = None if resume is None else resume.frames
-        self._frame_log = FrameLog(self._stream, self._recorded, frames)
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=self._kept.recording_id, batcher_config=batches)
+        self._early_events: list[tuple[str, str]] = []  # logged before the first frame
+        self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
+        self._seen_cells = SeenCells()
+        self._with_meshes = [name for name, settings in recorded.object_classes.items() if settings.mesh]
+        self._images = log_cameras.CameraImages(self._stream, self._options.images == "av1")
+        draws_bev = self._options.bev != "none" and self._options.shows_internals
+        # Its stamps are predictions.
+        self._bev_images = BevImages(self._options.bev, self._kept.colors) if draws_bev else None
 
     def __enter__(self) -> Recording:
-        recorded, object_classes = self._recorded, self._recorded.object_classes
+        recorded, path = self._recorded, self._options.vehicle_mesh
         vehicle, of_classes = None, {}
-        path = recorded.options.vehicle_mesh
-        if path is not None or any(settings.mesh for settings in object_classes.values()):
+        if path is not None or self._with_meshes:
             from bevcli.recording import meshes
 
             vehicle = None if path is None else meshes.load_vehicle(path)
-            of_classes = meshes.read_class_meshes(object_classes)
-        self._layout = recording_blueprint(recorded)
-        self.file = RrdFile(self.path, self._size)
-        self._connect(recording_blueprint(recorded, follows=self._live is not None))
+            of_classes = meshes.read_class_meshes(recorded.object_classes)
+        self._bytes = rr.binary_stream(self._stream)
+        self.file = GrowingFile(self.path, self._resume_at)
+        self._send_layout(follows=self._live is not None)
         if self._live is not None:
             self._live.open(self.path)
         log_static.log_scene(self._stream, recorded.drive.rig, recorded.classes, vehicle, recorded.grid)
@@ -229,62 +185,300 @@ class Recording:
         log_static.log_about(self._stream, recorded)
         return self
 
-    def _connect(self, layout: Layout | None) -> None:
-        """Makes rerun write a new stream into the file. Raises OutputError."""
-        try:
-            with self.file.sink() as sink:
-                self._stream.set_sinks(sink, default_blueprint=layout)
-        except RuntimeError as error:
-            raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
-        finally:
-            if layout is not None:
-                layout.free()
+    def _send_layout(self, *, follows: bool) -> None:
+        layout = recording_blueprint(self._recorded, follows=follows)
+        self._stream.send_blueprint(layout, make_active=False)
+        layout.free()
 
     def __exit__(self, *error: object) -> None:
-        try:
-            self._frame_log.finish()
-            if self._live is not None:  # who opens the file later sees it from the first frame on
-                self._stream.send_blueprint(self._layout, make_active=False)
-                self._layout.free()
-            self._flush()
-        finally:
-            self.file.leave_out_index()
-            # rerun itself waits without a limit.
-            closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
-            closing.start()
-            closing.join(FLUSH_TIMEOUT_S)
-            if closing.is_alive():
-                raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
-            self.file.close()
-            if self._live is not None:
-                self._live.close()
+        with self.file:
+            try:
+                if self._bev_images is not None:  # those that wait for later frames
+                    self._log_bev_images(self._bev_images.finish())
+                for encoder in self._images.encoders.values():
+                    encoder.close()
+                if self._live is not None:  # who opens the file later sees it from the first frame on
+                    self._send_layout(follows=False)
+                self._write()
+            finally:
+                self._stream.disconnect()
+                if self._live is not None:
+                    self._live.close()
 
     def state(self) -> RecordingState | None:
-        """The state from which a later Recording goes on; None as long as it cannot be resumed."""
-        frames = self._frame_log.state()
-        return None if frames is None else RecordingState(self._recording_id, self.file.synced, frames)
+        """The state from which a later Recording goes on; None as long as it cannot be resumed.
+
+        BEV colours are fitted on the first two frames, and are part of the state.
+        """
+        self._kept.colors = None if self._bev_images is None else self._bev_images.colors
+        can_resume = self._kept.origin is not None and (self._bev_images is None or self._kept.colors is not None)
+        return deepcopy(self._kept) if can_resume else None
+
+    def _write(self) -> None:
+        """Append to the file what was logged since the last call. Raises OutputError."""
+        try:
+            content = self._bytes.read(flush_timeout_sec=FLUSH_TIMEOUT_S) or b""
+        except RuntimeError as error:
+            raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
+        end = entities.FILE_HEADER
+        while end < len(content):  # up to the index, which every call gives anew
+            kind, length = entities.MESSAGE_HEADER.unpack_from(content, end)
+            if kind == entities.INDEX:
+                break
+            end += entities.MESSAGE_HEADER.size + length
+        self.file.append(memoryview(content)[entities.FILE_HEADER if self.file.size else 0 : end])
+        self._kept.size = self.file.size
 
     def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals.
 
         found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the frame.
         """
-        self._frame_log.log(frame, found)
-        self._flush()
-        self._frames += 1
-        if self._frames % INDEXED_FRAMES == 0:
-            self._connect(None)  # a new stream frees the index of the one before
+        prediction = found if isinstance(found, Prediction) else None
+        stream, is_first = self._stream, self._kept.world_from_ego is None
+        if self._kept.origin is None:  # the recording's world frame has its origin at the first frame's ego position
+            self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
+            stream.log(entities.WORLD, rr.AnyValues(origin=self._kept.origin), static=True)
+        self._at(frame.stamp)
+        moved = rigid(-self._kept.origin)  # from the sequence's world into the recording's world
+        self._log_ego(frame, moved)
+        poses = [moved @ frame.world_from_ego_at[c.name].matrix @ c.ego_from_camera for c in frame.rig.cameras]
+        cameras = tuple(
+            PosedCamera(camera, pose, inverse(pose)) for camera, pose in zip(frame.rig.cameras, poses, strict=True)
+        )
+        for posed in cameras:
+            name = posed.camera.name
+            log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
+            self._images.log(name, frame.images.get(name))
+        self._log_boxes(frame, found, moved, cameras)
+        if is_first:
+            counted = self._recorded.layers or self._recorded.classes
+            lines = rr.SeriesLines(names=list(counted), colors=list(counted.values()))
+            stream.log(entities.BOX_CURVES, lines, static=True)
+            stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
+        if prediction is not None:
+            if self._recorded.results:
+                self._log_results(prediction, moved, cameras)
+            self._log_stages(prediction, is_first=is_first)
+        elif self._recorded.map_classes:
+            self._log_map(frame.ground_truth_map, frame.rig.ego_from_bev)
+        self._log_events(frame, found)
+        if prediction is not None and self._options.shows_internals:
+            self._log_internals(frame, prediction, moved, cameras)
+        self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
+        self._write()
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
 
         level: "INFO", "WARN" or "ERROR".
         """
-        self._frame_log.event(text, level)
+        if self._kept.origin is None:
+            self._early_events.append((text, level))
+        else:
+            self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
 
-    def _flush(self) -> None:
-        try:
-            self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
-            self.file.sync()
-        except (RuntimeError, ValueError, TimeoutError) as error:
-            raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
+    def _at(self, stamp: FrameStamp) -> None:
+        self._stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
+        self._stream.set_time(entities.TIME_TIMELINE, timestamp=np.datetime64(stamp.timestamp_ns, "ns"))
+
+    def _log_ego(self, frame: Frame, moved: Array) -> None:
+        """Writes the ego pose, the speed (a curve and a label above the vehicle), the way since the frame before.
+
+        moved: (4, 4) from the sequence's world into the recording's world.
+        """
+        stream, stamp = self._stream, frame.stamp
+        pose = moved @ frame.world_from_ego.matrix
+        facts = any_values(scene=stamp.scene, timestamp_ns=stamp.timestamp_ns, pose=pose.ravel())
+        log(stream, entities.EGO, log_cameras.transform(pose) | facts)
+        if self._recorded.drive.has_ego_motion:
+            km_h = 3.6 * float(np.linalg.norm(frame.kinematics.velocity[:2]))
+            log(stream, entities.SPEED_CURVE, components(rr.Scalars, scalars=np.array([km_h])))
+            label = components(
+                rr.Points3D,
+                positions=np.array([SPEED_LABEL_M]),
+                labels=[f"{km_h:.0f} km/h"],
+                colors=entities.EGO_COLOR,
+                radii=log_cameras.UNSEEN,
+                show_labels=True,
+            )
+            log(stream, entities.SPEED, label)
+        before = self._kept.world_from_ego if self._kept.scene == stamp.scene else None
+        if self._geo_origin is not None:
+            last = None if before is None else before.translation
+            log_boxes.log_ego_on_map(stream, self._geo_origin, frame.world_from_ego.translation, last)
+        if before is not None:
+            way = np.array([[(moved @ before.matrix)[:3, 3], pose[:3, 3]]])
+            line = components(rr.LineStrips3D, strips=way, colors=entities.EGO_COLOR, radii=0.06)
+            log(stream, entities.TRAJECTORY, line)
+
+    def _log_boxes(self, frame: Frame, found: Prediction | FileBoxes, moved: Array, cameras: PosedCameras) -> None:
+        """Writes the boxes and the ground truth of a frame."""
+        recorded, files = self._recorded, self._recorded.files
+        if isinstance(found, Prediction):
+            place = _Place(moved, found.world_from_ego, found.ego_from_bev)
+            sides, grid = [found.boxes], found.grid
+        else:
+            place = _Place(moved, frame.world_from_ego, frame.rig.ego_from_bev)
+            sides, grid = [place.in_bev(boxes) if boxes else NO_BOXES for boxes in found], None
+        sides = [boxes.scored(self._options.score) for boxes in sides]
+        truth = None if frame.ground_truth is None else place.in_bev(frame.ground_truth)
+        truth = None if truth is None else log_boxes.detectable(truth, grid)
+        if files is not None and not files.names:  # labels alone are drawn as boxes
+            sides, truth = [truth or NO_BOXES], None
+        marks = log_boxes.false_and_duplicate(sides[0], None)
+        missed = np.zeros(0 if truth is None else len(truth), dtype=bool)
+        is_known = isinstance(found, Prediction) or all(boxes is not None for boxes in found)
+        # Random boxes match nothing: a scene all in red would be useless.
+        if truth is not None and is_known and not recorded.layers and not recorded.model.untrained:
+            marks = self._marks(sides[0], truth, place)
+            missed = ~marks.found & ~log_boxes.other_classes(truth, recorded.classes)
+        if recorded.layers:
+            drawn = [self._log_layer(*layer, place) for layer in zip(recorded.layers.items(), sides, strict=True)]
+            none = log_boxes.false_and_duplicate(NO_BOXES, None)
+            log_boxes.log_boxes_3d(self._stream, NO_BOXES, np.zeros((0, 8, 3)), none, {}, [])
+            counts = list(map(len, sides))
+        else:
+            drawn = [self._log_shown(frame.stamp, sides[0], marks, place)]
+            counts = [(sides[0].classes == name).sum() for name in recorded.classes]
+        if truth is not None:
+            drawn.append(self._log_truth(truth, missed, place))
+        log_cameras.log_boxes_in_images(self._stream, cameras, drawn)
+        log(self._stream, entities.BOX_CURVES, components(rr.Scalars, scalars=np.array(counts)))
+
+    def _marks(self, shown: Boxes3D, truth: Boxes3D, place: _Place) -> log_boxes.Marks:
+        """The marks of boxes, both in the bev frame: of a model all over its grid, of a file where it is scored."""
+        files = self._recorded.files
+        if files is None:
+            return log_boxes.false_and_duplicate(shown, truth)
+        return log_boxes.marks_within(shown, truth, *(place.within(side, files.ranges_m) for side in (shown, truth)))
+
+    def _log_truth(self, truth: Boxes3D, missed: NDArray[np.bool_], place: _Place) -> ImageLayer:
+        """Writes ground truth (M, bev frame) into the scene and the BEV view; returns its drawing in the images."""
+        other = log_boxes.other_classes(truth, self._recorded.classes)
+        in_world, colors = truth.transformed(place.world_from_bev), log_boxes.ground_truth_colors(~missed, other)
+        log_boxes.log_ground_truth(self._stream, in_world, truth.corners(), ~missed, colors)
+        return ImageLayer("ground_truth", in_world.corners(), colors, width=0.6, order=20)
+
+    def _log_layer(self, layer: tuple[str, Color], shown: Boxes3D, place: _Place) -> ImageLayer:
+        """Writes the boxes of one of two models, a name and a colour; returns their drawing in the images."""
+        (name, color), in_world = layer, shown.transformed(place.world_from_bev)
+        texts = log_cameras.box_labels(shown)
+        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE // 2)
+        log_boxes.log_layer(self._stream, name, in_world, shown.corners(), color, labels)
+        colors = np.tile(np.array(color, np.uint8), (len(shown), 1))
+        return ImageLayer(entities.layer("", name)[1:], in_world.corners(), colors, texts)
+
+    def _log_shown(self, stamp: FrameStamp, shown: Boxes3D, marks: log_boxes.Marks, place: _Place) -> ImageLayer:
+        """Writes the boxes (N, bev frame) of one model, or labels alone; returns their drawing in the images."""
+        stream, classes = self._stream, self._recorded.classes
+        in_world, colors = shown.transformed(place.world_from_bev), log_boxes.box_colors(shown, classes)
+        files = self._recorded.files
+        is_label = files is not None and not files.names  # the names of labelled objects are long
+        corners, texts = (
+            in_world.corners(),
+            log_cameras.box_labels(replace(shown, instances=None) if is_label else shown),
+        )
+        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE)
+        log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
+        for name in self._with_meshes:
+            log_boxes.log_class_mesh(stream, name, in_world[in_world.classes == name])
+        log_boxes.log_boxes_bev(stream, shown, shown.corners(), marks, colors)
+        bev_from_world = inverse(place.world_from_bev)
+        log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, stamp, bev_from_world)
+        if self._geo_origin is not None:
+            centers = apply(place.pose.matrix @ place.ego_from_bev, shown.centers)
+            log_boxes.log_boxes_on_map(stream, self._geo_origin, centers, colors if len(shown) else None)
+        return ImageLayer("boxes", corners, colors, texts)
+
+    def _log_stages(self, prediction: Prediction, *, is_first: bool) -> None:
+        """Writes the seconds of each stage of the model."""
+        if is_first:
+            stages, bright = list(prediction.stage_seconds), entities.STAGE_COLORS
+            colors = [bright[i % len(bright)] for i in range(len(stages))]
+            self._stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
+        seconds = np.array(list(prediction.stage_seconds.values()))
+        log(self._stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
+
+    def _log_results(self, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+        """Writes the results and futures of a model that has further results."""
+        score, moved_from_ego = self._options.score, moved @ prediction.world_from_ego.matrix
+        world_from_bev = moved_from_ego @ prediction.ego_from_bev
+        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(moved_from_ego))
+        for kind, names in self._recorded.results.items():
+            result = result_of(kind, prediction.results)
+            lines = GroundLines() if result is None else result.drawn(ground, names, score)
+            log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+        shown = prediction.boxes.scored(score).transformed(world_from_bev)
+        futures = future_lines(shown, self._recorded.classes)
+        log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
+
+    def _log_events(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+        if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
+            self.event(log_static.WARNINGS[self._recorded.note], "WARN")
+        where = f"frame {frame.stamp.index}"
+        while self._early_events:
+            self.event(*self._early_events.pop(0))
+        if isinstance(found, Prediction) and found.started_anew:
+            scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
+            self.event(f"{where}: no history: {found.started_anew}{scene}")
+        for camera, reason in frame.dropped.items():
+            self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
+        if isinstance(found, Prediction):
+            if found.failure:
+                self.event(f"{where}: {found.failure}", "ERROR" if found.not_finite else "WARN")
+            return
+        for name, boxes in zip(self._recorded.files.names if self._recorded.files else (), found, strict=True):
+            if boxes is None:
+                self.event(f"{where}: {name} does not have this frame", "WARN")
+
+    def _log_internals(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+        """Writes pillars, segmentation, BEV features, history weights and probes."""
+        stream, grid, ego_from_bev = self._stream, prediction.grid, prediction.ego_from_bev
+        ranges = grid.x_range_m, grid.y_range_m
+        if self._pillars is None:
+            all_cells = self._options.level == "full"
+            self._pillars = log_static.log_pillars(stream, grid, ego_from_bev, all_cells=all_cells)
+        pillars, colors = self._pillars
+        points = apply(moved @ prediction.world_from_ego.matrix @ ego_from_bev, pillars)
+        for posed in cameras:
+            if posed.camera.name in frame.images:
+                log_cameras.log_pillar_hits(stream, posed, points, colors)
+        if prediction.segmentation is not None:
+            self._log_map(self._seen_cells.of(prediction.segmentation, frame, grid), ego_from_bev)
+        if self._bev_images is not None and prediction.bev is not None:
+            features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
+            self._log_bev_images(self._bev_images.push(prediction, features))
+            self._at(frame.stamp)
+        if (attention := prediction.attention) is None:
+            return
+        if attention.history_weight is None:  # no history was used
+            stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
+        else:
+            log_flat_image(stream, entities.BEV_HISTORY, entities.colormap(attention.history_weight[::-1]), ranges, -8)
+        if attention.probes:
+            log_probes(stream, attention.probes, ego_from_bev, grid)
+            for posed in cameras:
+                name = posed.camera.name
+                samples = [probe.cameras[name] for probe in attention.probes if name in probe.cameras]
+                log_cameras.log_samples(stream, posed, samples)
+
+    def _log_map(self, ground_map: BevMap | None, ego_from_bev: Array) -> None:
+        """Writes a map into the BEV view and on the ground of the scene; None clears that of the frame before."""
+        flat, on_ground = entities.BEV_SEGMENTATION, entities.SEGMENTATION_ON_GROUND
+        if ground_map is None:
+            for entity in (flat, on_ground):
+                self._stream.log(entity, rr.Clear(recursive=False))
+            return
+        painted = ground_map.painted(entities.map_colors(ground_map.classes), entities.BACKGROUND)
+        of_map = ground_map.x_range_m, ground_map.y_range_m
+        log_flat_image(self._stream, flat, painted, of_map, -5)
+        log_on_ground(self._stream, on_ground, painted, of_map, ego_from_bev, 255)
+
+    def _log_bev_images(self, ready: list[tuple[Prediction, NDArray[np.uint8]]]) -> None:
+        for prediction, image in ready:
+            self._at(prediction.stamp)
+            ranges = prediction.grid.x_range_m, prediction.grid.y_range_m
+            log_flat_image(self._stream, entities.BEV_FEATURES, image, ranges, -10)
+            ground = entities.BEV_ON_GROUND
+            log_on_ground(self._stream, ground, image, ranges, prediction.ego_from_bev, GROUND_OPACITY)

@@ -118,10 +118,6 @@ class RunFiles:
 
     def __exit__(self, *raised: Any) -> None:
         self._stack.__exit__(*raised)
-        if self._resume is not None and self._is_complete:  # else its bytes must stay for the next resume
-            from bevcli.viewer.recording_file import restore_index
-
-            restore_index(self._out / RECORDING)
 
     def write(self, frame: Frame, prediction: Prediction) -> None:
         """Add a frame to every file."""

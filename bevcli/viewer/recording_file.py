@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -13,11 +12,11 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import rerun as rr
 
-from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import open_regular, plain_name, run_program, run_python
+from bevcli.recording.entities import FILE_HEADER, INDEX, MESSAGE_HEADER, MESSAGE_KINDS
 from bevcli.sequences.format import drives_in, is_drive
 from bevcli.viewer.native import viewer_binary, viewer_environment
-from bevcli.writing import whole_file
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer
@@ -41,14 +40,11 @@ CHECK_MEMORY = 1 << 30  # bytes, beside four times the file's size
 CHECK_ENVIRONMENT = {"MIMALLOC_ARENA_RESERVE": "65536"}
 SECONDS, BYTES_PER_SECOND = 30.0, 1e6  # time limit of a process that reads a recording
 RECORDING = "recording.rrd"
-LARGEST_INDEXED = 256 << 20  # bytes; to make an index takes several times its size in memory
 PREDICTIONS = "predictions.json"
 IMAGES = ("frames.csv", "images", "videos")  # of a sequence folder, which may hold predictions too
 MAGIC_START = b"RRF"  # of all versions of rerun
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 OLDEST = (0, 23)  # version of rerun whose files are read; the bytes after MAGIC state a file's
-FILE_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")  # bytes; kind and length of a message
-MESSAGE_KINDS = (1, 2, 3)  # facts of the recording, data, and the choice of a blueprint
 
 
 @contextmanager
@@ -131,23 +127,6 @@ def _check(file: Path, path: Path) -> None:
         raise InputError(f"{path}: the recording cannot be read: it is damaged ({reason:.200})")
 
 
-def restore_index(path: Path) -> bool:
-    """Gives a recording of at most 256 MiB an index, in place. False if it stays as it is, such as on a full disk.
-
-    Every reader of this package reads a recording without an index too.
-    """
-    if path.stat().st_size > LARGEST_INDEXED:
-        return False
-    try:
-        with whole_file(path) as copy:
-            _repair(path, copy)
-            if not _is_whole(copy):
-                raise InputError(f"{path}: its index cannot be made")
-    except (OutputError, InputError):
-        return False
-    return True
-
-
 def _repair(path: Path, copy: Path) -> None:
     """Copies all messages of a recording that can be read. Raises InputError if this takes too long."""
     command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
@@ -194,8 +173,10 @@ def _ends_with_a_message(file: BinaryIO, size: int) -> bool:
     while position + MESSAGE_HEADER.size <= size:
         file.seek(position)
         kind, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
-        if kind not in MESSAGE_KINDS:
+        if kind == INDEX:
             return False
+        if kind not in MESSAGE_KINDS:
+            raise InputError(f"{file.name}: the recording cannot be read: it is damaged (a message of kind {kind})")
         position += MESSAGE_HEADER.size + length
     return position == size > FILE_HEADER
 

@@ -25,7 +25,7 @@ from bevcli.geometry.transforms import apply, inverse, rotation_about_z
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.decoder import boxes_of_codes
 from bevcli.model.segmentation import STUFF_CLASSES, THING_CLASS
-from bevcli.recording.frame_log import fit_colors
+from bevcli.recording.log_ground import fit_colors
 
 ROOT = Path(__file__).parents[2]
 RECENT = 4  # frames in the figure of the recurrence

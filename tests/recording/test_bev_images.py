@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.recording.frame_log import BevImages
+from bevcli.recording.log_ground import BevImages
 
 
 def features(seed: int, rows: int = 6, columns: int = 5, channels: int = 12) -> np.ndarray:

@@ -13,7 +13,7 @@ from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
 from bevcli.config import load_config
 from bevcli.geometry.transforms import apply
 from bevcli.recording import entities
-from bevcli.recording.frame_log import future_lines
+from bevcli.recording.log_ground import future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video import CameraImages, draw_frame, tiles

@@ -1,10 +1,8 @@
 """What a recording holds, read back from the file."""
 
 import gc
-import os
 import subprocess
 import sys
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.writer import BLOCK, Recording, RrdFile
+from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 
 
@@ -257,41 +255,6 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     frames = list(RecordingReader(tmp_path / "r.rrd").frames())
     assert [frame.index for frame in frames] == [0, 1, 2]
     assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
-
-
-def test_a_resumed_recording_can_be_read_before_it_is_closed(tmp_path, monkeypatch):
-    """Its last stream has an index that does not fit the file: a kill before the index was cut off left it there."""
-    drive, path, close, read = MemoryDrive(2), tmp_path / "r.rrd", RrdFile.close, []
-    frames, options = [drive.load(place) for place in range(2)], RecordingOptions(level="minimal")
-    with Recording(path, drive, NamedModel(), options) as recording:
-        recording.log(frames[0], predict(frames[0]))
-        state = recording.state()
-    assert state is not None
-
-    def read_and_close(file):
-        file._thread.join(20)  # all that rerun wrote is in the file
-        read.extend(frame.index for frame in RecordingReader(path).frames())
-        close(file)
-
-    monkeypatch.setattr(RrdFile, "close", read_and_close)
-    with Recording(path, drive, NamedModel(), options, resume=state) as recording:
-        recording.log(frames[1], predict(frames[1]))
-    assert read == [0, 1]
-
-
-def test_moving_bytes_into_the_file_needs_no_new_memory(tmp_path):
-    content = np.random.default_rng(0).bytes(3 * BLOCK)
-    file = RrdFile(tmp_path / "recording.rrd")
-    with file.sink():
-        tracemalloc.start()
-        for start in range(0, len(content), BLOCK):
-            os.write(file._pipe_in, memoryview(content)[start : start + BLOCK])
-        file.sync()
-        grown = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    file.close()
-    assert grown < BLOCK / 20
-    assert (tmp_path / "recording.rrd").read_bytes() == content
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted on Linux")

@@ -16,7 +16,6 @@ from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import Model
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.recording import writer
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
@@ -96,9 +95,8 @@ def assert_flat(found: list[Usage], growth: int, peak: int) -> None:
 
 
 @pytest.mark.slow
-def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path, monkeypatch):
-    # Kept indexes would take 34 MB after these 100 frames; rerun's buffers come and go by up to 10 MB.
-    monkeypatch.setattr(writer, "INDEXED_FRAMES", 10)
+def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path):
+    # An index would take 34 MB after these 100 frames; rerun's buffers come and go by up to 10 MB.
     assert_flat(measured_run(mini_model, tmp_path / "out", 120, range(20, 120, 10)), 14 * MIB, 14 * MIB)
 
 
@@ -112,4 +110,4 @@ def test_ten_thousand_frames_take_the_memory_of_a_hundred(mini_config, tmp_path)
     model = BEVFormer(replace(mini_config, image=image, encoder=encoder, decoder=decoder)).eval()
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         found = pool.submit(measured_run, model, tmp_path / "out", 10_000, range(100, 10_000, 50)).result()
-    assert_flat(found, 20 * MIB, 120 * MIB)  # now and then four indexes of 28 MB are in memory
+    assert_flat(found, 20 * MIB, 120 * MIB)
