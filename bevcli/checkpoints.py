@@ -73,7 +73,7 @@ class Checkpoint:
     def misfit(self) -> str:
         """The known model that is nearest, and the difference from it, for an error of a file that fits none."""
         expected, count = _expected_of(self.nearest), len(load_config(self.nearest).classes)
-        advice = ": name its own by `model=FILE.toml`"
+        advice = ": name its own by `model` (`--model FILE.toml`)"
         if self.own_classes is not None:
             advice = f": `bevcli weights model-file {self.path} my.toml` writes its model file"
         what = difference(self.state, expected, count)

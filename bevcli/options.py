@@ -9,8 +9,7 @@ from them too. The help text is also what the class's docstring says of the attr
 
         rate_hz: float | None = option(default=None, help="Thin to this many frames per second.", flag="--rate")
 
-An error of the library names the argument in backticks, with its value where that helps: "pass `force=True`". The
-command line prints such a name as its flag: "pass --force".
+A text of the library names an option as both spell it: "pass `rate_hz` (`--rate`)"; a help text names its flag.
 """
 
 import dataclasses
@@ -62,6 +61,10 @@ class Option:
     hidden: bool = False
     is_argument: bool = False
 
+    def spellings(self, name: str) -> list[str]:
+        """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too. name: the field."""
+        return (self.flag or f"--{name.replace('_', '-')}{' -o' if name == 'out' else ''}").split()
+
 
 def option(
     *, default: Any = MISSING, default_factory: Callable[[], Any] | Any = MISSING, help: str, **settings: Any
@@ -84,6 +87,12 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
         return made
 
     return decorate
+
+
+def named(kind: type[Any], name: str) -> str:
+    """An option of a dataclass in a text for both, Python and the command line: "`rate_hz` (`--rate`)"."""
+    (field,) = (field for field in dataclasses.fields(kind) if field.name == name)
+    return f"`{name}` (`{field.metadata['option'].spellings(name)[0].partition('/')[0]}`)"
 
 
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:

@@ -39,6 +39,11 @@ def say(*texts: object, err: bool = False) -> None:
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
+def print_note(text: str) -> None:
+    """Print a note of the library to stderr."""
+    say(f"note: {one_line(text)}", err=True)
+
+
 def counted(count: int | str, things: str) -> str:
     """A number of things, such as "6 cameras" or "1 camera". things: a plural, such as "cameras" or "boxes"."""
     ending = "es" if things.endswith(("xes", "ches")) else "s"

@@ -141,7 +141,7 @@ class NamedWeights:
         """How to get weights that have no source, for messages."""
         return (
             f"can only be downloaded by hand, from {self.source.page or 'its publisher'}: run the model with "
-            f"`weights=FILE`, or state the file as `source` of [{self.name}] in {own_table()}"
+            f"`weights` (`--weights FILE`), or state the file as `source` of [{self.name}] in {own_table()}"
         )
 
     def store_hash(self, known: Known) -> None:

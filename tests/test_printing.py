@@ -5,10 +5,9 @@ from pathlib import Path
 
 from command_line import command
 
-from bevcli.cli.bridge import print_note
 from bevcli.cli.progress import Progress
 from bevcli.errors import InputError
-from bevcli.printing import LONGEST_MESSAGE, counted, one_line, say
+from bevcli.printing import LONGEST_MESSAGE, counted, one_line, print_note, say
 
 SAMPLE = Path(__file__).parents[1] / "samples/street"
 NASTY = "\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"

@@ -1,15 +1,12 @@
-"""Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
+"""Commands for typer from functions that take dataclasses of options."""
 
 import dataclasses
 import difflib
 import glob
 import os
-import re
 import types
-from collections.abc import Callable, Mapping
-from contextvars import ContextVar
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass
-from functools import partial
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -19,13 +16,10 @@ import typer
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
-from bevcli.printing import one_line, say
 from bevcli.published import is_of_hub
 from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
-_OTHER_ARGUMENT = re.compile(r"`([a-z]\w*)=\"?([^`\"]*)\"?`")
-_ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
 def argument(help: str, reads: Reads | None = "path", **settings: Any) -> Option:
@@ -82,17 +76,15 @@ class _Flag:
 
     @property
     def spellings(self) -> list[str]:
-        """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too."""
-        short = " -o" if self.name == "out" else ""
-        return (self.option.flag or f"--{self.name.replace('_', '-')}{short}").split()
+        return self.option.spellings(self.name)
 
     @property
     def yes(self) -> str:
         """Spelling without that of the opposite."""
         return self.spellings[0].partition("/")[0]
 
-    def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
-        """The parameter of a function, as typer reads it. flags: for the help text."""
+    def parameter(self) -> Parameter:
+        """The parameter of a function, as typer reads it."""
         stated, kind, default = self.option, self.kind, self.default
         kinds = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
         if Path in kinds:  # of several that Python takes, such as `str | Path | None`
@@ -109,7 +101,7 @@ class _Flag:
             value = get_args(value)[0]
         metavar = None if value is bool else "|".join(get_args(value)) or _METAVARS.get(value)
         settings: dict[str, Any] = {
-            "help": _ARGUMENT.sub(partial(_as_flag, flags), stated.help),
+            "help": stated.help,
             "metavar": stated.metavar or (self.name.upper() if stated.is_argument else metavar),
         }
         if stated.is_argument:
@@ -133,18 +125,13 @@ class _Flag:
             raise typer.BadParameter(str(error), param_hint=self.yes) from None
 
 
-# Of the command that runs, or ran last.
-_flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
-
-
 def command(function: Callable[..., None]) -> Callable[..., dict[str, Any]]:
     """The arguments of a function from what typer has read, for `PlainCommand`, which calls the function itself.
 
-    Each parameter that is a dataclass of options becomes one parameter for each field. Arguments in backticks in a help
-    text become flags.
+    Each parameter that is a dataclass of options becomes one parameter for each field.
     """
     parts: list[Parameter | _Flag] = []
-    flags: dict[str, _Flag] = {}  # of the dataclasses, which the texts of the library name
+    flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in signature(function).parameters.items():
@@ -163,7 +150,6 @@ def command(function: Callable[..., None]) -> Callable[..., dict[str, Any]]:
     inputs = [part for part in parts if isinstance(part, _Flag) and part.option.reads]
 
     def arguments(**given: Any) -> dict[str, Any]:
-        _flags.set(flags)
         read = [(given[flag.name], flag) for flag in inputs]
         for parameter, (make, fields) in makers.items():
             values = {name: flag.value(given.pop(name)) for name, flag in fields.items()}
@@ -174,7 +160,7 @@ def command(function: Callable[..., None]) -> Callable[..., dict[str, Any]]:
 
     arguments.__name__, arguments.__doc__ = function.__name__, function.__doc__
     arguments.__module__ = function.__module__
-    made = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
+    made = [part.parameter() if isinstance(part, _Flag) else part for part in parts]
     vars(arguments).update(__signature__=Signature(made), function=function)
     return arguments
 
@@ -210,44 +196,6 @@ def _require(value: Any, flag: _Flag) -> None:
             raise InputError(f"{text}: there is no such file or folder")
         elif next(glob.iglob(text), None) is None:
             raise InputError(f"{text}: nothing matches this pattern (expected drives)")
-
-
-def as_flags(text: str) -> str:
-    """A text of the library for the command line: the running command's arguments in backticks become its flags.
-
-    So do arguments with a value of other commands, such as `weights=FILE` in `bevcli weights fetch`.
-    """
-    flags = _flags.get()
-    return _OTHER_ARGUMENT.sub(_other_flag, _ARGUMENT.sub(partial(_as_flag, flags), text)) if flags else text
-
-
-def print_note(text: str) -> None:
-    """Print a note of the library to stderr."""
-    say(f"note: {one_line(as_flags(text))}", err=True)
-
-
-def _other_flag(argument: re.Match[str]) -> str:
-    flag = f"--{argument[1].replace('_', '-')}"
-    return flag if argument[2] == "True" else f"{flag} {argument[2]}"
-
-
-def _as_flag(flags: Mapping[str, _Flag], argument: re.Match[str]) -> str:
-    """The flag of an argument, with the value that a text of the library states as Python."""
-    flag, value = flags.get(argument[1]), argument[2]
-    if flag is None:
-        return argument[0]
-    if value is None:
-        return flag.yes
-    if value == "False":
-        return flag.spellings[0].partition("/")[2] or f"no {flag.yes}"
-    if flag.kind is bool or flag.option.flag_value is not None:
-        return flag.yes
-    if value.startswith("{"):
-        value = re.sub("[{}'\"]", "", value).replace(": ", "=")
-    elif value.startswith("("):
-        value = value.strip("()").replace(", ", ",")
-    quoted = re.fullmatch(r"([\"'])(.*)\1", value)
-    return f"{flag.yes} {quoted[2] if quoted else value}"
 
 
 def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, Json, Part, argument, as_flags
+from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
-from bevcli.options import Option, defaults
+from bevcli.options import Option, defaults, named
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.rig import CheckOptions
@@ -87,7 +87,7 @@ def viz(
         _record_drive(shown, options, recording, source, format_options)
         return
     kinds = (ViewOptions, RecordingOptions, InputOptions, *option_classes())
-    usual = {name: value for kind in kinds for name, value in defaults(kind).items()}
+    usual = {name: (kind, value) for kind in kinds for name, value in defaults(kind).items()}
     for_drives = {
         "boxes": options.boxes,
         "out": options.out,
@@ -95,8 +95,9 @@ def viz(
         **vars(source),
         **format_options,
     }
-    if given := [name for name, value in for_drives.items() if value != usual[name]]:
-        raise InputError(f"{shown}: is a recording, and `{given[0]}` is for a drive: remove it, or pass the drive")
+    if given := [name for name, value in for_drives.items() if value != usual[name][1]]:
+        option = named(usual[given[0]][0], given[0])
+        raise InputError(f"{shown}: is a recording, and {option} is for a drive: remove it, or pass the drive")
     show(recording_in(shown), options)
 
 
@@ -131,7 +132,7 @@ def _record_drive(
         drive = open_sequence(path, replace(source, after_step=show_steps), **format_options)
     indices = [stamp.index for stamp in drive.stamps]
     if options.frame is not None and options.frame not in indices:
-        raise InputError(f"`frame={options.frame}`: the drive has frames {min(indices)} to {max(indices)}")
+        raise InputError(f"--frame {options.frame}: the drive has frames {min(indices)} to {max(indices)}")
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         file = options.out or Path(folder) / RECORDING
         with Progress(len(drive.stamps), "frames", drive.notes) as progress:
@@ -228,7 +229,7 @@ def project_debug(
 
     given = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in given:
-        raise InputError("`calibration` and `sequence` exclude each other: pass the drive, and its `calibration`")
+        raise InputError("--calibration and --sequence exclude each other: pass the drive, and its --calibration")
     check = check_calibration(input, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
     model, gap = options.model or "demo", None
     if not check.errors:
@@ -258,6 +259,6 @@ def project_debug(
             notes.append(f"{gap.text()}\n")
         elif options.model is not None or options.against is not None:
             notes.append("Rig gap: not measured, because of the errors above.\n")
-        say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
+        say(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from bevcli._version import __version__
-from bevcli.cli.bridge import as_flags, command
+from bevcli.cli.bridge import command
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, prepare_output, reason_of, say
@@ -176,7 +176,7 @@ def root(
 def program() -> Iterator[None]:
     """Settings and exit codes of a process that runs commands in the block.
 
-    A user's mistake is one line on stderr and exit code 1, never a traceback. Arguments in backticks become flags.
+    A user's mistake is one line on stderr and exit code 1, never a traceback.
     """
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
@@ -188,7 +188,7 @@ def program() -> Iterator[None]:
         finally:
             sys.stdout.flush()  # here, where an error can still be told
     except BevcliError as error:
-        say(f"error: {as_flags(str(error))}", err=True)
+        say(f"error: {error!s}", err=True)
         if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
             os._exit(1)
         sys.exit(1)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TextIO
 
 import typer
 
-from bevcli.cli.bridge import as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import duration, one_line, say
 
@@ -87,7 +86,7 @@ class Progress:
 
     def message(self, text: str) -> None:
         """Print a line, above the bar if there is one. The command's arguments in backticks become flags."""
-        text = one_line(as_flags(text))
+        text = one_line(text)
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
         else:

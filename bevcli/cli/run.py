@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, InputDrive, as_flags, print_note
+from bevcli.cli.bridge import FormatValues, InputDrive
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
-from bevcli.printing import counted, say
+from bevcli.printing import counted, print_note, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import InputOptions
@@ -81,7 +81,7 @@ def run(
 
         drive = corrected(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
-    loaded = loaded.in_engine(drive.rig, drive, parts="`probes`" if recording.probes else "", report=print_note)
+    loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "", report=print_note)
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -90,13 +90,12 @@ def run(
         view = LiveView()
 
     standing = StandingCheck() if source.ego_motion == "static" and run_options.temporal else None
-    images_move = as_flags(IMAGES_MOVE)  # here, as frames are shown in another thread, which does not know the flags
 
     def show(frame: "Frame", prediction: "Prediction") -> None:
         for warning in _frame_warnings(frame, prediction):
             progress.message(f"warning: {warning}")
         if standing is not None and prediction.started_anew is None and standing.images_move(frame):
-            progress.message(f"warning: frame {frame.stamp.index}: {images_move}")
+            progress.message(f"warning: frame {frame.stamp.index}: {IMAGES_MOVE}")
         progress.advance()
 
     notes = [*drive.input_errors, *_run_notes(loaded, drive, live=output.live)]
@@ -113,7 +112,7 @@ def run(
             resumed=progress.skip,
             should_stop=signals.received,
         )
-    say(as_flags(summary.table()))
+    say(summary.table())
     if score_without_labels:
         from bevcli.workshop.trust.estimate import estimate_of_run
         from bevcli.workshop.trust.faults import find_faults

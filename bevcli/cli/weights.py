@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, argument, as_flags, command, model_option, print_note
+from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
-from bevcli.printing import aligned, counted, say
+from bevcli.printing import aligned, counted, print_note, say
 from bevcli.weights.options import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def inspect(
         data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
         data["parts"] = [asdict(part) for part in parts]
         texts.append(_parts_as_text(config.name, parts))
-    say(json.dumps(data, indent=1) if as_json else as_flags("\n\n".join(texts)))
+    say(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
 @weights_app.command(cls=PlainCommand)

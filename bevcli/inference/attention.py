@@ -107,7 +107,7 @@ def probe_cells(probes: tuple[tuple[float, float], ...], grid: BevGrid) -> Tenso
         if row < 0:
             (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
             raise InputError(
-                f"`probes=({x:g}, {y:g})`: outside the BEV map (x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m)"
+                f"`probes=({x:g}, {y:g})` (`--probe`): outside the BEV map (x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m)"
             )
         cells.append(row * grid.columns + column)
     return torch.tensor(cells, dtype=torch.int64)

@@ -108,8 +108,8 @@ class Model:
         if not isinstance(calibration, CameraRig | str | Path):
             found = "is missing" if calibration is None else f"is a {type(calibration).__name__}"
             raise InputError(
-                f"`calibration` {found}: model {self.name} does not know where your cameras are: pass a "
-                "calibration.json, or a CameraRig such as `drive.rig`"
+                f"`calibration` (`--calibration`) {found}: model {self.name} does not know where your cameras are: "
+                "pass a calibration.json, or a CameraRig such as `drive.rig`"
             )
         rig = calibration if isinstance(calibration, CameraRig) else read_calibration(Path(calibration))
         given, pose = checked_images(images, rig, color_order, 0), Pose.identity()
@@ -147,7 +147,8 @@ class Model:
     def require_parts(self, what: str) -> None:
         """Raises BevcliError for another engine than PyTorch. what: needs the network's parts, such as "`probes`"."""
         if self.needs_export:
-            given = "`precision=int8`" if self.precision == "int8" else f"`engine={self.engine}`"
+            int8, engine = "`precision=int8` (`--precision int8`)", f"`engine={self.engine}` (`--engine`)"
+            given = int8 if self.precision == "int8" else engine
             raise BevcliError(f"{what}: not available in {self.engine}, but in PyTorch: leave out {given}")
         if self.is_exported:
             raise BevcliError(f"{what}: not available for {self.file}, an exported file: use {self.name} by its name")
@@ -216,7 +217,7 @@ class Model:
         Raises BevcliError for a model that is to run in another engine, before `in_engine`.
         """
         if self.needs_export:
-            raise BevcliError(f"`engine={self.engine}`: needs a drive: pass the model to `bevcli.run`")
+            raise BevcliError(f"`engine={self.engine}` (`--engine`): needs a drive: pass the model to `bevcli.run`")
         if self.is_exported:
             return self.network
         assert self.precision != "int8"
@@ -273,14 +274,22 @@ def load_model(
     chosen = gather(ModelOptions, options, given | changes)
     if str(chosen.model).endswith(EXPORTED_SUFFIX):
         if chosen.engine == TORCH:
-            raise BevcliError(f"`engine=torch`: {chosen.model} is an exported file: use its model by its name")
+            raise BevcliError(
+                f"`engine=torch` (`--engine torch`): {chosen.model} is an exported file: use its model by its name"
+            )
         engine = chosen.engine or FILE_ENGINE
         opened: Model = _engine(engine).open_model(engine, chosen)
         return opened
     if chosen.weights is not None and chosen.untrained:
-        raise WeightsError(f"`weights={chosen.weights}` and `untrained` exclude each other: pass one of them")
+        raise WeightsError(
+            f"`weights={chosen.weights}` (`--weights`) and `untrained` (`--untrained`) exclude each other: pass one of "
+            "them"
+        )
     if Path(str(chosen.model)).suffix in WEIGHTS_SUFFIXES:
-        raise WeightsError(f"`model={chosen.model}`: is a file of weights: pass it as `weights={chosen.model}`")
+        raise WeightsError(
+            f"`model={chosen.model}` (`--model`): is a file of weights: pass it as `weights={chosen.model}` "
+            f"(`--weights {chosen.model}`)"
+        )
     name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
     of_hub = None
     if is_of_hub(name):  # here, because `fetch` looks for a newer version
@@ -290,7 +299,7 @@ def load_model(
     tracker = tracker_of_table(contents, config, file)
     path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
-        untrained = ", or pass `untrained=True` to try the program with random weights"
+        untrained = ", or pass `untrained=True` (`--untrained`) to try the program with random weights"
         path = bundled or (of_hub.weights if of_hub else _published(name, chosen, report, untrained))
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
@@ -336,7 +345,7 @@ def _published(
     if named is not None and named.here is not None:
         return named.here
     if named is None:
-        how = "pass `weights=FILE` (the official .pth or a .safetensors)"
+        how = "pass `weights` (`--weights FILE`), the official .pth or a .safetensors"
     elif named.file is None:
         how = f"they {named.by_hand}"
     elif options.fetch:
@@ -369,13 +378,18 @@ def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torc
     """
     engine, device, is_int8 = options.engine, choose_device(options.device), options.precision == "int8"
     if options.calibrate_with is not None and not is_int8:
-        raise BevcliError("`calibrate_with`: is for `precision=int8`")
+        raise BevcliError("`calibrate_with` (`--int8-drive`): is for `precision=int8` (`--precision int8`)")
     if is_int8 and engine == TORCH:
-        raise BevcliError("`precision=int8`: PyTorch has no INT8 here: choose another `engine`, or leave it out")
+        raise BevcliError(
+            "`precision=int8` (`--precision int8`): PyTorch has no INT8 here: choose another `engine` (`--engine`), "
+            "or leave it out"
+        )
     if is_int8 and engine is None:
         engine = next(iter(installed_engines()), None)
         if engine is None:
-            raise BevcliError("`precision=int8`: no engine is installed: run pip install 'bevcli[openvino]'")
+            raise BevcliError(
+                "`precision=int8` (`--precision int8`): no engine is installed: run pip install 'bevcli[openvino]'"
+            )
     if engine in (None, TORCH):
         assert options.precision != "int8"
         return TORCH, device, options.precision or ("bf16" if device.type == "cuda" else "fp32")
@@ -387,7 +401,7 @@ def _engine(name: str) -> Any:
     """The class of another engine than PyTorch, see `bevcli.workshop.engines.engine.Engine`. Raises BevcliError."""
     engines = list(entries("bevcli.engines"))
     if name not in engines:
-        raise BevcliError(f"`engine={name}`: unknown engine (expected {', '.join((TORCH, *engines))})")
+        raise BevcliError(f"`engine={name}` (`--engine`): unknown engine (expected {', '.join((TORCH, *engines))})")
     return load("bevcli.engines", name)
 
 
@@ -419,16 +433,23 @@ def choose_device(name: str | torch.device) -> torch.device:
         return name
     numbered = re.fullmatch(r"cuda:(\d+)", name)
     if name not in ("auto", "cpu", "cuda", "mps") and not numbered:
-        raise BevcliError(f'`device={name}`: unknown device (expected "auto", "cpu", "cuda", "cuda:N" or "mps")')
+        raise BevcliError(
+            f'`device={name}` (`--device`): unknown device (expected "auto", "cpu", "cuda", "cuda:N" or "mps")'
+        )
     if name == "mps" and not torch.backends.mps.is_available():
-        raise BevcliError("`device=mps`: PyTorch sees no Apple GPU here (use `device=cpu`)")
+        raise BevcliError(
+            "`device=mps` (`--device mps`): PyTorch sees no Apple GPU here (use `device=cpu` (`--device cpu`))"
+        )
     available = torch.cuda.is_available()
     if name.startswith("cuda") and not available:
         raise BevcliError(
-            f"`device={name}`: PyTorch sees no CUDA GPU here (use `device=cpu`, or install a CUDA build of torch)"
+            f"`device={name}` (`--device`): PyTorch sees no CUDA GPU here (use `device=cpu` (`--device cpu`), or "
+            "install a CUDA build of torch)"
         )
     if numbered and int(numbered[1]) >= (count := torch.cuda.device_count()):
-        raise BevcliError(f"`device={name}`: there is no such GPU (found {count}: cuda:0 to cuda:{count - 1})")
+        raise BevcliError(
+            f"`device={name}` (`--device`): there is no such GPU (found {count}: cuda:0 to cuda:{count - 1})"
+        )
     if name == "auto":
         name = "cuda" if available else "cpu"
     return torch.device(name)

@@ -130,7 +130,7 @@ class Session:
         if temporal and model.config.later_frames:
             raise InputError(
                 f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
-                "choose another model, or pass `temporal=False`"
+                "choose another model, or pass `temporal=False` (`--no-temporal`)"
             )
         model = model.in_engine(rig)
         self.name, self.rig, self.notes = name, rig, model.training_notes(rig)

@@ -349,12 +349,12 @@ def one_command(command: str, config: ModelConfig) -> Commands:
     """A command by its name, for all frames. Raises InputError for a model that does not plan, or another name."""
     names = _known(command, config)
     if command not in names:
-        raise InputError(f"`command={command}`: is unknown (expected {', '.join(names)} or a FILE.json)")
+        raise InputError(f"`command={command}` (`--command`): is unknown (expected {', '.join(names)} or a FILE.json)")
     return ((0, command),)
 
 
 def _known(command: str, config: ModelConfig) -> tuple[str, ...]:
     commands = next((names for kind, names in config.results.items() if kind.takes_command), ())
     if not commands:
-        raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
+        raise InputError(f"`command={command}` (`--command`): {config.name} plans no path: leave out the option")
     return commands

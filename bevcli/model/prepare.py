@@ -75,7 +75,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         if not torch.isfinite(parameter).all():
             raise WeightsError(
                 f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
-                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32`"
+                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32` "
+                "(`--precision fp32`)"
             )
     if device.type == "cuda":
         for name in methods_on_device(type(network)):

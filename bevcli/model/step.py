@@ -280,7 +280,7 @@ def assign_cameras(
             if np.isnan(distances).all():
                 raise InputError(
                     f"camera {camera.name}: the model has no camera of this name; pass "
-                    f"`cameras={{'{camera.name}': 'NAME'}}`"
+                    f"`cameras={{'{camera.name}': 'NAME'}}` (`--camera {camera.name}=NAME`)"
                 )
             embedding = model_cameras[int(np.nanargmin(distances))]
         embeddings[camera.name] = embedding

@@ -25,8 +25,9 @@ MOVING = 0.3  # share of the corners that stay, below which the images move
 
 
 IMAGES_MOVE = (
-    'the images move as if the vehicle drove, but `ego_motion="static"` says that it stands, so the history is wrong '
-    "and boxes are missed: pass `odometry=True` in its place, which measures the motion, or `temporal=False`"
+    'the images move as if the vehicle drove, but `ego_motion="static"` (`--static`) says that it stands, so the '
+    "history is wrong and boxes are missed: pass `odometry=True` (`--odometry`) in its place, which measures the "
+    "motion, or `temporal=False` (`--no-temporal`)"
 )
 
 

@@ -200,8 +200,8 @@ def _check_size(path: Path, size: int) -> None:
     size_now = path.stat().st_size if path.is_file() else 0
     if size_now < size:
         raise OutputError(
-            f"{path}: `resume`: was cut or removed since the interruption (expected {size} bytes or more, found "
-            f"{size_now}): pass `force=True` to start anew"
+            f"{path}: `resume` (`--resume`): was cut or removed since the interruption (expected {size} bytes or more, "
+            f"found {size_now}): pass `force=True` (`--force`) to start anew"
         )
 
 

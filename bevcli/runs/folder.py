@@ -45,8 +45,8 @@ class RunFolder(contextlib.ExitStack):
             is_free = self._force or self._resume or not out.exists()
             if not is_free and (written.exists() or any(entry.name != OWN for entry in out.iterdir())):
                 raise OutputError(
-                    f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
-                    "interrupted run, or `out=DIR` for another folder"
+                    f"{out}: exists already; pass `force=True` (`--force`) to overwrite it, `resume=True` (`--resume`) "
+                    "to go on with an interrupted run, or `out` (`--out DIR`) for another folder"
                 )
             stack.callback(self._remove_folders)  # once the lock is gone
             stack.enter_context(folder_lock(out))
@@ -70,7 +70,7 @@ class RunFolder(contextlib.ExitStack):
         if name in self._names:
             return
         if path.exists():
-            raise OutputError(f"{path}: exists already, and no run wrote it: move it, or pass `out=DIR`")
+            raise OutputError(f"{path}: exists already, and no run wrote it: move it, or pass `out` (`--out DIR`)")
         if self._written is None:
             file = self.path / OWN / "written"
             self._written = GrowingFile(file, file.stat().st_size if file.exists() else None)
@@ -127,7 +127,7 @@ def folder_lock(out: Path) -> Iterator[None]:
                 if not lock(file.fileno()):
                     file.seek(0)
                     holder = file.read(500).strip() or "an unknown process"
-                    raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`")
+                    raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out` (`--out DIR`)")
                 with contextlib.suppress(FileNotFoundError):
                     is_ours = os.path.samestat(os.fstat(file.fileno()), path.stat())
             file.truncate(0)
@@ -138,7 +138,7 @@ def folder_lock(out: Path) -> Iterator[None]:
                 folder = os.open(out, os.O_RDONLY)
                 stack.callback(os.close, folder)
                 if not lock(folder):
-                    raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`")
+                    raise OutputError(f"{out}: is in use by another run: wait, or pass `out` (`--out DIR`)")
         yield
 
 

@@ -61,10 +61,10 @@ def run_into_folder(
             the run to resume was another one.
     """
     options = RunOptions() if options is None else options
-    model = model.in_engine(sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
+    model = model.in_engine(sequence.rig, sequence, parts="`probes` (`--probe`)" if options.recording.probes else "")
     commands = read_commands(options.command, model.config)
     if force and resume:
-        raise OutputError("`force` and `resume` exclude each other: pass one of them")
+        raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
         facts = run_facts(model, sequence, options) | {"commands": str(commands)}
         state = _state_to_start_from(folder, facts, model, resume)
@@ -97,7 +97,7 @@ def run_into_folder(
                 _close(folder, summary, files, error)
             if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < done == summary.frames:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
-                message = f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
+                message = f"{out}: `resume` (`--resume`): the run cannot go on from its state ({reason}); {START_ANEW}"
                 raise OutputError(message) from error
             raise
         summary.write(out, files.written())
@@ -121,7 +121,7 @@ def _state_to_start_from(folder: RunFolder, facts: dict[str, str], model: Model,
     memory = model_class(model.config).memory_type
     state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
     if resume and state is None and folder.has_files():
-        raise OutputError(f"{folder.path}: `resume`: its run saved no state; {START_ANEW}")
+        raise OutputError(f"{folder.path}: `resume` (`--resume`): its run saved no state; {START_ANEW}")
     if state is None or state.files is None:
         folder.remove_written()
         state = RunState(facts, None, Counts())

@@ -38,7 +38,7 @@ SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
 HASHED_BYTES = 1 << 24  # files up to this size are hashed; of larger ones size and modification time count
 DIGITS = 12  # of a hash in a text
-START_ANEW = "pass `force=True` to start anew"
+START_ANEW = "pass `force=True` (`--force`) to start anew"
 _TREE = "tree"
 
 
@@ -98,12 +98,12 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
     try:
         state = load_state(folder.state_path, kind)
     except InputError as error:
-        raise OutputError(f"`resume`: {error}; {START_ANEW}") from None
+        raise OutputError(f"`resume` (`--resume`): {error}; {START_ANEW}") from None
     names = [name for name in {**state.facts, **facts} if state.facts.get(name) != facts.get(name)]
     if names:
         pairs = (f"{name}: was {state.facts.get(name)}, is {facts.get(name)}" for name in names)
         raise OutputError(
-            f"{folder.path}: `resume`: the interrupted run differs from this one ({'; '.join(pairs)}): "
+            f"{folder.path}: `resume` (`--resume`): the interrupted run differs from this one ({'; '.join(pairs)}): "
             f"pass the same model, options and input, or {START_ANEW.removeprefix('pass ')}"
         )
     return state

@@ -197,7 +197,7 @@ class RunSummary:
         if counts.tracks is not None:
             rows.insert(2, ("tracks", f"{len(counts.tracks)} objects have such boxes"))
         if guessed:
-            rows.append(("cameras", f"{', '.join(guessed)} (embeddings; `cameras` changes them)"))
+            rows.append(("cameras", f"{', '.join(guessed)} (embeddings; `cameras` (`--camera`) changes them)"))
         if counts.dropped:
             images, frames = counted(len(counts.dropped), "images"), counted(len(counts.skipped), "frames")
             rows.append(("dropped", f"{images}, {frames} without any"))

@@ -11,7 +11,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import defaults
+from bevcli.options import defaults, named
 from bevcli.registry import entries, load
 from bevcli.sequences.options import FormatOptions, InputOptions
 
@@ -89,8 +89,8 @@ def format_of(path: Path) -> Format:
         if drives:
             few = ", ".join(drives[:FEW]) + (", …" if len(drives) > FEW else "")
             raise InputError(
-                f"{path}: is a folder of {len(drives)} drives ({few}): choose one with `scene`, or run all by "
-                "`bevcli batch`"
+                f"{path}: is a folder of {len(drives)} drives ({few}): choose one with `scene` (`--scene`), or run all "
+                "by `bevcli batch`"
             )
         kind = "is a file, and not" if path.is_file() else "is not"
         expected = _either([f"{form.name} (expected {form.expected})" for form in known])
@@ -144,7 +144,8 @@ def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: st
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0].options)[name]:
-            raise InputError(f"{where}: `{name}` is for {_either([form.name for form in having])}: remove it")
+            option = named(having[0].options, name)
+            raise InputError(f"{where}: {option} is for {_either([form.name for form in having])}: remove it")
 
 
 def _either(names: list[str]) -> str:

@@ -110,7 +110,7 @@ class ImageReader:
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
-            raise InputError(f"camera {camera}: {reason}: add the image, or remove `strict=True`")
+            raise InputError(f"camera {camera}: {reason}: add the image, or remove `strict=True` (`--strict`)")
         tasks = {name: self._threads.submit(self._read_one, source, rig[name]) for name, source in sources.items()}
         images: dict[str, CameraImage] = {}
         reasons = dict(dropped)
@@ -119,7 +119,7 @@ class ImageReader:
                 images[name] = result_within(task, READING_TIMEOUT_S, f"{sources[name]}: reading the image")
             except UnreadableImage as unreadable:
                 if self._strict:
-                    hint = "replace the image, or remove `strict=True`"
+                    hint = "replace the image, or remove `strict=True` (`--strict`)"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
         if not images and self._inside is not None and not os.path.isdir(self._inside):
@@ -138,7 +138,7 @@ class ImageReader:
                 if os.path.commonpath((path, self._inside)) != self._inside:
                     raise InputError(
                         f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
-                        "`allow_outside=True` to read it"
+                        "`allow_outside=True` (`--allow-outside`) to read it"
                     )
             is_file = source.video_index is None
             image = self._read_file(source, camera) if is_file else self._read_video(source, camera.name)

@@ -77,7 +77,7 @@ class InputOptions(ClassOptions):
     )
     rate_hz: float | Literal["all"] | None = option(
         default=None,
-        help="Thin to this many frames per second. Default: the model's rate; all with `sweeps`.",
+        help="Thin to this many frames per second. Default: the model's rate; all with --sweeps.",
         flag="--rate",
         metavar="HZ|all",
         parse=parse_rate,
@@ -105,29 +105,31 @@ class InputOptions(ClassOptions):
         help='Read images outside of the folder too: absolute paths, "..", and links that lead out of it.',
     )
     model_rate_hz: float | None = option(
-        default=None, help="Frame rate of a model, used without `rate_hz` and `every`.", hidden=True
+        default=None, help="Frame rate of a model, used without --rate and --every.", hidden=True
     )
     classes: tuple[str, ...] | None = option(
         default=None, help="The classes of a model. Default: nuScenes' ten.", hidden=True
     )
     after_step: Callable[[int, int], None] | None = option(
-        default=None, help="Called with the steps that `odometry` has measured, and the number of all.", hidden=True
+        default=None, help="Called with the steps that --odometry has measured, and the number of all.", hidden=True
     )
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None and self.every is not None:
-            raise InputError("`rate_hz` and `every` exclude each other: pass one of them")
+            raise InputError("`rate_hz` (`--rate`) and `every` (`--every`) exclude each other: pass one of them")
         if isinstance(self.rate_hz, (int, float)) and not 0 < self.rate_hz < float("inf"):
-            raise InputError(f"`rate_hz={self.rate_hz:g}`: expected frames per second, above 0")
+            raise InputError(f"`rate_hz={self.rate_hz:g}` (`--rate`): expected frames per second, above 0")
         if self.every is not None and self.every < 1:
-            raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
+            raise InputError(f"`every={self.every}` (`--every`): expected an integer, 1 or more")
         if self.odometry and self.ego_motion == "static":
-            raise InputError('`odometry` and `ego_motion="static"` exclude each other: pass one of them')
+            raise InputError(
+                '`odometry` (`--odometry`) and `ego_motion="static"` (`--static`) exclude each other: pass one of them'
+            )
 
     def refuse_static(self, path: Path) -> None:
         """Raise InputError for `ego_motion="static"`. path: of an input that has its own ego-motion."""
         if self.ego_motion == "static":
-            raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"`')
+            raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"` (`--static`)')
 
     def for_model(self, config: ModelConfig, *, temporal: bool = True) -> InputOptions:
         """The options for a run of a model: its rate and classes, and ego-motion only where history needs it."""
@@ -175,13 +177,13 @@ class RigOptions(FormatOptions):
         metavar="FILE|FOLDER",
     )
     intrinsics: Path | None = option(
-        reads="path", default=None, help="Another name of `calibration`, for a file without poses."
+        reads="path", default=None, help="Another name of --calibration, for a file without poses."
     )
     extrinsics: Path | None = option(
-        reads="path", default=None, help="The poses of the cameras, in place of those of `calibration`."
+        reads="path", default=None, help="The poses of the cameras, in place of those of --calibration."
     )
     transform: Literal["ego_from_camera", "camera_from_ego"] | None = option(
-        default=None, help="What the transforms of `calibration` are, where both are possible."
+        default=None, help="What the transforms of --calibration are, where both are possible."
     )
     fov_deg: float | Mapping[str, float] | None = option(
         default=None,
@@ -216,16 +218,16 @@ class RigOptions(FormatOptions):
         metavar="FILE",
     )
     pose_times: Literal["s", "ms", "us", "ns"] | None = option(
-        default=None, help="Unit of the times in `ego_motion_file`. Default: the only possible one."
+        default=None, help="Unit of the times in --ego-motion. Default: the only possible one."
     )
     pose_angles: Literal["degrees", "radians", "compass"] | None = option(
         default=None,
-        help="Unit of the angles in `ego_motion_file`; compass: degrees clockwise from north. Default: what fits how "
+        help="Unit of the angles in --ego-motion; compass: degrees clockwise from north. Default: what fits how "
         "the vehicle moves.",
     )
     poses_of: str | None = option(
         default=None,
-        help='Camera whose poses `ego_motion_file` has, or "vehicle". Default: vehicle, and camera 0 for KITTI.',
+        help='Camera whose poses --ego-motion has, or "vehicle". Default: vehicle, and camera 0 for KITTI.',
         metavar="CAMERA|vehicle",
     )
 
@@ -240,7 +242,9 @@ class RigOptions(FormatOptions):
     def draft(self, drive: Path | None = None) -> RigDraft | None:
         """The rig, and how it was understood; as `rig`."""
         if self.calibration is not None and self.intrinsics is not None:
-            raise InputError("`calibration` and `intrinsics` are the same: pass one of them")
+            raise InputError(
+                "`calibration` (`--calibration`) and `intrinsics` (`--intrinsics`) are the same: pass one of them"
+            )
         names = ("extrinsics", "transform", "fov_deg", "height", "yaw_deg")
         how = {name: value for name in names if (value := getattr(self, name)) is not None}
         path = self.intrinsics if self.calibration is None else self.calibration

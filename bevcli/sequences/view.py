@@ -129,7 +129,9 @@ def select_range(drive: Drive, frames: slice) -> Drive:
     if not indices:
         start, stop = ("" if end is None else end for end in (frames.start, frames.stop))
         count = len(drive.stamps)
-        raise InputError(f"`frames={start}:{stop}`: the range has no frame (the sequence has {count}: 0:{count})")
+        raise InputError(
+            f"`frames={start}:{stop}` (`--frames`): the range has no frame (the sequence has {count}: 0:{count})"
+        )
     return select(drive, indices)
 
 
@@ -158,7 +160,7 @@ def select_rate(drive: Drive, rate_hz: float) -> Drive:
     if len(kept) < len(stamps):
         notes.append(
             f"{len(kept)} of {len(stamps)} frames are used, at about {rate_hz:g} frames per second "
-            '(`rate_hz="all"` uses every frame)'
+            '(`rate_hz="all"` (`--rate all`) uses every frame)'
         )
     if slowest < SLOWEST_RATIO:
         notes.append(

@@ -163,7 +163,10 @@ def _go_to(recording: Path, client: ViewerClient, state: ViewerState, frame: int
         raise InputError(f"{recording}: the recording has no frames (expected one of `bevcli run`)")
     wanted = timeline.start if frame is None else frame
     if not timeline.start <= wanted <= timeline.end:
-        raise InputError(f"{recording}: `frame={wanted}`: the recording has frames {timeline.start} to {timeline.end}")
+        raise InputError(
+            f"{recording}: `frame={wanted}` (`--frame {wanted}`): the recording has frames {timeline.start} to "
+            f"{timeline.end}"
+        )
     client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
 
 

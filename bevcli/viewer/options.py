@@ -59,7 +59,7 @@ class ViewOptions:
     )
     frame: int | None = option(
         default=None,
-        help="Frame index, where the viewer's window opens, or for `screenshot`. Default: the first frame.",
+        help="Frame index, where the viewer's window opens, or for --screenshot. Default: the first frame.",
     )
     summary: bool = option(default=False, help="Print the frames, time span, boxes per class and sizes.")
     video: Path | None = option(

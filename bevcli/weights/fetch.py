@@ -150,7 +150,7 @@ def _require_space(folder: Path, wanted: int) -> None:
     if wanted > free:
         raise OutputError(
             f"{folder}: the disk has too little space: {wanted / 1e6:.0f} MB are needed, {max(free, 0) / 1e6:.0f} MB "
-            "are free: free some, or pass `weights_dir=DIR` on another disk"
+            "are free: free some, or pass `weights_dir` (`--weights-dir DIR`) on another disk"
         )
 
 

@@ -37,7 +37,9 @@ def model_file_for(
     if path.suffix != ".toml":
         raise OutputError(f"{path}: expected a file name that ends in .toml")
     if path.exists() and not chosen.force:
-        raise OutputError(f"{path}: already exists; choose another name, or pass `force=True` to overwrite it")
+        raise OutputError(
+            f"{path}: already exists; choose another name, or pass `force=True` (`--force`) to overwrite it"
+        )
     model = checkpoint.nearest
     names = chosen.classes or _stated(checkpoint)
     known = load_config(model)
@@ -49,7 +51,7 @@ def model_file_for(
         found = counted(len(names), "names") if names else "none"
         raise WeightsError(
             f"{weights}: has {counted(count, 'classes')}: pass their names in the order of the training as "
-            f"`classes=NAME,NAME` (found {found})"
+            f"`classes` (`--classes NAME,NAME`) (found {found})"
         )
     contents = read_model_file(model)[0] | {"name": path.stem, "classes": list(names)}
     settings = contents.get("class_settings", {})

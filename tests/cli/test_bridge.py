@@ -1,6 +1,5 @@
-"""Commands made from dataclasses of options, and the flags that stand for arguments in messages."""
+"""Commands made from dataclasses of options."""
 
-from contextvars import Context
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,10 +8,9 @@ import typer
 from typer.testing import CliRunner
 
 from bevcli.cli import bridge
-from bevcli.cli.bridge import Part, as_flags, command
+from bevcli.cli.bridge import Part, command
 from bevcli.cli.main import PlainCommand
-from bevcli.errors import InputError
-from bevcli.options import Option, option, options
+from bevcli.options import Option, named, option, options
 
 
 def parse_range(text):
@@ -33,7 +31,7 @@ class ReadOptions:
     calibration: str | Path | None = option(default=None, help="A file.")
     track: bool = option(default=True, help="Track.", flag="--track/--no-track")
     strict: bool = option(default=False, help="Strict.", panel="Checks")
-    names: tuple[str, ...] = option(default=(), help="Names, in order of `rate_hz`.", repeatable=True)
+    names: tuple[str, ...] = option(default=(), help="Names, in order of --rate.", repeatable=True)
     secret: int = option(default=3, help="Only Python has it.", hidden=True)
 
 
@@ -146,32 +144,7 @@ def test_the_docstring_of_a_class_has_the_help_texts():
     assert "\n    frames: Frame range.\n" in ReadOptions.__doc__
 
 
-@pytest.mark.parametrize(
-    ("library", "shown"),
-    [
-        ("pass `rate_hz`", "pass --rate"),
-        ("`rate_hz=2.5`: too low", "--rate 2.5: too low"),
-        ("pass `force=True`", "pass --force"),
-        ("pass `track=False`", "pass --no-track"),
-        ('pass `motion="static"`', "pass --static"),
-        ("pass `calibration=FILE`", "pass --calibration FILE"),
-        ('`names="a b"`', "--names a b"),
-        ('pass `names={"CAM": "/topic"}`', "pass --names CAM=/topic"),
-        ("`calibration=(1, -2.5)`", "--calibration 1,-2.5"),
-        ("`rate_hz` and `strict` exclude each other", "--rate and --strict exclude each other"),
-        ("`unknown`, `bevcli run` and `READ`", "`unknown`, `bevcli run` and `READ`"),
-        ("pass `of_others=FILE` there, `other=True`", "pass --of-others FILE there, --other"),
-        ('`of_others="auto"`', "--of-others auto"),
-    ],
-)
-def test_arguments_in_messages_become_flags(library, shown):
-    def read(source: ReadOptions, file: FileOptions) -> None:
-        raise InputError(library)
-
-    error = invoke(read).exception
-    assert isinstance(error, InputError)
-    assert as_flags(str(error)) == shown
-
-
-def test_arguments_stay_as_they_are_outside_a_command():
-    assert Context().run(as_flags, "pass `force=True`") == "pass `force=True`"
+def test_a_text_names_an_option_as_both_spell_it():
+    assert named(ReadOptions, "rate_hz") == "`rate_hz` (`--rate`)"
+    assert named(ReadOptions, "track") == "`track` (`--track`)"
+    assert named(FileOptions, "files") == "`files` (`--file`)"

@@ -8,7 +8,6 @@ import pytest
 from memory_drive import MemoryDrive
 from typer.testing import CliRunner
 
-from bevcli.cli.bridge import as_flags
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame
@@ -156,4 +155,4 @@ def test_the_command_needs_one_kind_of_drives():
     for options in ([], ["samples/crossing", "--rendered", "1000000:1000001"]):
         answer = CliRunner().invoke(app, ["stress", *options])
         assert isinstance(answer.exception, InputError)
-        assert "SEQUENCE folders or --rendered SEEDS" in as_flags(str(answer.exception))
+        assert "SEQUENCE folders or --rendered SEEDS" in str(answer.exception)

@@ -64,7 +64,8 @@ class ClassNames:
         for name, target in (renames or {}).items():
             if target.lower() not in known:
                 raise InputError(
-                    f'`class_map` {name}={target}: "{target}" is not a class (expected one of {", ".join(self.known)})'
+                    f'`class_map` (`--class-map`) {name}={target}: "{target}" is not a class (expected one of '
+                    f"{', '.join(self.known)})"
                 )
             exact = target if target in self.known else known[target.lower()]
             self._by_lower_case[name.lower()] = self._by_name[name] = exact
@@ -110,7 +111,7 @@ class ClassNames:
         named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
         return (
             f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
-            f'(`class_map` "{min(others)}={self.known[0]}" renames a class)',
+            f'(`class_map` (`--class-map`) "{min(others)}={self.known[0]}" renames a class)',
         )
 
 

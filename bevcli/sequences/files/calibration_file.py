@@ -16,9 +16,11 @@ from bevcli.findings import Finding, errors_of
 from bevcli.frame import DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
+from bevcli.options import named
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
+from bevcli.sequences.options import RigOptions
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
@@ -86,7 +88,7 @@ def draft_rig(path: Path | None, drive: Path | None = None, **how: Any) -> RigDr
 
         return read_rig(path, drive, **how)
     for name in how:
-        raise InputError(f"{file}: states all of the rig: remove `{name}`")
+        raise InputError(f"{file}: states all of the rig: remove {named(RigOptions, name)}")
     return draft_calibration(file)
 
 
@@ -111,7 +113,10 @@ def draft_calibration(path: Path) -> RigDraft:
             raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
         return dict(pairs)
 
-    missing = "the file is missing (expected a calibration): pass `calibration=FILE` of another kind, or `fov_deg=70`"
+    missing = (
+        "the file is missing (expected a calibration): pass `calibration` (`--calibration FILE`) of another kind, or "
+        "`fov_deg=70` (`--fov 70`)"
+    )
     document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=unique)
     if not isinstance(document, dict):
         raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')

@@ -141,7 +141,7 @@ class IncrementalJson(GrowingFile):
         except ValueError:
             raise OutputError(
                 f"{self.name}: {name}: a box or pose has a number that is not finite, so the model's output is "
-                'invalid: try `precision="fp32"`'
+                'invalid: try `precision="fp32"` (`--precision fp32`)'
             ) from None
         member = text if key is None else f"{json.dumps(key)}: {text}"
         self.append((self._separator + member).encode())

@@ -67,7 +67,7 @@ class FolderDrive(ListedDrive):
             found = find_frames(path, rig.names, own, motion, has_poses=has_poses)
             poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(found[0])))
             entries, self.understood = found if poses.motion is None else covered(found, poses.motion)
-            advice = "state the time of the first image by `start_ns`, or in timing.toml"
+            advice = "state the time of the first image by `start_ns` (`--start-ns`), or in timing.toml"
         assert poses is not None
         if not common.allow_outside:
             _check_paths(path, entries)
@@ -139,7 +139,7 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
             if leads_out(path, folder):
                 raise InputError(
                     f"{entry.origin}: camera {camera}: {path}: leads out of the folder: pass "
-                    "`allow_outside=True` to read it"
+                    "`allow_outside=True` (`--allow-outside`) to read it"
                 )
 
 
@@ -159,8 +159,8 @@ def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
     if not is_there(file) and use == "required":
         raise InputError(
             f"{file}: the file is missing (expected the vehicle's poses): add it, "
-            'pass `odometry=True` to measure them from the images, `ego_motion="static"` if the vehicle stands, or '
-            "`temporal=False` to run without history"
+            'pass `odometry=True` (`--odometry`) to measure them from the images, `ego_motion="static"` (`--static`) '
+            "if the vehicle stands, or `temporal=False` (`--no-temporal`) to run without history"
         )
     if not is_there(file):
         return ReadPoses(None, () if use == "measured" else ("ego_motion.csv is missing: boxes are in the ego frame",))

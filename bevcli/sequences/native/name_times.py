@@ -98,7 +98,8 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
         first = next(iter(names.values()))
         raise InputError(
             f"{where}: the names {first[0]} to {first[-1]} are no times of a camera in any unit (expected 0.5 to 240 "
-            "images per second) and no different indices: state their unit by `times`, or list the images in frames.csv"
+            "images per second) and no different indices: state their unit by `times` (`--times`), or list the images "
+            "in frames.csv"
         )
     alone = [readings[0] for readings in found if len(readings) == 1]
     known = [reading for reading in alone if reading.is_known_origin]
@@ -116,7 +117,7 @@ def _decided(where: Path, names: Texts, readings: list[Reading], motion: EgoMoti
             return fitting[0]
     words = [f"{each.words} ({1e9 / np.median(_steps(each.values)[0]):.3g} Hz)" for each in times]
     words += ["indices of images"] if len(times) < len(readings) else []
-    options = " or ".join(f'`times="{each.kind}"`' for each in readings)
+    options = " or ".join(f'`times="{each.kind}"` (`--times`)' for each in readings)
     first = next(iter(names.values()))
     raise InputError(
         f"{where}: the numbers in the image names {first[0]} to {first[-1]} may be {' or '.join(words)}: pass {options}"
@@ -253,8 +254,8 @@ def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> 
         example = next(iter(names.values()))[0]
         expected = "dates such as 20260301120000" if kind == "date" else WORDS[kind]
         raise InputError(
-            f'{where}: `times="{kind}"`: no numbers in the names are possible (expected {expected}, different in each '
-            f"image of a camera, found {example}): pass another unit"
+            f'{where}: `times="{kind}"` (`--times {kind}`): no numbers in the names are possible (expected '
+            f"{expected}, different in each image of a camera, found {example}): pass another unit"
         )
     is_likely: tuple[Callable[[Reading], bool], ...] = (lambda r: r.is_known_origin, lambda r: _has_rate(r.values))
     if kind == "index":

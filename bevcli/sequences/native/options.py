@@ -35,6 +35,9 @@ class FolderOptions(RigOptions):
     def __post_init__(self) -> None:
         slowest, fastest = RATES_HZ
         if self.image_rate_hz is not None and not slowest <= self.image_rate_hz <= fastest:
-            raise InputError(f"`image_rate_hz={self.image_rate_hz:g}`: expected images per second, {slowest:g} or more")
+            raise InputError(
+                f"`image_rate_hz={self.image_rate_hz:g}` (`--image-rate`): expected images per second, {slowest:g} or "
+                "more"
+            )
         if self.start_ns is not None and abs(self.start_ns) > LARGEST_NS:
-            raise InputError(f"`start_ns={self.start_ns}`: expected nanoseconds, at most {LARGEST_NS}")
+            raise InputError(f"`start_ns={self.start_ns}` (`--start-ns`): expected nanoseconds, at most {LARGEST_NS}")

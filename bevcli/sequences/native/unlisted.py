@@ -271,12 +271,12 @@ def _times_of_indices(
         if motion is not None:
             seconds = (motion.last_ns - motion.first_ns) / 1e9
             cover = f"the poses cover {seconds:.1f} s from {motion.first_ns} ns on"
-            also = ", and the time of the first one by `start_ns`"
+            also = ", and the time of the first one by `start_ns` (`--start-ns`)"
         raise InputError(
             f"{folder}: the images are numbered {first} to {numbers[-1]}, and {cover}: state the images per second by "
-            f"`image_rate_hz`{also}"
+            f"`image_rate_hz` (`--image-rate`){also}"
         )
-    assumed = "" if rate else " (assumed: state `image_rate_hz`)"
+    assumed = "" if rate else " (assumed: state `image_rate_hz` (`--image-rate`))"
     start, rate = timing.start_ns or 0, rate or ASSUMED_RATE_HZ
     return [start + round((number - first) * 1e9 / rate) for number in numbers], f"at {rate:g} Hz{assumed}"
 
@@ -300,7 +300,7 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
         videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + own.offset_ns, own.rate_hz)
     matched = match(videos)
     is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
-    stated = "times as stated" if is_stated else "times from 0 on (state `start_ns`)"
+    stated = "times as stated" if is_stated else "times from 0 on (state `start_ns` (`--start-ns`))"
     return matched.entries, f"{stated}, {_matched(videos, matched)}{renamed(names)}"
 
 

@@ -242,14 +242,14 @@ def choose_version(root: object, versions: Sequence[str], version: str | None) -
         return chosen[0]
     found = ", ".join(versions) or "none"
     wanted = f'has no version "{version}"' if version else "has several versions"
-    raise InputError(f"{root}: {wanted} (found: {found}): choose one with `version`")
+    raise InputError(f"{root}: {wanted} (found: {found}): choose one with `version` (`--version`)")
 
 
 def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: str | None = None) -> list[int]:
     """Indices of the scenes with images of a split (None: all), or of one scene. Raises InputError without any."""
     names = [str(name) for name in index.scenes.names]
     if split is not None and split not in SPLITS:
-        raise InputError(f'`split` "{split}": expected one of {", ".join(SPLITS)}')
+        raise InputError(f'`split` (`--split`) "{split}": expected one of {", ".join(SPLITS)}')
     if scene is not None and scene not in names:
         few = ", ".join(names[:6]) + (f", ... ({len(names)} scenes)" if len(names) > 6 else "")
         raise InputError(f'{tables}: has no scene "{scene}" (found: {few})')
@@ -261,7 +261,9 @@ def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: 
     ]
     if not scenes:
         what = f"scene {scene} is not in" if scene else "has no scene of"
-        raise InputError(f"{tables}: {what} the split {split}: choose another `split` or `version`")
+        raise InputError(
+            f"{tables}: {what} the split {split}: choose another `split` (`--split`) or `version` (`--version`)"
+        )
     with_frames = (np.diff(index.scenes.first_sample) > 0) & (np.diff(index.scenes.first_image) > 0)
     filled = [number for number in scenes if with_frames[number]]
     if not filled:

@@ -21,7 +21,7 @@ class Workers:
 
     count: int | None = option(
         default=None,
-        help="Number of workers. Default: one per GPU, else one per core. 1 without `address` needs no Ray.",
+        help="Number of workers. Default: one per GPU, else one per core. 1 without --ray needs no Ray.",
         flag="--workers",
         metavar="N",
         minimum=1,
@@ -71,7 +71,7 @@ class BatchOptions:
         help="Go on with the batch in the output folder: skip drives that are done or have failed. Drives whose files, "
         "model, weights or options differ run again.",
     )
-    retry_failed: bool = option(default=False, help="With `resume`: run failed drives again.")
+    retry_failed: bool = option(default=False, help="With --resume: run failed drives again.")
     evaluate: bool = option(
         default=False,
         help="Score drives that have ground truth, each and all together (metrics.json).",

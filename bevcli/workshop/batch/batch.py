@@ -82,7 +82,7 @@ def batch(
     if own.keys() - names:
         raise TypeError(f"batch() has no option {min(own.keys() - names)}")
     if chosen.retry_failed and not chosen.resume:
-        raise InputError("`retry_failed`: is for `resume=True`")
+        raise InputError("`retry_failed` (`--retry-failed`): is for `resume=True` (`--resume`)")
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
     if "recording" not in options:
         run_options = replace(run_options, recording=recording)

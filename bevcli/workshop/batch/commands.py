@@ -204,9 +204,9 @@ def _get(named: "NamedWeights", model: ModelOptions) -> None:
     size = "size unknown" if named.size is None else f"{named.size / 1e6:.1f} MB"
     what = f"the weights {named.name} are not here: {named.source.url or named.source.source} ({size})"
     if not model.fetch and not sys.stdin.isatty():
-        raise WeightsError(f"{what}: pass `fetch=True` to download them, or `weights=FILE`")
+        raise WeightsError(f"{what}: pass --fetch to download them, or --weights FILE")
     if not model.fetch and not typer.confirm(f"{what}. Download them?", err=True):
-        raise WeightsError(f"{named.name}: without its weights nothing can be scored: pass `weights=FILE`")
+        raise WeightsError(f"{named.name}: without its weights nothing can be scored: pass --weights FILE")
     fetch_with_bar(named)
 
 

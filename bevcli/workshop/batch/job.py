@@ -94,7 +94,7 @@ def find_drives(
     with ThreadPoolExecutor(LISTING_THREADS) as pool:
         drives = [drive for found in pool.map(lambda s: list(_drives_of(s, options)), sources) for drive in found]
     if not drives:
-        raise InputError("there are no drives (expected paths, URLs or patterns, or `listed=FILE`)")
+        raise InputError("there are no drives (expected paths, URLs or patterns, or `listed` (`--list FILE`))")
     return _without_copies(drives)
 
 

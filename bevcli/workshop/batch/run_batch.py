@@ -147,9 +147,12 @@ def _check_folder(out: storage.Storage, resume: bool) -> None:
     is_batch = out.read(DESCRIPTION) is not None
     found = out.names("") - {".bevcli"}
     if found and not is_batch:
-        raise OutputError(f"{out.where}: is not a batch and not empty: pass `out=DIR` for another folder")
+        raise OutputError(f"{out.where}: is not a batch and not empty: pass `out` (`--out DIR`) for another folder")
     if is_batch and not resume and (out.names(storage.RESULTS) or out.names(storage.FAILED)):
-        raise OutputError(f"{out.where}: has a batch already: pass `resume=True` to go on with it, or `out=DIR`")
+        raise OutputError(
+            f"{out.where}: has a batch already: pass `resume=True` (`--resume`) to go on with it, or `out` (`--out "
+            "DIR`)"
+        )
 
 
 def _known_records(

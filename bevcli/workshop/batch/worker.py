@@ -287,9 +287,9 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[BatchDrive], workers: W
     model or write into the batch's folder.
     """
     if not ray_is_installed():
-        raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass `count=1`")
+        raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass `count=1` (`--workers 1`)")
     if workers.address and _LOOPBACK.items() <= os.environ.items():
-        raise BevcliError("Ray ran on this machine only in this process: use a new process for `address`")
+        raise BevcliError("Ray ran on this machine only in this process: use a new process for `address` (`--ray`)")
     settings = _ENVIRONMENT if workers.address else _ENVIRONMENT | _LOOPBACK
     for name, value in settings.items():
         os.environ.setdefault(name, value)
@@ -314,7 +314,7 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[BatchDrive], workers: W
                 if left:
                     running[worker.run.remote(left.pop())] = worker
         except ray.exceptions.RayError as error:
-            raise BevcliError(f"Ray stopped ({reason_of(error)[:200]}); `resume=True` goes on") from None
+            raise BevcliError(f"Ray stopped ({reason_of(error)[:200]}); `resume=True` (`--resume`) goes on") from None
 
 
 class _RayWorker:
@@ -353,7 +353,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
-        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]}); `count=1` needs no Ray") from None
+        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]}); `count=1` (`--workers 1`) needs no Ray") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
     try:
@@ -379,7 +379,7 @@ def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int,
     cores, gpus = int(resources.get("CPU", 0)), float(resources.get("GPU", 0))
     share = workers.gpus if workers.gpus is not None else float(gpus > 0 and job.model.device != "cpu")
     if share > gpus:
-        raise BevcliError(f"`gpus={share:g}`: Ray has {gpus:g} GPUs: pass 0 to run on CPUs")
+        raise BevcliError(f"`gpus={share:g}` (`--gpus-per-worker`): Ray has {gpus:g} GPUs: pass 0 to run on CPUs")
     count = workers.count
     if count is None:
         count = int(gpus / share) if share else cores // (workers.threads or 1)
@@ -389,6 +389,6 @@ def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int,
     if count > possible:
         raise BevcliError(
             f"{count} workers with {threads} threads and {share:g} GPUs each: Ray has {cores} cores and {gpus:g} GPUs: "
-            f"pass `count={max(1, possible)}`"
+            f"pass `count={max(1, possible)}` (`--workers {max(1, possible)}`)"
         )
     return count, threads, share

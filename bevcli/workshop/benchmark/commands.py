@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from bevcli.cli.bridge import Json, Part, as_flags, print_note
+from bevcli.cli.bridge import Json, Part
 from bevcli.errors import BevcliError
 from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions, complete_model
 from bevcli.options import option, options
-from bevcli.printing import say
+from bevcli.printing import print_note, say
 from bevcli.registry import known_models
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ def bench(
 
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
-            raise BevcliError("`engines` compares all of them on the CPU: leave out other options")
+            raise BevcliError("--engines compares all of them on the CPU: leave out other options")
         table = compare_engines(load_config(options.model), options.frames, print_note)
-        say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))
+        say(json.dumps(table.as_data(), indent=1) if as_json else table.text())
         return
     model, against_plain = _model(options, model_options), options.against == "plain"
     result = run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)
@@ -80,7 +80,7 @@ def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
         config = load_config(options.model)
         engine, device, precision = choose_engine(model_options, config)
         model = Model(made_up_model(config), device, precision, engine=engine)
-    parts = " and ".join(f"`{name}`" for name in ("against", "profile") if getattr(options, name) is not None)
+    parts = " and ".join(f"--{name}" for name in ("against", "profile") if getattr(options, name) is not None)
     if parts:
         model.require_parts(parts)
     if model.needs_export:

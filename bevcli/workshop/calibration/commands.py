@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part, as_flags
+from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions
@@ -41,5 +41,5 @@ def calibrate(
     with Progress(steps, "steps", drive.notes) as progress:
         result = measure_it(drive, options, after_step=progress.advance)
     written = result.write(out)
-    say(result.to_json() if as_json else as_flags(result.text()))
+    say(result.to_json() if as_json else result.text())
     say("Written: " + ", ".join(map(str, written)), err=as_json)

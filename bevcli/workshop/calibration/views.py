@@ -107,13 +107,15 @@ def _check(drive: Drive) -> None:
     if not drive.has_ego_motion:
         raise InputError(
             f"{drive.name}: has no ego-motion (expected the vehicle's poses, since a calibration is measured from "
-            "motion): add it, or measure it from the images too: `odometry`"
+            "motion): add it, or measure it from the images too: `odometry` (`--odometry`)"
         )
     if len(drive.stamps) < 2:
         raise InputError(f"{drive.name}: has one frame (expected {FEWEST_PAIRS + 1} or more): choose more frames")
     scenes = {stamp.scene for stamp in drive.stamps}
     if len(scenes) > 1:
-        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one, since rigs differ): choose a `scene`")
+        raise InputError(
+            f"{drive.name}: has {len(scenes)} scenes (expected one, since rigs differ): choose a `scene` (`--scene`)"
+        )
 
 
 def _positions(drive: Drive) -> tuple[list[int], Array]:

@@ -2,9 +2,9 @@
 
 import json
 
-from bevcli.cli.bridge import Json, print_note
+from bevcli.cli.bridge import Json
 from bevcli.options import option, options
-from bevcli.printing import say
+from bevcli.printing import print_note, say
 
 PANEL = "Start"
 

@@ -18,7 +18,9 @@ class FileOptions:
         """The file to write. Raises OutputError where it exists and `force` is false."""
         target = default if self.out is None else self.out
         if target.exists() and not self.force:
-            raise OutputError(f"{target}: already exists; choose another name, or pass `force=True` to overwrite it")
+            raise OutputError(
+                f"{target}: already exists; choose another name, or pass `force=True` (`--force`) to overwrite it"
+            )
         return target
 
 

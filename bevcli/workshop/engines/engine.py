@@ -111,15 +111,16 @@ class Engine(LoadedFile):
         """The model of an exported file, `options.model`. name: of the engine. Raises BevcliError, as `open` does."""
         file = Path(str(options.model))
         if options.weights is not None or options.untrained:
-            option = "`untrained`" if options.untrained else f"`weights={options.weights}`"
+            weights = f"`weights={options.weights}` (`--weights`)"
+            option = "`untrained` (`--untrained`)" if options.untrained else weights
             raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
         if options.precision is not None:
             raise BevcliError(
-                f"`precision={options.precision}`: {file} has a fixed precision: leave out the option "
+                f"`precision={options.precision}` (`--precision`): {file} has a fixed precision: leave out the option "
                 "(bevcli quantize writes files with INT8)"
             )
         if str(options.device) not in ("auto", "cpu"):
-            raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
+            raise BevcliError(f"`device={options.device}` (`--device`): {file} runs on the CPU: leave out the option")
         network = cls.open(file)
         stated = network.metadata
         return Model(
@@ -137,9 +138,15 @@ class Engine(LoadedFile):
         """Raises BevcliError where the engine, `name`, is not installed or cannot run a model with these options."""
         if options.precision not in (None, *cls.precisions):
             known = " or ".join(cls.precisions)
-            raise BevcliError(f"`precision={options.precision}`: `engine={name}` computes in {known}")
+            raise BevcliError(
+                f"`precision={options.precision}` (`--precision`): `engine={name}` (`--engine {name}`) computes in "
+                f"{known}"
+            )
         if str(options.device) not in ("auto", "cpu"):
-            raise BevcliError(f"`device={options.device}`: `engine={name}` runs on the CPU: leave out the option")
+            raise BevcliError(
+                f"`device={options.device}` (`--device`): `engine={name}` (`--engine {name}`) runs on the CPU: leave "
+                "out the option"
+            )
         cls.in_precision(options.precision or "fp32").require_packages()
         require(*EXPORTERS, *(QUANTIZERS if options.precision == "int8" else ()))
         export_form(config, len(config.cameras))
@@ -258,7 +265,9 @@ class RoundingOpenVinoEngine(OpenVinoEngine):
         """As `Engine.require_packages`; raises BevcliError for a processor without bfloat16 too."""
         super().require_packages()
         if "BF16" not in _openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
-            raise BevcliError("`precision=bf16`: OpenVINO has no bfloat16 on this processor: leave it out")
+            raise BevcliError(
+                "`precision=bf16` (`--precision bf16`): OpenVINO has no bfloat16 on this processor: leave it out"
+            )
 
 
 def import_openvino() -> Any:
@@ -300,7 +309,10 @@ def _calibration_frames(model: Model, drive: Drive | None) -> Drive:
     if model.calibrate_with is not None:
         drive = open_sequence(model.calibrate_with, rate_hz=model.config.rate_hz, ground_truth=False)
     if drive is None:
-        raise InputError("`precision=int8`: there are no frames to calibrate with: pass `calibrate_with=DRIVE`")
+        raise InputError(
+            "`precision=int8` (`--precision int8`): there are no frames to calibrate with: pass `calibrate_with` "
+            "(`--int8-drive DRIVE`)"
+        )
     return select_range(drive, slice(0, CALIBRATION_FRAMES))
 
 

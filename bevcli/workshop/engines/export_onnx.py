@@ -88,8 +88,9 @@ def export_onnx(
     chosen = gather(OnnxOptions, options, changes)
     if chosen.opset < MIN_OPSET[chosen.deformable_convolution]:
         raise BevcliError(
-            f"`opset={chosen.opset}`: expected {MIN_OPSET[chosen.deformable_convolution]} or newer with "
-            f"`deformable_convolution={chosen.deformable_convolution}`"
+            f"`opset={chosen.opset}` (`--opset`): expected {MIN_OPSET[chosen.deformable_convolution]} or newer with "
+            f"`deformable_convolution={chosen.deformable_convolution}` (`--deformable-convolution "
+            f"{chosen.deformable_convolution}`)"
         )
     config = network.config
     form = export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)

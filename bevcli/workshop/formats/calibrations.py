@@ -15,10 +15,12 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.options import named
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
 from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
+from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.camera_poses import (
     Cameras,
     Direction,
@@ -66,7 +68,7 @@ def read_rig(
             raise InputError(_incomplete(extrinsics, height))
         return _guessed_rig(drive, fov_deg, height, yaw_deg)
     if fov_deg is not None:
-        raise InputError("`calibration` and `fov_deg` exclude each other: pass one of them")
+        raise InputError("`calibration` (`--calibration`) and `fov_deg` (`--fov`) exclude each other: pass one of them")
     kind, cameras = _stated(calibration)
     if extrinsics is not None:
         poses = _extrinsics(extrinsics)
@@ -90,9 +92,15 @@ def read_rig(
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
     if extrinsics is not None:
-        return "`intrinsics` and `extrinsics` must be given together: pass both, or pass `calibration`"
-    name = "`yaw_deg`" if height is None else "`height`"
-    return f"{name} needs a field of view or a calibration: pass `fov_deg=70` or `calibration=FILE`"
+        return (
+            "`intrinsics` (`--intrinsics`) and `extrinsics` (`--extrinsics`) must be given together: pass both, or "
+            "pass `calibration` (`--calibration`)"
+        )
+    name = "`yaw_deg` (`--yaw`)" if height is None else "`height` (`--height`)"
+    return (
+        f"{name} needs a field of view or a calibration: pass `fov_deg=70` (`--fov 70`) or `calibration` "
+        "(`--calibration FILE`)"
+    )
 
 
 def _poses(
@@ -111,17 +119,17 @@ def _poses(
         why = "moves through the file, as in a reconstruction" if cameras[lacking[0]].moves else "is missing"
         raise InputError(
             f'{where}: camera {lacking[0]}: its pose (T, extrinsics or "ego_from_camera") {why}: add it, pass '
-            "`extrinsics=FILE`, or pass `height` and `yaw_deg`"
+            "`extrinsics` (`--extrinsics FILE`), or pass `height` (`--height`) and `yaw_deg` (`--yaw`)"
         )
     if yaw_deg is not None:
-        raise InputError(f"{where}: states the poses of the cameras: remove `yaw_deg`")
+        raise InputError(f"{where}: states the poses of the cameras: remove `yaw_deg` (`--yaw`)")
     heights = _by_camera(height, tuple(cameras), "height")
     if transform is not None and all(pose.exact for pose in stated.values()):
-        raise InputError(f"{where}: states what its transforms mean: remove `transform`")
+        raise InputError(f"{where}: states what its transforms mean: remove `transform` (`--transform`)")
     poses, how = decide_poses(where, stated, transform, level_known=bool(heights))
     yaws = ", ".join(f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°" for name, pose in poses.items())
     if heights:
-        poses, how = raised(poses, heights), f"{how}, raised to `height`"
+        poses, how = raised(poses, heights), f"{how}, raised to `height` (`--height`)"
     return poses, f"{how}; yaw {yaws}"
 
 
@@ -208,7 +216,9 @@ def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_de
     if not found:
         raise InputError(f"{drive}: has no images of a camera (expected images/CAMERA/*.jpg, or a video)")
     if height is None:
-        raise InputError("`fov_deg` needs the height of the camera above the ground: pass `height=1.5`")
+        raise InputError(
+            "`fov_deg` (`--fov`) needs the height of the camera above the ground: pass `height=1.5` (`--height 1.5`)"
+        )
     fovs = _by_camera(fov_deg, tuple(found), "fov_deg")
     poses, how = _guessed_poses(tuple(found), height, yaw_deg)
     cameras = []
@@ -217,7 +227,9 @@ def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_de
         if size is None:
             raise InputError(f"{drive}: camera {name}: its first image cannot be read: bring it back")
         if not FOV_DEG[0] <= fovs[name] <= FOV_DEG[1]:
-            raise InputError(f"`fov_deg={fovs[name]:g}`: expected the horizontal field of view, 5 to 170 degrees")
+            raise InputError(
+                f"`fov_deg={fovs[name]:g}` (`--fov`): expected the horizontal field of view, 5 to 170 degrees"
+            )
         width, tall = size
         focal = width / 2 / np.tan(np.radians(fovs[name]) / 2)
         matrix = [[focal, 0, (width - 1) / 2], [0, focal, (tall - 1) / 2], [0, 0, 1]]
@@ -233,19 +245,20 @@ def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_de
 def _guessed_poses(names: tuple[str, ...], height: ByCamera, yaw_deg: ByCamera) -> tuple[dict[str, Array], str]:
     if yaw_deg is None:
         if len(names) > 1:
-            given = " ".join(f"`yaw_deg={name}=0`" for name in names[:2])
+            flags = " ".join(f"--yaw {name}=0" for name in names[:2])
             raise InputError(
-                f"the directions of {counted(len(names), 'cameras')} are not stated: pass one for each: {given} …"
+                f"the directions of {counted(len(names), 'cameras')} are not stated: pass one for each by `yaw_deg` "
+                f"(`{flags} …`)"
             )
         yaw_deg = 0.0
     heights, yaws = _by_camera(height, names, "height"), _by_camera(yaw_deg, names, "yaw_deg")
     if len(names) > 1 and not isinstance(yaw_deg, Mapping):
         raise InputError(
-            f"`yaw_deg={yaw_deg:g}`: is one direction for {counted(len(names), 'cameras')}: pass one for each"
+            f"`yaw_deg={yaw_deg:g}` (`--yaw`): is one direction for {counted(len(names), 'cameras')}: pass one for each"
         )
     for name in names:
         if not 0 < heights[name] <= HIGHEST_M:
-            raise InputError(f"`height={heights[name]:g}`: expected metres above the ground, 0 to 10")
+            raise InputError(f"`height={heights[name]:g}` (`--height`): expected metres above the ground, 0 to 10")
     poses = {name: guessed_pose(heights[name], np.radians(yaws[name])) for name in names}
     text = "; ".join(
         f"{name} yaw {yaws[name]:g}°, {heights[name]:g} m high, {pose[0, 3]:.1f} m ahead of the rear axle"
@@ -261,9 +274,11 @@ def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str
     if not isinstance(value, Mapping):
         return dict.fromkeys(names, float(value))
     for name in value.keys() - set(names):
-        raise InputError(f"`{option}`: there is no camera {name} (expected {', '.join(names)})")
+        raise InputError(f"{named(RigOptions, option)}: there is no camera {name} (expected {', '.join(names)})")
     for name in (name for name in names if name not in value):
-        raise InputError(f"`{option}`: camera {name} is missing: pass one for each camera, or one for all")
+        raise InputError(
+            f"{named(RigOptions, option)}: camera {name} is missing: pass one for each camera, or one for all"
+        )
     return {name: float(value[name]) for name in names}
 
 

@@ -37,7 +37,9 @@ AXES_TEXT = {
 }
 
 
-ORIGIN = "if the origin is not on the ground, pass `height=1.5`, the mean height of the cameras above it"
+ORIGIN = (
+    "if the origin is not on the ground, pass `height=1.5` (`--height 1.5`), the mean height of the cameras above it"
+)
 ADVICE = {"below": ORIGIN, "height": ORIGIN, "unit": "convert the translations to metres"}
 
 
@@ -151,13 +153,14 @@ def _check_certain(
         raise InputError(
             f"{where}: no reading of the transforms puts the cameras on a vehicle (expected above the ground, "
             f"at most {HIGHEST_M:g} m high, upright, looking outwards); as {nearest.text}, {text}: "
-            f"{ADVICE.get(code, 'correct them, or pass `extrinsics=FILE`')}"
+            f"{ADVICE.get(code, 'correct them, or pass `extrinsics` (`--extrinsics FILE`)')}"
         )
     first = chosen[0].direction
     if any(reading.direction != first for reading in chosen):
         raise InputError(
             f"{where}: can be read in two directions, and both put the cameras on a vehicle: pass "
-            f'`transform="{DIRECTIONS[0]}"` or `transform="{DIRECTIONS[1]}"`'
+            f'`transform="{DIRECTIONS[0]}"` (`--transform {DIRECTIONS[0]}`) or `transform="{DIRECTIONS[1]}"` '
+            f"(`--transform {DIRECTIONS[1]}`)"
         )
     if len(chosen) > 1:
         raise InputError(
@@ -167,7 +170,8 @@ def _check_certain(
         if first != stated and other.direction != first and reason and reason[0] == "below":  # the origin of a lidar?
             raise InputError(
                 f"{where}: as {other.text}, {reason[1]}, and as {first} above it: pass "
-                f'`transform="{first}"`; or `transform="{other.direction}"` and `height=1.5`'
+                f'`transform="{first}"` (`--transform {first}`); or `transform="{other.direction}"` (`--transform '
+                f"{other.direction}`) and `height=1.5` (`--height 1.5`)"
             )
 
 

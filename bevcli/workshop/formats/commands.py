@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument, print_note
-from bevcli.printing import say
+from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
+from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
 

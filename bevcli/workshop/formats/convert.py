@@ -86,10 +86,10 @@ def open_writer(path: Path, sequence: Drive, options: WriteOptions) -> DriveWrit
     OutputError where the path cannot be written.
     """
     if options.form not in DRIVE_FORMATS:
-        raise InputError(f"`form={options.form}`: unknown format (expected {', '.join(DRIVE_FORMATS)})")
+        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(DRIVE_FORMATS)})")
     chosen = DRIVE_FORMATS[options.form]
     if options.boxes is not None and not chosen.takes_boxes:
-        raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
+        raise InputError(f"`boxes` (`--boxes`): {chosen.name} takes no boxes of a run: remove the option")
     return chosen.opener(path, sequence, options)
 
 

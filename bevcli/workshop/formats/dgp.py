@@ -308,7 +308,7 @@ def _file(path: Path, record: Record, member: str, *, allow_outside: bool) -> Pa
     file = path / PurePosixPath(name)
     if not allow_outside and leads_out(file, path):
         where = f"{record.where}: {name:.100}"
-        raise InputError(f"{where}: leads out of the folder: pass `allow_outside=True` to read it")
+        raise InputError(f"{where}: leads out of the folder: pass `allow_outside=True` (`--allow-outside`) to read it")
     return file
 
 

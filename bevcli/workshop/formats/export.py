@@ -70,7 +70,7 @@ def export(
     given = Path(predictions)
     chosen = gather(ExportOptions, options, changes)
     if chosen.form not in BOX_FORMATS:
-        raise InputError(f"`form={chosen.form}`: unknown format (expected {', '.join(BOX_FORMATS)})")
+        raise InputError(f"`form={chosen.form}` (`--format`): unknown format (expected {', '.join(BOX_FORMATS)})")
     form = BOX_FORMATS[chosen.form]
     file = given / "predictions.json" if given.is_dir() else given
     target = chosen.out or file.parent / form.target

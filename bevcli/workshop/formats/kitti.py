@@ -36,9 +36,14 @@ def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labe
     """
     name = _looking_ahead(rig) if options.labels_camera is None else options.labels_camera
     if name not in rig.names:
-        raise InputError(f"`labels_camera={name}`: is not in the rig (expected one of {', '.join(rig.names)})")
+        raise InputError(
+            f"`labels_camera={name}` (`--labels-camera`): is not in the rig (expected one of {', '.join(rig.names)})"
+        )
     frames = _folder(path, rig[name]) if path.is_dir() else _tracking_file(path, rig[name])
-    note = f"the boxes are those that {name} sees, in its frame (`labels_camera`); others have no labels"
+    note = (
+        f"the boxes are those that {name} sees, in its frame (`labels_camera` (`--labels-camera`)); others have no "
+        "labels"
+    )
     return Labels("ego", tuple(frames), lists_empty=path.is_dir(), notes=(note,))
 
 
@@ -103,8 +108,8 @@ def export_kitti(boxes: BoxesFile, target: Path, options: ExportOptions, source:
     path = options.calibration or source.parent / CALIBRATION
     if options.calibration is None and not path.is_file():
         raise InputError(
-            f"`form=kitti` needs `calibration`: KITTI labels are in a camera frame, and there is no {path} "
-            "(a run writes it for a drive of one scene)"
+            "`form=kitti` (`--format kitti`) needs `calibration` (`--calibration`): KITTI labels are in a camera "
+            f"frame, and there is no {path} (a run writes it for a drive of one scene)"
         )
     path = path / CALIBRATION if path.is_dir() else path
     rig, name = read_calibration(path), options.camera

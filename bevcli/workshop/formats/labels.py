@@ -82,7 +82,7 @@ class WithLabels(DerivedDrive):
         parts = [f"{counted(self._listed, 'frames')} with labels: {counts or 'none'}"]
         empty, unlabelled = len(self._boxes) - self._listed, len(self.stamps) - len(self._boxes)
         if empty:
-            parts.append(f"{empty} frames without rows are empty (see `unlisted_frames`)")
+            parts.append(f"{empty} frames without rows are empty (see `unlisted_frames` (`--unlisted-frames`))")
         if unlabelled:
             parts.append(f"{unlabelled} frames are not labelled: they have no ground truth")
         return "; ".join(parts)

@@ -117,9 +117,11 @@ class McapWriter:
     def __init__(self, path: Path, sequence: Drive, options: WriteOptions) -> None:
         """See `OutputFormat`."""
         if not all(importlib.util.find_spec(name) for name in ("mcap", "rosbags")):
-            raise BevcliError('`form="mcap"`: needs mcap and rosbags: pip install "bevcli[ros]"')
+            raise BevcliError('`form="mcap"` (`--format mcap`): needs mcap and rosbags: pip install "bevcli[ros]"')
         if path.exists() and not options.force:
-            raise OutputError(f"{path}: exists already: choose another file, or pass `force=True` to replace it")
+            raise OutputError(
+                f"{path}: exists already: choose another file, or pass `force=True` (`--force`) to replace it"
+            )
         self.path, self._has_ego_motion = path, sequence.has_ego_motion
         self._boxes = None if options.boxes is None else _boxes_of(options.boxes, options.score, sequence, path)
         known = None if self._boxes is None else self._boxes.classes

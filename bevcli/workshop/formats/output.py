@@ -83,7 +83,7 @@ class FolderWriter(ExitStack):
             raise OutputError(f"{folder}: is a file (expected a folder to write)")
         if folder.is_dir() and any(folder.iterdir()):
             if not (force and can_replace):
-                way = ", or pass `force=True` to replace it" if can_replace else ""
+                way = ", or pass `force=True` (`--force`) to replace it" if can_replace else ""
                 raise OutputError(f"{folder}: exists already: choose another folder{way}")
             remove_parts(folder, parts)
         super().__init__()
@@ -216,7 +216,7 @@ class NativeWriter(FolderWriter):
         elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
             raise InputError(
                 f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
-                "sequence has a single calibration: convert scene by scene (`scene`)"
+                "sequence has a single calibration: convert scene by scene (`scene` (`--scene`))"
             )
         if stamp.index in self._numbers:
             raise InputError(f"frame {stamp.index} ({stamp.scene}): its index occurred before: renumber the frames")
@@ -242,7 +242,9 @@ class NativeWriter(FolderWriter):
         spans = sorted((first, last, name) for name, (first, last) in self._scenes.items())
         for (_, end, earlier), (start, _, later) in pairwise(spans):
             if start <= end:
-                raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (`scene`)")
+                raise InputError(
+                    f"scenes {earlier} and {later} overlap in time: convert scene by scene (`scene` (`--scene`))"
+                )
 
     def _write_boxes(self, frame: Frame, boxes: Boxes3D, pose: Pose | None) -> None:
         if self._boxes is None:

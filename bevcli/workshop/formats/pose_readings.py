@@ -76,7 +76,8 @@ def _refuse_poses_of_camera(path: Path, reading: Reading, times_ns: NDArray[np.i
         if min(each.misfit_deg(times_ns)[0] for each in of_vehicle(reading, camera)) <= LARGEST_MISFIT_DEG:
             raise InputError(
                 f"{path}: the poses are not those of the vehicle (x forward, z up), but fit a camera that looks ahead: "
-                f"pass `poses_of={camera.name}`, or `poses_of=vehicle` to keep them"
+                f"pass `poses_of={camera.name}` (`--poses-of {camera.name}`), or `poses_of=vehicle` (`--poses-of "
+                "vehicle`) to keep them"
             )
 
 

@@ -240,7 +240,9 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
     of_name = cast("TimeKind | None", stated and (stated[1] or stated[2]))
     unit = drive.stated.pose_times or of_name or _unit(table.path, values, positions, drive)
     if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
-        raise InputError(f"{rows[0].path}: the times are too large for {WORDS[unit]}: pass `pose_times`")
+        raise InputError(
+            f"{rows[0].path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)"
+        )
     times = np.array([int((value * UNITS_NS[unit]).to_integral_value()) for value in values], dtype=np.int64)
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
 
@@ -284,7 +286,7 @@ def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePo
     units = recent or units
     if len(units) > 1:
         words = " or ".join(WORDS[unit] for unit in units)
-        options = " or ".join(f"`pose_times={unit}`" for unit in units)
+        options = " or ".join(f"`pose_times={unit}` (`--pose-times`)" for unit in units)
         message = f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}"
         raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
     return units[0]
@@ -304,11 +306,16 @@ def _camera(path: Path, kind: Kind, drive: DrivePoses) -> tuple[Camera | None, s
         named = next((camera for camera in cameras if camera.name == drive.stated.poses_of), None)
         if named is None:
             expected = ", ".join(("vehicle", *drive.rig.names))
-            raise InputError(f"`poses_of={drive.stated.poses_of}`: is not in the rig (expected one of {expected})")
+            raise InputError(
+                f"`poses_of={drive.stated.poses_of}` (`--poses-of`): is not in the rig (expected one of {expected})"
+            )
         return named, f"of {named.name}"
     zeroth = [camera for camera in cameras if re.search("(?<![0-9])0+$", camera.name)] or drive.cameras_ahead
     if not zeroth:
-        raise InputError(f"{path}: KITTI's poses are those of its camera 0, and no camera looks ahead: pass `poses_of`")
+        raise InputError(
+            f"{path}: KITTI's poses are those of its camera 0, and no camera looks ahead: pass `poses_of` "
+            "(`--poses-of`)"
+        )
     return zeroth[0], f"of camera 0, as KITTI's are ({zeroth[0].name})"
 
 
@@ -376,4 +383,4 @@ def _readings_of_angles(table: Table, positions: Array, drive: DrivePoses) -> tu
             words = f"{name} in {unit} {turn}"
             readings.append(Reading(words, positions, quaternions_of_angles(roll, pitch, yaw)))
     names = ["degrees", "radians", *(["compass"] if name == "heading" or of_gps else [])]
-    return readings, "" if usual else " or ".join(f"`pose_angles={each}`" for each in names)
+    return readings, "" if usual else " or ".join(f"`pose_angles={each}` (`--pose-angles`)" for each in names)

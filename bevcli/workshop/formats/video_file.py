@@ -22,7 +22,8 @@ def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDr
     given = own.draft(path)
     if given is None:
         raise InputError(
-            f"{path}: a video does not state its camera: pass `fov_deg=70` and `height=1.5`, or `calibration=FILE`"
+            f"{path}: a video does not state its camera: pass `fov_deg=70` (`--fov 70`) and `height=1.5` (`--height "
+            "1.5`), or `calibration` (`--calibration FILE`)"
         )
     rig = given.rig
     if len(rig.cameras) != 1:  # of a calibration.json
@@ -34,26 +35,28 @@ def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDr
         FrameEntry(FrameStamp(index, "", int(time)), {name: video.image(index)}, {}, f"{path}#{index}")
         for index, time in enumerate(video.times_ns)
     )
-    start = "time 0 (state `start_ns`)" if own.start_ns is None else f"{own.start_ns} ns"
+    start = "time 0 (state `start_ns` (`--start-ns`))" if own.start_ns is None else f"{own.start_ns} ns"
     understood = f"{len(entries)} images at {1e9 / video.period_ns:g} Hz from {start} on"
     poses = ReadPoses(None)
     if own.ego_motion_file is not None and common.ego_motion != "static":
         poses = read_poses(own.ego_motion_file, DrivePoses(rig, own, video.times_ns))
     elif common.ego_motion == "required":
         raise InputError(
-            f"{path}: a video has no poses of the vehicle: pass `ego_motion_file=FILE`, `odometry=True` to measure "
-            'them from the images, `temporal=False` to run without history, or `ego_motion="static"` if the vehicle '
-            "stands"
+            f"{path}: a video has no poses of the vehicle: pass `ego_motion_file` (`--ego-motion FILE`), "
+            "`odometry=True` (`--odometry`) to measure them from the images, `temporal=False` (`--no-temporal`) to run "
+            'without history, or `ego_motion="static"` (`--static`) if the vehicle stands'
         )
     motion = poses.motion
     if motion is not None and own.ego_motion_file is not None:
         entries, understood = covered((entries, understood), motion)
-        check_covered(own.ego_motion_file, poses, entries, "state the time of the first image by `start_ns`")
+        check_covered(
+            own.ego_motion_file, poses, entries, "state the time of the first image by `start_ns` (`--start-ns`)"
+        )
     assumed = bev_frame_notes(rig, "the calibration")
     notes = (*given.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
     if motion is None and common.ego_motion != "measured":
         without = "no history is used, and boxes are in the ego frame"
-        notes += (f"a video has no poses: {without} (`odometry=True` measures them from the images)",)
+        notes += (f"a video has no poses: {without} (`odometry=True` (`--odometry`) measures them from the images)",)
     sequence = ListedDrive(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
     sequence.facts = replace(given.facts, geo_origin=given.facts.geo_origin or poses.geo_origin)

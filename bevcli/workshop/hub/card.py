@@ -66,9 +66,9 @@ class CardFacts:
     def missing(self) -> tuple[str, ...]:
         """Notes on what the card lacks, and the options that state it."""
         notes = {
-            "no licence: others may not use the weights: pass `licence=NAME`": self.licence,
-            "no data of the training: pass `datasets=NAME`": self.datasets or self.limit,
-            "no scores: pass `scores=FILE.json`": self.scores,
+            "no licence: others may not use the weights: pass `licence` (`--licence NAME`)": self.licence,
+            "no data of the training: pass `datasets` (`--datasets NAME`)": self.datasets or self.limit,
+            "no scores: pass `scores` (`--scores FILE.json`)": self.scores,
         }
         return tuple(f"the model card states {text}" for text, stated in notes.items() if not stated)
 

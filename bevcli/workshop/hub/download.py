@@ -39,8 +39,8 @@ def open_model(name: str, *, fetch: bool = False) -> HubModel:
     match = _NAME.fullmatch(name)
     if match is None:
         raise WeightsError(
-            f"`model={name}`: is no model of the Hugging Face Hub (expected hf:OWNER/NAME, hf:OWNER/NAME@REVISION or "
-            "hf:./FOLDER)"
+            f"`model={name}` (`--model`): is no model of the Hugging Face Hub (expected hf:OWNER/NAME, "
+            "hf:OWNER/NAME@REVISION or hf:./FOLDER)"
         )
     folder = _snapshot(match[1], match[2], fetch)
     branch = f" ({match[2] or 'main'})" if match[2] != folder.name else ""

@@ -45,9 +45,11 @@ def pack_model(
     targets = [out / each for each in (CONFIG, WEIGHTS, CARD)]
     there = next((target for target in targets if target.exists()), None)
     if there is not None and not chosen.force:
-        raise OutputError(f"{there}: already exists; choose another folder, or pass `force=True` to overwrite it")
+        raise OutputError(
+            f"{there}: already exists; choose another folder, or pass `force=True` (`--force`) to overwrite it"
+        )
     if name.endswith(".toml") and chosen.weights is None:
-        raise WeightsError(f"{name}: a model file holds no weights: pass `weights=FILE`")
+        raise WeightsError(f"{name}: a model file holds no weights: pass `weights` (`--weights FILE`)")
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
     checkpoint = read_checkpoint(weights_file(chosen.weights or Path(name)))

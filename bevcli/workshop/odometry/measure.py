@@ -240,7 +240,7 @@ def measure_steps(drive: Drive, options: OdometryOptions | None = None) -> Itera
     """
     scenes = {stamp.scene for stamp in drive.stamps}
     if len(scenes) > 1:
-        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one): choose a `scene`")
+        raise InputError(f"{drive.name}: has {len(scenes)} scenes (expected one): choose a `scene` (`--scene`)")
     if len(drive.stamps) < 2:
         raise InputError(f"{drive.name}: has {len(drive.stamps)} frames (expected 2 or more): choose more frames")
     meter = MotionMeter(options)

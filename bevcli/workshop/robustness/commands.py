@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import say
+from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.robustness.options import StressOptions, StressOutputOptions
 from bevcli.workshop.synth.options import DriveOptions
@@ -47,7 +47,7 @@ def stress(
     conditions = choose_conditions(output.severity, output.only)
     other = None if options.against is None else read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
-        raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
+        raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
     loaded = load_with_bar(model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)

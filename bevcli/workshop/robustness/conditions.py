@@ -280,7 +280,7 @@ def choose_conditions(severity: SeverityChoice = "all", only: Sequence[str] = ()
     """
     unknown = [name for name in only if name not in NAMES]
     if unknown:
-        raise InputError(f"`only={unknown[0]}`: unknown corruption (expected one of {', '.join(NAMES)})")
+        raise InputError(f"`only={unknown[0]}` (`--only`): unknown corruption (expected one of {', '.join(NAMES)})")
     chosen = [
         Condition(corruption, label)
         for corruption in CORRUPTIONS

@@ -184,7 +184,7 @@ def stress(
             another one.
     """
     if force and resume:
-        raise OutputError("`force` and `resume` exclude each other: pass one of them")
+        raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
     model = model.in_engine(drives[0].rig, drives[0])
     memory, parts = FrameMemory(KEPT_BYTES), [part for drive in drives for part in split_scenes(drive)]
     scenes = [KeptFrames(part, memory, index) for index, part in enumerate(parts)]

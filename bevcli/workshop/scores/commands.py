@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from bevcli.cli.bridge import FormatValues, Json, Part, argument, print_note
+from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
-from bevcli.printing import say
+from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.scores.options import EvaluationOptions, ResultOptions
 

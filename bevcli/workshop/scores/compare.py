@@ -163,7 +163,8 @@ def compare(
     options = ResultOptions(**results)  # type: ignore[arg-type]
     if further := [name for name, value in vars(options).items() if value and name != "worst"]:
         raise InputError(
-            f"`{further[0]}=True`: two files of predictions are compared by their boxes only: leave it out"
+            f"`{further[0]}=True` (`--{further[0]}`): two files of predictions are compared by their boxes only: "
+            "leave it out"
         )
     if resamples < 1:
         raise ConfigError(f"`resamples` is {resamples} (expected 1 or more)")
@@ -201,7 +202,7 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
         notes.append(f"only the {frames} of both are compared: A has {len(keys[0])}, B has {len(keys[1])}")
     classes = {name: kind for name, kind in models[0].classes.items() if name in models[1].classes}
     if not classes:
-        raise InputError("the two models have no class in common: rename classes with `class_map`")
+        raise InputError("the two models have no class in common: rename classes with `class_map` (`--class-map`)")
     others = [name for model in models for name in model.classes if name not in classes]
     if others:
         notes.append(f"only classes of both are compared, without {', '.join(dict.fromkeys(others))}")
@@ -212,8 +213,8 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
     if max_range is None and known:
         max_range = min(known)
         notes.append(
-            f"nothing beyond {max_range:g} m is scored: the BEV grid of a model ends there (`max_range=M` sets another "
-            "limit)"
+            f"nothing beyond {max_range:g} m is scored: the BEV grid of a model ends there (`max_range` (`--max-range "
+            "M`) sets another limit)"
         )
     return [
         replace(_at(model, [own[key] for key in common]), classes=classes, max_range_m=max_range)

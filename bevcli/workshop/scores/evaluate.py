@@ -221,11 +221,11 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: inputs.FramePairs) -> Iterator[str]:
     if max_range is None and not pairs.ego_pose_known:
-        yield 'no frame has "world_from_ego": class ranges are not applied (`max_range=M` applies them)'
+        yield 'no frame has "world_from_ego": class ranges are not applied (`max_range` (`--max-range M`) applies them)'
     if model_range is not None:
         yield (
             f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
-            "there (`max_range=M` sets another limit)"
+            "there (`max_range` (`--max-range M`) sets another limit)"
         )
 
 

@@ -312,7 +312,7 @@ def _notes(key: str, pairs: int, predictions: int, ground_truth: int, count_miss
     if key not in RELIABLE:
         notes.append(f"timestamps or scenes differ between the files: frames are matched by {key}")
     if pairs < ground_truth:
-        left_out = "left out (`count_missing=True` counts them)"
+        left_out = "left out (`count_missing=True` (`--count-missing`) counts them)"
         treatment = "all their boxes count as missed" if count_missing else left_out
         notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {treatment}")
     if pairs < predictions:

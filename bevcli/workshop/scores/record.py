@@ -60,7 +60,9 @@ def record(
     drive = open_sequence(drive, class_map=class_map or {}) if isinstance(drive, str | Path) else drive
     given = dict(boxes) if isinstance(boxes, Mapping) else {} if boxes is None else {_name_of(boxes): boxes}
     if len(given) > MOST:
-        raise InputError(f"`boxes`: found those of {len(given)} models (expected at most {MOST}): leave some out")
+        raise InputError(
+            f"`boxes` (`--boxes`): found those of {len(given)} models (expected at most {MOST}): leave some out"
+        )
     inputs = {name: _open(each, name, drive, class_map) for name, each in given.items()}
     of_frames = [_by_frame(drive, name, each, report) for name, each in inputs.items()]
     options = RecordingOptions(level="minimal") if score is None else RecordingOptions(level="minimal", score=score)
@@ -87,7 +89,7 @@ def names_of(paths: Iterable[Path]) -> dict[str, Path]:
     if len(set(names)) < len(names):
         names = [f"{path.resolve().parent.name}/{name}" for path, name in zip(short, names, strict=True)]
     if len(set(names)) < len(names):
-        raise InputError(f"`boxes`: {given[0]} and {given[-1]} have the same name: rename one")
+        raise InputError(f"`boxes` (`--boxes`): {given[0]} and {given[-1]} have the same name: rename one")
     return dict(zip(names, given, strict=True))
 
 
@@ -108,11 +110,13 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
     if of_one_frame or wrong:
         found = "those of one frame" if of_one_frame else f"a {type(wrong[0]).__name__}"
         raise InputError(
-            f"`boxes`: {name}: found {found} (expected a file, or a list with the Boxes3D of each frame in the world "
-            "frame)"
+            f"`boxes` (`--boxes`): {name}: found {found} (expected a file, or a list with the Boxes3D of each frame in "
+            "the world frame)"
         )
     if len(boxes) != len(drive.stamps):
-        raise InputError(f"`boxes`: {name}: found {len(boxes)} (expected {len(drive.stamps)}, one for each frame)")
+        raise InputError(
+            f"`boxes` (`--boxes`): {name}: found {len(boxes)} (expected {len(drive.stamps)}, one for each frame)"
+        )
     pairs = zip(drive.stamps, boxes, strict=True)
     frames = tuple(FrameBoxes(stamp, None, each) for stamp, each in pairs if each is not None)
     return ScoredInput(BoxesFile("world" if drive.has_ego_motion else "ego", frames), Path(name))

@@ -232,7 +232,8 @@ def training_drives(
     highest = max(data.rendered or (0,))
     if highest >= FIRST_HELD_OUT_SEED:
         raise InputError(
-            f"`rendered`: seed {highest} is reserved for evaluation; train on seeds below {FIRST_HELD_OUT_SEED}"
+            f"`rendered` (`--rendered`): seed {highest} is reserved for evaluation; train on seeds below "
+            f"{FIRST_HELD_OUT_SEED}"
         )
     if data.split is not None:
         split = _only_split(data, data.split)
@@ -263,7 +264,10 @@ def _opened(
 ) -> FolderDrives:
     """Some of the drives in folders, or of the rendered ones. Raises InputError where both or neither are given."""
     if bool(data.data) == (data.rendered is not None):
-        raise InputError("choose the drives: give either `data=DIR` (repeatable), `rendered=SEEDS` or `split=FILE`")
+        raise InputError(
+            "choose the drives: give either `data` (`--data DIR`) (repeatable), `rendered` (`--rendered SEEDS`) or "
+            "`split` (`--split FILE`)"
+        )
     if data.rendered is None:
         return FolderDrives(data.data[part], config, data.class_map)
     return RenderedDrives(data.rendered[part], cache, config, rig, data.class_map)
@@ -271,7 +275,8 @@ def _opened(
 
 def _only_split(data: DriveOptions, path: Path) -> Split:
     if data.data or data.rendered is not None:
-        raise InputError(f"{path}: states the drives: remove `{'data' if data.data else 'rendered'}`, or `split`")
+        name = "data" if data.data else "rendered"
+        raise InputError(f"{path}: states the drives: remove `{name}` (`--{name}`), or `split` (`--split`)")
     return read_split(path)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
-from bevcli.options import option, options
+from bevcli.options import named, option, options
 from bevcli.sequences.options import ClassOptions
 
 if TYPE_CHECKING:
@@ -35,7 +35,9 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     except ValueError:
         seeds = ()
     if not seeds or min(seeds) < 0:
-        raise InputError(f'`rendered` "{text}": expected seeds as A:B (B excluded) or A,B,C, none of them negative')
+        raise InputError(
+            f'`rendered` (`--rendered`) "{text}": expected seeds as A:B (B excluded) or A,B,C, none of them negative'
+        )
     return seeds
 
 
@@ -81,7 +83,7 @@ class RenderOptions:
             for number in value if isinstance(value, tuple) else (value,):
                 if number < low or (high is not None and number > high):
                     wanted = f"{low} or more" if high is None else f"{low} to {high}"
-                    raise InputError(f"`{field.name}`: expected {wanted}, found {number}")
+                    raise InputError(f"{named(type(self), field.name)}: expected {wanted}, found {number}")
 
 
 @options()

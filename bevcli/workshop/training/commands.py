@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, model_option, print_note
+from bevcli.cli.bridge import Json, Part, model_option
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import counted, say
+from bevcli.printing import counted, print_note, say
 from bevcli.runs.options import RunOptions
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.options import ModelFileOptions, TrainOptions, ValidationOptions
@@ -55,12 +55,12 @@ def train(
 
     if file_options.init is not None:
         if model or options != TrainOptions():
-            raise InputError("`init` trains nothing: remove the model and the options of a training")
+            raise InputError("--init trains nothing: remove the model and the options of a training")
         device = choose_device(model_options.device)
         say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
         return
     if file_options.preset is not None:
-        raise InputError("`preset` is for `init`: remove it")
+        raise InputError("--preset is for --init: remove it")
     if not model:
         raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
     torch.manual_seed(options.seed)
@@ -140,7 +140,7 @@ def validate(
         _estimate(loaded, drives, options, as_json=as_json, temporal=run_options.temporal)
         return
     if options.reference is not None:
-        raise InputError("`reference` is for drives without ground truth: remove it")
+        raise InputError("--reference is for drives without ground truth: remove it")
     with Progress(frames, "frames", notes) as progress:
         scores = score_drives(loaded, drives, options, temporal=run_options.temporal, after_frame=progress.advance)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
@@ -152,9 +152,9 @@ def _estimate(model: "Model", drives: "Drives", options: ValidationOptions, *, a
     from bevcli.workshop.synth.drives import FolderDrives, count_frames
     from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
 
-    for name, given in (("max_range", options.max_range is not None), ("tracking", options.tracking)):
+    for name, given in (("--max-range", options.max_range is not None), ("--tracking", options.tracking)):
         if given:
-            raise InputError(f"`{name}`: needs ground truth, which no drive has: remove it")
+            raise InputError(f"{name}: needs ground truth, which no drive has: remove it")
     beside = FolderDrives(() if options.reference is None else (options.reference,), model.config)
     scores: list[tuple[str, EstimatedScore]] = []
     notes = ("no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",)

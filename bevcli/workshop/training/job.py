@@ -288,7 +288,9 @@ def prepare_training(
     if options.log is not None:
         require_tensorboard()
     if data.split is not None and options.held_out is not None:
-        raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
+        raise InputError(
+            f"{data.split}: states the drives to score on: remove `held_out` (`--held-out`), or `split` (`--split`)"
+        )
     rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     own = None if data.split is None and config.held_out == 0 else evaluated
@@ -297,8 +299,8 @@ def prepare_training(
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
     if config.freeze_batch_norm and not (options.weights or options.backbone_weights or options.resume):
         notes += (
-            "the model starts from random weights, but its file keeps the statistics of batch norms: pass `weights` or "
-            '`changes={"freeze_batch_norm": "false"}`',
+            "the model starts from random weights, but its file keeps the statistics of batch norms: pass "
+            '`weights` (`--weights`) or `changes={"freeze_batch_norm": "false"}` (`--set freeze_batch_norm=false`)',
         )
     model, started = build_network(model_config), []
     if options.weights is not None and not options.resume:
@@ -338,7 +340,8 @@ def check_folder(out: Path, *, resume: bool) -> None:
     """Raises OutputError if an output folder holds a training that is not to be resumed."""
     if (out / CHECKPOINT).exists() and not resume:
         raise OutputError(
-            f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
+            f"{out}: already holds a training; pass `resume=True` (`--resume`) to continue it, or `out` (`--out DIR`) "
+            "for a new one"
         )
 
 
@@ -353,13 +356,13 @@ def with_changes(config: TrainingConfig, changes: Mapping[str, str]) -> Training
     for key, text in changes.items():
         key = key.removeprefix(f"{TRAINING}.")
         if key not in keys:
-            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, keys)}')
+            raise ConfigError(f'`changes` (`--set`): unknown key "{key:.100}"; {_nearest(key, keys)}')
         *tables, name = key.split(".")
         inner = table
         for name_of_table in tables:
             inner = inner[name_of_table]
         inner[name] = _value(text)
-    return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes`")
+    return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes` (`--set`)")
 
 
 def _keys(config: Any, prefix: str = "") -> Iterator[str]:

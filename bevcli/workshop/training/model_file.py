@@ -296,11 +296,17 @@ def fitting_batch(batch: int, used_bytes: int, card_bytes: int, most: int) -> in
 def _open_drives(data: DriveOptions) -> list[Drive]:
     """All drives, at their own frame rate. Raises InputError."""
     if data.rendered is not None:
-        raise InputError("`init` needs drives in folders (`data` or `split`): rendered drives are trained with demo")
+        raise InputError(
+            "`init` (`--init`) needs drives in folders (`data` (`--data`) or `split` (`--split`)): rendered drives "
+            "are trained with demo"
+        )
     split = None if data.split is None else read_split(data.split)
     folders = data.data if split is None else (*split.train, *split.validate)
     if not folders or (split is not None and data.data):
-        raise InputError("`init`: choose the drives: give either `data=DIR` (repeatable) or `split=FILE`")
+        raise InputError(
+            "`init` (`--init`): choose the drives: give either `data` (`--data DIR`) (repeatable) or `split` "
+            "(`--split FILE`)"
+        )
     classes = tuple(dict.fromkeys([*NUSCENES_CLASSES, *data.class_map.values()]))
     options = InputOptions(data.class_map, rate_hz="all", classes=classes)
     return [open_sequence(folder, options) for folder in folders]

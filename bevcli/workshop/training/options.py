@@ -72,7 +72,7 @@ class ModelFileOptions:
     )
     preset: Preset | None = option(
         default=None,
-        help="The model that the file of `init` starts from. quick, the default, is the demo model on smaller images, "
+        help="The model that the file of --init starts from. quick, the default, is the demo model on smaller images, "
         "for a CPU.",
     )
 

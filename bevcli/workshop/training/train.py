@@ -68,7 +68,10 @@ def check_steps_left(trainer: Trainer) -> None:
     """Raise InputError where a resumed training has done more steps than it is to do."""
     job = trainer.job
     if trainer.done > job.config.steps:
-        found = f"has done {trainer.done} steps already (expected at most `steps={job.config.steps}`)"
+        found = (
+            f"has done {trainer.done} steps already (expected at most `steps={job.config.steps}` (`--steps "
+            f"{job.config.steps}`))"
+        )
         raise InputError(f"{job.out}: {found}")
 
 

@@ -210,8 +210,8 @@ class Trainer:
                 loss = rows[-1]["loss"]
                 if not math.isfinite(loss):
                     raise BevcliError(
-                        f"step {self.done + 1}: the loss is {loss}; lower the learning rate, and `resume` from the "
-                        f"last checkpoint in {job.out}"
+                        f"step {self.done + 1}: the loss is {loss}; lower the learning rate, and `resume` (`--resume`) "
+                        f"from the last checkpoint in {job.out}"
                     )
                 after_update(loss)
         job.group.average_statistics(self.trained)
@@ -327,7 +327,7 @@ def load_checkpoint(
     Returns the number of steps done. Raises WeightsError.
     """
     if not path.exists():
-        raise WeightsError(f"{path}: no checkpoint to resume from; leave out `resume` to start a training")
+        raise WeightsError(f"{path}: no checkpoint to resume from; leave out `resume` (`--resume`) to start a training")
     file = read_pth(path)
     if file.left_out:
         raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")

@@ -127,14 +127,15 @@ def _count(drives: Drives) -> str:
 def _too_short(drives: str, clip_frames: int, frames: int) -> InputError:
     return InputError(
         f"drives with fewer frames than a clip, {clip_frames} at the model's frame rate: {drives}: leave them out, or "
-        f'pass `changes={{"clips.frames": {frames}}}`'
+        f'pass `changes={{"clips.frames": {frames}}}` (`--set clips.frames={frames}`)'
     )
 
 
 def _no_known_class(where: str, found: str, example: str, config: ModelConfig) -> InputError:
     return InputError(
-        f"{where} has no class of the model {config.name} (expected {', '.join(config.classes)}; found {found}): "
-        f"pass `class_map={{{example!r}: {config.classes[0]!r}}}`, or set classes in the model's file"
+        f"{where} has no class of the model {config.name} (expected {', '.join(config.classes)}; found {found}): pass "
+        f"`class_map={{{example!r}: {config.classes[0]!r}}}` (`--class-map {example}={config.classes[0]}`), or set "
+        "classes in the model's file"
     )
 
 
@@ -371,7 +372,10 @@ def _write_rows(path: Path, rows: list[Row], mode: str, *, header: bool = True) 
 def require_tensorboard() -> None:
     """Raise BevcliError where the package tensorboard is not installed."""
     if importlib.util.find_spec("tensorboard") is None:
-        raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
+        raise BevcliError(
+            '`log="tensorboard"` (`--log tensorboard`) needs the package tensorboard: '
+            "pip install 'bevcli[tensorboard]'"
+        )
 
 
 def event_writer(folder: Path, done: int) -> Any:

@@ -274,7 +274,9 @@ def start_backbone(file: Path, model: Network, model_file: str) -> tuple[WarmSta
         held = f"holds no backbone (expected a tensor named {' or '.join(ORIGINS)})"
         if origin:
             held = f'holds a backbone of kind "{kind}" (key names of {origin}), that of {model_file} is "{config.kind}"'
-        raise WeightsError(f"{file}: {held}; choose other `backbone_weights`, or another kind in [backbone]")
+        raise WeightsError(
+            f"{file}: {held}; choose other `backbone_weights` (`--backbone-weights`), or another kind in [backbone]"
+        )
     start, own = WarmStart(file, "", f"the backbone of {model_file}"), model.backbone.state_dict()
     if origin == "bevcli":
         renamed = {key.removeprefix("backbone."): tensor for key, tensor in state.items()}
@@ -293,7 +295,7 @@ def start_backbone(file: Path, model: Network, model_file: str) -> tuple[WarmSta
             what = f"has the shape {_shape(renamed[key])}" if key in renamed else "is not there"
             raise WeightsError(
                 f"{file}: does not fit the backbone of {model_file}: {key} (expected {_shape(tensor)}) {what}; choose "
-                "other `backbone_weights`, or change [backbone]"
+                "other `backbone_weights` (`--backbone-weights`), or change [backbone]"
             )
     for key, tensor in renamed.items():
         if key not in own:

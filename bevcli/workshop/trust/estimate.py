@@ -30,7 +30,7 @@ from bevcli.workshop.trust.fit import Fit
 SHOWN = 0.3  # the tables count boxes with this score or more
 NO_FIT = (
     "these weights have no fit of figures to a true NDS: compare the figures with those of a drive on which the "
-    "weights are known to work (`reference=DIR`)"
+    "weights are known to work (`reference` (`--reference DIR`))"
 )
 
 FAULTY = "scores stay high under the faults below: the true NDS is likely to be lower than estimated"

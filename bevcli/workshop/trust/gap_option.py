@@ -69,7 +69,9 @@ def gap_of_rigs(
     if against is not None:
         other = check_calibration(against)
         if other.errors:
-            raise InputError(f"`against={against}`: {other.errors[0].line}; `bevcli project-debug {against}` says more")
+            raise InputError(
+                f"`against={against}` (`--against`): {other.errors[0].line}; `bevcli project-debug {against}` says more"
+            )
         rigs[other.name if other.name != check.name else f"{other.name} (second)"] = other.rig
     known, range_m = known_rigs(config), config.bev_grid.nearest_side_m
     found = {name: list(rig_differences(rig, known, range_m)) for name, rig in rigs.items()}

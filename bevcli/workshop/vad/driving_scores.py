@@ -151,7 +151,9 @@ def evaluate_driving(options: ResultOptions, compared: Compared) -> DrivingScore
 def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> FramesByTime:
     """The drives of the ground truth, which an option needs in the world frame."""
     if pairs.frame_of_reference != "world":
-        raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
+        raise InputError(
+            f"`{option}` (`--{option}`): needs boxes in the world frame (found the {pairs.frame_of_reference} frame)"
+        )
     if truth.boxes.frame_of_reference != "world":
         raise InputError(
             "forecasts and paths need ground truth in the world frame "
@@ -164,14 +166,14 @@ def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> metrics.LineSco
     predicted, true = read_lines(file), _true_lines(truth)
     if predicted.frame_of_reference != true.frame_of_reference:
         raise InputError(
-            f"`map`: predicted lines are in the {predicted.frame_of_reference} frame, true ones in the "
+            f"`map` (`--map`): predicted lines are in the {predicted.frame_of_reference} frame, true ones in the "
             f"{true.frame_of_reference} frame (expected the same)"
         )
     predicted_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (predicted, true))
     stamps = [(one.stamp, other.stamp) for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)]
     lines = [(predicted_of[one], true_of[other]) for one, other in stamps if one in predicted_of and other in true_of]
     if not lines:
-        raise InputError("`map`: no frame has both predicted and true lines")
+        raise InputError("`map` (`--map`): no frame has both predicted and true lines")
     return metrics.evaluate_lines(lines, true.classes)
 
 
@@ -181,7 +183,7 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
         file = truth.path.with_name(LINES_FILE)
         if not file.exists():
             raise InputError(
-                f"{file}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)"
+                f"{file}: `map` (`--map`): the file is missing (expected true lines, as `bevcli render` writes them)"
             )
         return read_lines(file)
     drive, frames = truth.open_drive(), []
@@ -190,7 +192,9 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
             expansion = f"the map expansion in {truth.path / 'maps' / 'expansion'}"
             expected = expansion if is_nuscenes_root(truth.path) else "a drive that has them"
             where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
-            raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
+            raise InputError(
+                f"{drive.name}: `map` (`--map`): {where} has no true lines of the map (expected {expected})"
+            )
         ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)
         frames.append(FrameLines(frame.stamp, replace(lines, points=tuple(map(ground.points, lines.points)))))
     return LinesFile("world", LINE_CLASSES, tuple(frames))
@@ -219,7 +223,9 @@ def _times(predictions: Sequence[FrameBoxes]) -> Array:
     for frame in predictions:
         if frame.boxes.futures is not None and len(frame.boxes):
             return np.asarray(frame.boxes.futures[0, 0, :, 0])
-    raise InputError('`motion`: the predictions have no "futures" (expected those of a model that forecasts)')
+    raise InputError(
+        '`motion` (`--motion`): the predictions have no "futures" (expected those of a model that forecasts)'
+    )
 
 
 def ego_from_bev_of(frame: FrameBoxes) -> Array:
@@ -240,7 +246,7 @@ def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.Pl
             continue
         planned = plans[predicted.stamp]
         if planned.frame_of_reference != "world":
-            raise InputError(f"{file}: `plan`: needs paths in the world frame (found the ego frame)")
+            raise InputError(f"{file}: `plan` (`--plan`): needs paths in the world frame (found the ego frame)")
         plan, ego_from_bev = planned.plan, ego_from_bev_of(predicted)
         later = [frame for seconds in plan.times_s if (frame := drives.after(true.stamp, seconds)) is not None]
         if len(later) < len(plan.times_s):
@@ -249,7 +255,9 @@ def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.Pl
         times, guessed = plan.times_s, guessed + (not plan.command)
         frames.append(_planned(plan, world_from_ego @ ego_from_bev, ego_from_bev, later))
     if not frames:
-        raise InputError(f"{file}: `plan`: no frame has a planned path and {max(times, default=3):g} s of ground truth")
+        raise InputError(
+            f"{file}: `plan` (`--plan`): no frame has a planned path and {max(times, default=3):g} s of ground truth"
+        )
     notes = [f"{left_out} frames at the end of scenes have no whole driven path: left out"] if left_out else []
     if guessed:
         notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")

@@ -274,14 +274,16 @@ class TopicFinder:
         for camera in without:
             if camera.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
                 raise InputError(
-                    f"{bag.path}: camera {camera.camera}: no CameraInfo belongs to {camera.images}: pass "
-                    f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
+                    f"{bag.path}: camera {camera.camera}: no CameraInfo belongs to {camera.images}: pass `calibration` "
+                    "(`--calibration FILE`), or name the topic with `topics_file` (`--topics FILE.toml`) "
+                    f"({self.seen()})"
                 )
         self.left_out = tuple(camera.images for camera in without)
         self.cameras = tuple(camera for camera in cameras if camera not in without)
         if not self.cameras:
             raise InputError(
-                f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
+                f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}` "
+                "(`--topic CAMERA=/TOPIC`)"
             )
 
     def of_kind(self, kind: Kind) -> list[str]:
@@ -386,6 +388,6 @@ def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag)
             offered = ", ".join(found.values()) or "none"
             raise InputError(
                 f"{bag.path}: camera {name} of the calibration: its image topic was not found (image topics: "
-                f"{offered}): pass `topics={{{name!r}: '/TOPIC'}}`"
+                f"{offered}): pass `topics={{{name!r}: '/TOPIC'}}` (`--topic {name}=/TOPIC`)"
             )
         yield name, chosen[0]

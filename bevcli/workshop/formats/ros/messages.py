@@ -195,7 +195,9 @@ def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: boo
     image_from_sensor = scale @ [[1, 0, -region.x_offset], [0, 1, -region.y_offset], [0, 0, 1]]
     intrinsics = image_from_sensor @ _matrix(_first(message, "k", "K"), 3, 3)
     if not (np.isfinite(intrinsics).all() and min(intrinsics[0, 0], intrinsics[1, 1]) > 0):
-        raise InputError(f"{where}: the camera is not calibrated (K is zero or NaN): pass `calibration=FILE`")
+        raise InputError(
+            f"{where}: the camera is not calibrated (K is zero or NaN): pass `calibration` (`--calibration FILE`)"
+        )
     projection = image_from_sensor @ _matrix(_first(message, "p", "P"), 3, 4)
     rotation = _matrix(_first(message, "r", "R"), 3, 3)
     if rectified and projection[0, 0] > 0:

@@ -311,7 +311,7 @@ def _covered(
         begin, end = entries[0].stamp.timestamp_ns, entries[-1].stamp.timestamp_ns
         raise InputError(
             f"{path}: the poses ({motion.first_ns} to {motion.last_ns} ns) and the images ({begin} to {end} ns) do not "
-            "overlap in time: pass `ego_motion_file=FILE` for these images"
+            "overlap in time: pass `ego_motion_file` (`--ego-motion FILE`) for these images"
         )
     left_out = len(entries) - len(kept)
     note = f"{left_out} of {len(entries)} frames are left out: there are no poses at their times"

@@ -291,7 +291,7 @@ class VehicleReader:
             return EGO_FRAMES[0]
         self.notes.append(
             f'no frame is named {" or ".join(EGO_FRAMES[:2])}: "{common[0]}" is taken as the frame of the vehicle '
-            "(ego_frame in `topics_file=FILE.toml` states another)"
+            "(ego_frame in `topics_file` (`--topics FILE.toml`) states another)"
         )
         return common[0]
 
@@ -304,13 +304,13 @@ class VehicleReader:
             frames = ", ".join(self._tree.frames[:12]) or "none"
             raise InputError(
                 f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
-                f"(frames: {frames}; {self._finder.seen()}): pass `calibration=FILE`, or name the frames "
-                "with `topics_file=FILE.toml`"
+                f"(frames: {frames}; {self._finder.seen()}): pass `calibration` (`--calibration FILE`), or name the "
+                "frames with `topics_file` (`--topics FILE.toml`)"
             )
         if abs(found[2, 2]) > 0.7:
             self.notes.append(
                 f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
-                "not, name the optical frame with `topics_file=FILE.toml`"
+                "not, name the optical frame with `topics_file` (`--topics FILE.toml`)"
             )
         return found
 
@@ -346,9 +346,10 @@ class VehicleReader:
         if use == "required":
             raise InputError(
                 f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
-                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `odometry=True` to '
-                'measure them from the images, `ego_motion="static"` if the vehicle stands, or `temporal=False` to run '
-                "without history"
+                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file` (`--ego-motion FILE`), '
+                "`odometry=True` (`--odometry`) to measure them from the images, "
+                '`ego_motion="static"` (`--static`) if the vehicle stands, or '
+                "`temporal=False` (`--no-temporal`) to run without history"
             )
         note = "the bag has no poses of the vehicle: boxes are in the ego frame"
         return None, "", () if use == "measured" else (note,)
