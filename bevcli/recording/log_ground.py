@@ -74,7 +74,7 @@ def fit_colors(kind: str, features: Features) -> BevColors:
     elif kind.startswith("channel:"):
         chosen = int(kind.partition(":")[2])
         if chosen >= channels:
-            raise InputError(f"`bev={kind}`: the BEV map has channels 0 to {channels - 1}")
+            raise InputError(f"`bev={kind}` (`--bev`): the BEV map has channels 0 to {channels - 1}")
         basis = np.eye(channels, dtype=np.float32)[:, chosen : chosen + 1]
     low, high = np.percentile(_values(features, mean, basis), PERCENTILES, axis=0)
     return BevColors(mean, basis, low, high)
