@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
-    from bevcli.viewer.recording_file import show as show
-    from bevcli.viewer.views import screenshot as screenshot, video as video
+    from bevcli.viewer.recording_file import screenshot as screenshot, show as show
     from bevcli.weights.model_file import model_file_for as model_file_for
     from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
+    from bevcli.workshop.video.video import video as video
 
 # The public names by the modules that define them.
 _NAMES = {
@@ -87,8 +87,8 @@ _NAMES = {
     "bevcli.workshop.training.train": "train validate",
     "bevcli.workshop.trust.estimate": "estimate_score",
     "bevcli.workshop.formats.export": "export",
-    "bevcli.viewer.recording_file": "show",
-    "bevcli.viewer.views": "screenshot video",
+    "bevcli.viewer.recording_file": "screenshot show",
+    "bevcli.workshop.video.video": "video",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = list(_MODULES)

@@ -162,7 +162,7 @@ def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: P
     from bevcli.cli.progress import Progress
     from bevcli.viewer.native import take_screenshot
     from bevcli.viewer.recording_reader import summarise
-    from bevcli.viewer.video import frame_rate, write_video
+    from bevcli.workshop.video.video import frame_rate, write_video
 
     if options.summary:
         say(summarise(recording, read_from).replace(str(recording), str(name), 1))
@@ -172,7 +172,8 @@ def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: P
     if options.video is not None:
         count, rate = frame_rate(read_from)
         with Progress(count, "frames") as progress:
-            write_video(read_from, options.video, count, rate, progress.advance)
+            for _ in write_video(read_from, options.video, count, rate):
+                progress.advance()
         say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
 
 

@@ -9,33 +9,32 @@ from bevcli.frame import ColorOrder, Frame, Prediction, check_color_order
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import Color
-from bevcli.geometry.transforms import Array, inverse
+from bevcli.geometry.transforms import inverse
 from bevcli.recording import entities
 from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_colors
 from bevcli.recording.log_boxes import MOVING_M_S, box_colors
 from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
 from bevcli.recording.log_static import bev_image_points, default_vehicle, range_lines
-from bevcli.viewer.video import (
+from bevcli.viewer.drawing import (
     BACKGROUND,
     BEV_MARGIN,
-    BEV_SIDE,
     CAMERAS_HEIGHT,
     CAMERAS_WIDTH,
-    FAR,
-    HEIGHT,
-    SUBPIXEL_BITS,
     TEXT,
+    UNTRAINED,
     WARNING,
-    WIDTH,
     Canvas,
+    draw_arrow,
     draw_entry,
+    draw_lines,
     draw_text,
     draw_title,
+    from_above,
+    new_sheet,
     tiles_of,
-)
+)  # fmt: skip
 
 TOP = (4, 5, 6, 7, 4)  # corners of a box, around its top
-UNTRAINED = "UNTRAINED WEIGHTS: boxes are meaningless"
 LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
 
 
@@ -57,7 +56,7 @@ def plot(prediction: Prediction, image: str | None, score: float, color_order: C
 
 
 def _whole(prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color]) -> Canvas:
-    canvas = np.full((HEIGHT, WIDTH, 3), BACKGROUND, dtype=np.uint8)
+    canvas = new_sheet()
     sizes = {camera.name: (camera.width, camera.height) for camera in frame.rig.cameras}
     for tile in tiles_of(sizes, {camera.name: camera.yaw for camera in frame.rig.cameras}):
         drawn = _camera_image(prediction, frame, boxes, colors, frame.rig[tile.camera], tile.width, tile.height)
@@ -88,7 +87,7 @@ def _camera_image(
     [lines] = lines_in_images(boxes.transformed(world_from_bev).corners(), [posed])
     own, texts = box_colors(boxes, colors), box_labels(boxes)
     for box in np.unique(lines.owners):
-        _draw_lines(canvas, lines.segments[lines.owners == box], own[box], 1 + width // 800)
+        draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own[box]), 1 + width // 800)
     size = max(0.36, width * LABEL_SHARE)
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
         draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own[box]), size, centered=True)
@@ -103,10 +102,7 @@ def _draw_from_above(
 ) -> None:
     """The map, range rings, boxes with their velocities, and the vehicle, in the bev frame."""
     grid, rings = prediction.grid, range_lines(frame.rig, prediction.grid)
-    reach = BEV_MARGIN * max(np.abs([*grid.x_range_m, *grid.y_range_m]))
-
-    def to_canvas(points: Array) -> Array:
-        return np.clip((points / reach + 1) * BEV_SIDE / 2, -FAR, FAR)
+    to_canvas = from_above(BEV_MARGIN * max(np.abs([*grid.x_range_m, *grid.y_range_m])))
 
     if prediction.segmentation is not None:
         (left, right), (low, high) = prediction.segmentation.x_range_m, prediction.segmentation.y_range_m
@@ -115,17 +111,17 @@ def _draw_from_above(
         area = prediction.segmentation.painted(palette, entities.BACKGROUND)[..., ::-1]
         canvas[y0:y1, x0:x1] = cv2.resize(area, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
     for ring in rings:
-        _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, ring))[None], RING_COLOR)
+        draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, ring))], _bgr(RING_COLOR))
     corners, own = boxes.corners()[..., :2] * (1, -1), box_colors(boxes, colors)
     for index in reversed(range(len(boxes))):  # the best ones lie on top
-        _draw_lines(canvas, to_canvas(corners[index][[TOP]]), own[index], 2)
+        draw_lines(canvas, to_canvas(corners[index][[TOP]]), _bgr(own[index]), 2)
         velocity = boxes.velocities[index] * (1, -1)
         if np.linalg.norm(velocity) > MOVING_M_S:  # not of NaN
             start = boxes.centers[index, :2] * (1, -1)
-            tail, tip = to_canvas(np.stack([start, start + velocity])).astype(int).tolist()
-            cv2.arrowedLine(canvas, tail, tip, _bgr(own[index]), 1, cv2.LINE_AA, 0, 0.25)
+            tail, tip = to_canvas(np.stack([start, start + velocity]))
+            draw_arrow(canvas, tail, tip, _bgr(own[index]))
     for strip in default_vehicle().top_view:
-        _draw_lines(canvas, to_canvas(bev_image_points(frame.rig, strip))[None], EGO_COLOR, 2)
+        draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, strip))], _bgr(EGO_COLOR), 2)
 
 
 def _draw_legend(canvas: Canvas, prediction: Prediction, boxes: Boxes3D, colors: dict[str, Color]) -> None:
@@ -139,12 +135,6 @@ def _draw_legend(canvas: Canvas, prediction: Prediction, boxes: Boxes3D, colors:
         entries += [(color, f"map: {name.replace('_', ' ')}") for name, color in maps]
     for index, (color, text) in enumerate(entries[:15]):
         draw_entry(canvas, (16 + 250 * (index % 5), 60 + 32 * (index // 5)), color, text)
-
-
-def _draw_lines(canvas: Canvas, lines: Array, color: Color | NDArray[np.uint8], thickness: int = 1) -> None:
-    """Lines (M, P, 2) in pixels. color: RGB."""
-    points = np.round(lines * (1 << SUBPIXEL_BITS)).astype(np.int32)
-    cv2.polylines(canvas, list(points), False, _bgr(color), thickness, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def _bgr(color: Color | NDArray[np.uint8]) -> Color:

@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import open_regular, plain_name, run_program, run_python
 from bevcli.recording.entities import FILE_HEADER, INDEX, MESSAGE_HEADER, MESSAGE_KINDS
 from bevcli.sequences.format import drives_in, is_drive
-from bevcli.viewer.native import viewer_binary, viewer_environment
+from bevcli.viewer.native import take_screenshot, viewer_binary, viewer_environment
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer
@@ -210,3 +210,23 @@ def show(
         stream.log_file_from_path(file)
         stream.flush(timeout_sec=60.0)
     return viewer
+
+
+def screenshot(recording: str | Path, image: str | Path, *, frame: int | None = None) -> tuple[str, ...]:
+    """Write an image of the viewer with a recording; return the names of its views.
+
+        bevcli.screenshot("street.rrd", "street.png", frame=3)
+
+    Needs a Vulkan driver, but no screen and no GPU. `Prediction.plot` needs neither, and no recording.
+
+    Args:
+        recording: a recording, or the folder of a run.
+        image: the .png, .jpg or .jpeg file to write.
+        frame: index of the frame. Default: the first one.
+
+    Raises:
+        InputError: there is no such recording or frame, or the image has another ending.
+        OutputError: the viewer cannot draw, or the file cannot be written.
+    """
+    with open_recording(Path(recording)) as file:
+        return take_screenshot(file, Path(image), frame)

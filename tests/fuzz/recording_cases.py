@@ -17,7 +17,7 @@ from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import write_boxes
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader, read_recording, summarise
-from bevcli.viewer.video import CameraImages, draw_frame, frame_rate, tiles
+from bevcli.workshop.video.video import CameraImages, draw_frame, frame_rate, tiles
 
 READ = (entities.WORLD, entities.EGO, entities.BOXES, entities.RUN, entities.SPEED, "world/cameras", "bev")
 

@@ -16,9 +16,9 @@ from bevcli.recording import entities
 from bevcli.recording.log_ground import future_lines
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
-from bevcli.viewer.video import CameraImages, draw_frame, tiles
 from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
+from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
 
 TIMES = np.array([0.5, 1.0])
 LINES = MapLines(

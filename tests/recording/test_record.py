@@ -21,8 +21,8 @@ from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
-from bevcli.viewer.video import CameraImages, draw_frame, tiles
 from bevcli.workshop.scores.record import names_of, record
+from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
 
 CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS

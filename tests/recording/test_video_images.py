@@ -11,7 +11,7 @@ from bevcli.recording import entities, log_cameras, options
 from bevcli.recording.log_cameras import Av1Encoder
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.video import Av1Decoder, CameraImages
+from bevcli.workshop.video.video import Av1Decoder, CameraImages
 
 with_av = pytest.mark.skipif(not options.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
 

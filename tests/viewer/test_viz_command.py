@@ -18,8 +18,8 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.boxes_table import COLUMNS
-from bevcli.viewer import video
-from bevcli.viewer.video import write_video
+from bevcli.workshop.video import video
+from bevcli.workshop.video.video import write_video
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_a_video_that_does_not_fit_is_an_error(drive, tmp_path, ending):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
         with pytest.raises(OutputError, match="cannot be written"):
-            write_video(drive[1], path, 3, 2.0, lambda: None)
+            list(write_video(drive[1], path, 3, 2.0))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_text() == "old"

@@ -6,15 +6,14 @@ H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM
 import errno
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import MAP_CLASSES
@@ -22,31 +21,42 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, color_
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import decode_image, plain_name
 from bevcli.recording import entities
-from bevcli.recording.blueprint import rows_of_largest_images
 from bevcli.recording.entities import Color, class_colors, map_colors
 from bevcli.recording.options import has_av, require_av
+from bevcli.viewer.drawing import (
+    BEV_MARGIN,
+    BEV_SIDE,
+    CAMERAS_HEIGHT,
+    CAMERAS_WIDTH,
+    FAR,
+    HEIGHT,
+    TEXT,
+    UNTRAINED,
+    WARNING,
+    WIDTH,
+    Canvas,
+    Tile,
+    ToCanvas,
+    draw_arrow,
+    draw_entry,
+    draw_lines,
+    draw_text,
+    draw_title,
+    from_above,
+    new_sheet,
+    tiles_of,
+)  # fmt: skip
+from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
 
 MOST_PIXELS = 64 << 20
-Canvas = NDArray[np.uint8]
-ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-SUBPIXEL_BITS = 3
 STRIPS = "LineStrips2D:strips"
-FAR = 1e5  # pixels; what lies farther outside of a canvas is drawn there
 OPACITIES = 10  # steps of opacity, faint to opaque
-WIDTH, HEIGHT = 1920, 640
-BEV_SIDE = 640
-CAMERAS_WIDTH = WIDTH - BEV_SIDE
-CAMERAS_HEIGHT = 500
 BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
-BEV_MARGIN = 1.02  # of the range rings and the border of the grid
-BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
 BELOW_BOXES = (
     entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
 )  # fmt: skip
-TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 H264_QUALITY = 21  # x264's crf
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
@@ -98,7 +108,7 @@ def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     strips = frame.strips(entity, STRIPS)
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
     for strip, color in zip(strips, colors, strict=True):
-        _draw_line(canvas, strip, color, to_canvas, thickness)
+        draw_lines(canvas, [to_canvas(strip)], color, thickness)
 
 
 def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
@@ -111,13 +121,8 @@ def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canv
     for level in np.unique(step[step > 0]):
         below = canvas.copy()
         for index in np.flatnonzero(step == level):
-            _draw_line(canvas, strips[index], colors[index], to_canvas)
+            draw_lines(canvas, [to_canvas(strips[index])], colors[index])
         canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
-
-
-def _draw_line(canvas: Canvas, strip: Array, color: Color, to_canvas: ToCanvas, thickness: int = 1) -> None:
-    points = np.round(to_canvas(strip) * (1 << SUBPIXEL_BITS)).astype(np.int32)
-    cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
@@ -126,7 +131,7 @@ def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     ends = starts + frame.array(entity, "Arrows2D:vectors", 2, len(starts))
     colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
     for start, end, color in zip(to_canvas(starts), to_canvas(ends), colors, strict=True):
-        cv2.arrowedLine(canvas, start.astype(int).tolist(), end.astype(int).tolist(), color, 1, cv2.LINE_AA, 0, 0.25)
+        draw_arrow(canvas, start, end, color)
 
 
 def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, size: float = 0.4) -> None:
@@ -135,21 +140,6 @@ def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     colors = entity_colors(frame, entity, "Points2D:colors", len(positions))
     for text, (x, y), color in zip(frame.texts(entity, "Points2D:labels"), positions, colors, strict=False):
         draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
-
-
-def draw_text(
-    canvas: Canvas, text: str, position: tuple[int, int], color: Color, size: float = 0.45, *, centered: bool = False
-) -> None:
-    """Draws a line of text.
-
-    position: x, y, pixels, of the middle of its left edge, or of its centre if `centered`. color: BGR.
-    """
-    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
-    left = position[0] - width // 2 if centered else position[0]
-    bottom = position[1] + height // 2
-    if centered:
-        cv2.rectangle(canvas, (left - 2, bottom - height - 3), (left + width + 2, bottom + 3), (24, 20, 18), -1)
-    cv2.putText(canvas, text, (left, bottom), FONT, size, color, 1, cv2.LINE_AA)
 
 
 def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
@@ -172,41 +162,12 @@ def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
     return pixels.reshape(shape)[..., ::-1]
 
 
-@dataclass(frozen=True)
-class Tile:
-    """The rectangle of a camera's image in the video frame, pixels."""
-
-    camera: str
-    left: int
-    top: int
-    width: int
-    height: int
-
-
 def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     """The rectangles of the cameras of a recording, in rows in the same order as in the viewer."""
     sizes = {name: _camera_size(frame, name) for name in frame.texts(entities.RUN, "camera_names")}
     if not sizes:
         raise frame.wrong(entities.RUN, "camera_names", "the names of cameras", "none")
     return tiles_of(sizes, _camera_yaws(frame))
-
-
-def tiles_of(sizes: Mapping[str, ArrayLike], yaws: Mapping[str, float]) -> tuple[Tile, ...]:
-    """The rectangles of cameras. sizes: width and height of their images. yaws: radians, in the ego frame."""
-    whole = {name: np.asarray(size, dtype=np.float64) for name, size in sizes.items()}
-    aspect = min(width / height for width, height in whole.values())
-    rows = rows_of_largest_images(yaws, aspect, CAMERAS_WIDTH, CAMERAS_HEIGHT)
-    cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
-    layout = []
-    for r, row in enumerate(rows):
-        indent = (CAMERAS_WIDTH - len(row) * cell[0]) // 2
-        for c, name in enumerate(row):
-            width, height = whole[name]
-            scale = min(cell[0] / width, cell[1] / height)
-            w, h = max(1, round(width * scale)), max(1, round(height * scale))
-            left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
-            layout.append(Tile(name, left, top, w, h))
-    return tuple(layout)
 
 
 def _camera_size(frame: RecordedFrame, camera: str) -> Array:
@@ -230,7 +191,7 @@ def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: CameraIma
 
     layout: where each camera's image goes. images: decodes them; frames must come in order.
     """
-    canvas = np.full((HEIGHT, WIDTH, 3), BACKGROUND, dtype=np.uint8)
+    canvas = new_sheet()
     for tile in layout:
         image = images.image(frame, tile.camera)
         _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile, image)
@@ -260,19 +221,9 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     draw_title(canvas, tile.camera, has_image=image is not None)
 
 
-def draw_title(canvas: Canvas, camera: str, *, has_image: bool) -> None:
-    """Draws the name of a camera into the corner of its image."""
-    cv2.rectangle(canvas, (0, 0), (10 * len(camera) + 12, 22), BACKGROUND, -1)
-    text, color = (camera, TEXT) if has_image else (f"{camera}: no image", WARNING)
-    draw_text(canvas, text, (8, 11), color, 0.42)
-
-
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     rings = max((np.abs(ring).max(initial=0) for ring in frame.strips(entities.BEV_RINGS, STRIPS)), default=0)
-    reach = BEV_MARGIN * rings or BEV_RANGE_M
-
-    def to_canvas(points: Array) -> Array:
-        return np.clip((points / reach + 1) * BEV_SIDE / 2, -FAR, FAR)
+    to_canvas = from_above(BEV_MARGIN * rings or BEV_RANGE_M)
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
@@ -307,7 +258,7 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_text(canvas, f"{title}   {scene}   frame {frame.index}   {speed}", (16, 24), TEXT, 0.6)
     note = "".join(frame.texts(entities.RUN, "note"))
     if any(frame.integers(entities.RUN, "untrained")):
-        note = "UNTRAINED WEIGHTS: boxes are meaningless"
+        note = UNTRAINED
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
     counts, layers = Counter(frame.texts(entities.BOXES, "name")), _layers(frame)
     for name in layers:
@@ -348,24 +299,38 @@ def _named_colors(frame: RecordedFrame, names: str, colors: str) -> dict[str, Co
         raise frame.wrong(entities.RUN, colors, "colours such as #ff9e2c", values) from None
 
 
-def draw_entry(canvas: Canvas, position: tuple[int, int], color: Color, text: str) -> None:
-    """Draws an entry of a legend. position: x, y of its left edge. color: RGB."""
-    x, y = position
-    cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), color[::-1], -1)
-    draw_text(canvas, text, (x + 24, y), TEXT)
-
-
 def _rotation(frame: RecordedFrame, entity: str) -> Array:
     columns = frame.array(entity, "Transform3D:mat3x3", 9)
     return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns
 
 
-def write_video(recording: Path, video: Path, count: int, rate: float, on_frame: Callable[[], None]) -> None:
-    """Writes the video. count, rate: of `frame_rate`. on_frame: called after each frame.
+def video(
+    recording: str | Path, video: str | Path, *, on_frame: Callable[[], None] = lambda: None
+) -> tuple[int, float]:
+    """Write a video of a recording with all cameras and the map from above; return its frames, and those a second.
 
-    Raises InputError if the path does not end in .mp4 or .webm or the recording has no frames, OutputError if the video
-    cannot be written.
+        bevcli.video("street.rrd", "street.mp4")
+
+    H.264 if PyAV is installed (`bevcli[video]`), else VP9.
+
+    Args:
+        recording: a recording, or the folder of a run.
+        video: the .mp4 or .webm file to write.
+        on_frame: called after each frame.
+
+    Raises:
+        InputError: there is no such recording, it has no frames, or the video has another ending.
+        OutputError: the video cannot be written.
     """
+    with open_recording(Path(recording)) as file:
+        count, rate = frame_rate(file)
+        for _ in write_video(file, Path(video), count, rate):
+            on_frame()
+    return count, rate
+
+
+def write_video(recording: Path, video: Path, count: int, rate: float) -> Iterator[int]:
+    """Write the video, and yield after each frame. count, rate: of `frame_rate`. Raises as `video`."""
     if video.suffix.lower() not in FOURCC:
         raise InputError(f"{video}: the file must end in .mp4 or .webm")
     if not count:
@@ -373,9 +338,9 @@ def write_video(recording: Path, video: Path, count: int, rate: float, on_frame:
     encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
     with whole_file(video) as own, plain_name(own) as unfinished:
         with encoder(unfinished, rate) as write:
-            for image in _images(recording):
+            for index, image in enumerate(_images(recording)):
                 write(image)
-                on_frame()
+                yield index
         _check_complete(unfinished, count)
 
 
