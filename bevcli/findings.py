@@ -39,11 +39,6 @@ class Finding:
         return f"{where}{self.message}{brackets}" + (f": {self.advice}" if self.advice else "")
 
 
-def rig_error(code: str, message: str, found: str, expected: str, advice: str) -> Finding:
-    """An error about the whole rig or drive; arguments as the attributes of `Finding`."""
-    return Finding(code, "error", None, message, found, expected, advice)
-
-
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The findings of severity "error", in their order."""
     return tuple(finding for finding in findings if finding.severity == "error")

@@ -31,6 +31,7 @@ from bevcli.recording.components import log
 from bevcli.recording.entities import colormap
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
+from bevcli.viewer.drawing import FONT, Canvas, draw_lines
 from bevcli.writing import whole_file
 
 GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
@@ -41,7 +42,6 @@ GROUND: Color = (120, 205, 140)
 HORIZON: Color = (255, 214, 64)
 PILLAR: Color = (235, 238, 245)
 BACKDROP: Color = (44, 49, 58)
-Pixels = NDArray[np.uint8]
 
 
 def pillars_in(camera: Camera, ego_from_bev: Array) -> tuple[Array, Array, NDArray[np.uint8]]:
@@ -109,7 +109,7 @@ def visible_runs(pixels: Array) -> list[Array]:
     return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
 
 
-def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, width: int) -> Pixels:
+def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Canvas | None, width: int) -> Canvas:
     """The camera's image with the overlay, (h, width, 3) RGB.
 
     image_bgr: (H, W, 3); a dark image is used where it is None. width: of the result, pixels.
@@ -120,9 +120,9 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
     else:
         resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
         canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
-    _blend_lines(canvas, ground_lines(shown), GROUND, 0.55)
-    _blend_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
-    _blend_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
+    draw_lines(canvas, ground_lines(shown), GROUND, opacity=0.55, bits=4)
+    draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 2, 0.9, 4)
+    draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, opacity=0.35, bits=4)
     for pixel, distance, color in zip(*pillars_in(shown, ego_from_bev), strict=True):
         radius = float(np.clip(60 / distance, 1.2, 6)) * (width / 800)
         center = tuple(np.round(pixel * 16).astype(int).tolist())
@@ -131,25 +131,18 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
     return canvas
 
 
-def _blend_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
-    """Draw lines (P, 2) in pixels on an image (H, W, 3), in place."""
-    layer, points = canvas.copy(), [np.round(line * 16).astype(np.int32) for line in lines]
-    cv2.polylines(layer, points, False, color, thickness, cv2.LINE_AA, 4)
-    cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
-
-
-def _draw_distances(canvas: Pixels, camera: Camera) -> None:
+def _draw_distances(canvas: Canvas, camera: Camera) -> None:
     """Label distances on the ground along the viewing direction, where the labels do not overlap."""
     ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
     start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
-    font, size, last = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800, np.inf
+    size, last = 0.5 * canvas.shape[1] / 800, np.inf
     for distance in LABELLED_M:
         pixel = pixels_in_image(camera, start + distance * ahead)
         if np.isfinite(pixel).all() and last - pixel[1] > 22:
             last = float(pixel[1])
             corner = (round(pixel[0]), round(pixel[1]))
             for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
-                cv2.putText(canvas, f"{distance:g} m", corner, font, size, color, thickness, cv2.LINE_AA)
+                cv2.putText(canvas, f"{distance:g} m", corner, FONT, size, color, thickness, cv2.LINE_AA)
 
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
@@ -166,7 +159,7 @@ LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fon
 CAR_LENGTH_M, CAR_WIDTH_M, AXLE_TO_TAIL_M = 4.6, 1.8, 1.0
 
 
-def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Canvas]) -> None:
     """Write the PNG. images: by camera, (H, W, 3) BGR; others are drawn on a dark background. Raises OutputError."""
     front, left, right, back = _cameras_by_side(rig)
     columns = max(len(front), len(back), 3)
@@ -231,7 +224,7 @@ def _draw_camera(
     camera: Camera,
     rig: CameraRig,
     report: RigReport,
-    images: Mapping[str, Pixels],
+    images: Mapping[str, Canvas],
 ) -> None:
     """Draw a camera's image with title, angles and its first finding. corner: left and top, inches."""
     left, top = corner
@@ -371,7 +364,7 @@ JPEG_QUALITY = 90
 OVERLAYS = ("pillars", "ground_grid", "pillar_lines", "horizon")
 
 
-def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Canvas]) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
     with _layout(rig).saved_to(path, "bevcli-project-debug") as stream:
         log_static.log_scene(stream, rig, {})
@@ -418,7 +411,7 @@ def _log_coverage(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage
     stream.log(COVERAGE_ON_GROUND, quad, static=True)
 
 
-def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Pixels | None) -> None:
+def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Canvas | None) -> None:
     log(stream, entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
     if pixels is not None:
         encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
@@ -430,7 +423,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
     stream.log(entities.overlay(camera.name, "pillars"), dots, static=True)
     for kind, lines, color, width in (
         ("ground_grid", ground_lines(camera), (*GROUND, 120), 0.6),
-        ("pillar_lines", pillar_lines(camera, ego_from_bev), (235, 238, 245, 90), 0.6),
+        ("pillar_lines", pillar_lines(camera, ego_from_bev), (*PILLAR, 90), 0.6),
         ("horizon", visible_runs(horizon(camera)), HORIZON, 1.0),
     ):
         inside = [part for line in lines for part in _clipped(line, camera)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bevcli.findings import Finding, rig_error
+from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from bevcli.rig import rig_checks
@@ -172,44 +172,35 @@ def bev_frame_error(ego_from_bev: Array) -> Finding:
     """The common mistake whose undoing gives a plausible bev frame, or else its implausible property."""
     pose, plausible = ego_from_bev, rig_checks.is_plausible_bev_frame
     distance, height, (tilt, heading) = np.linalg.norm(pose[:3, 3]), pose[2, 3], rig_checks.bev_angles_deg(pose)
-    unit = units_per_metre(float(distance))
+    found = f"tilt {tilt:.0f}°, y {heading:.0f}° from forward, height {height:.2f} m"
+    expected, unit = "x right, y forward, z up, z 1.84 m", units_per_metre(float(distance))
     if unit != 1:
-        found, expected = f"{distance:.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
         message = f'the translation of "ego_from_bev" is in {"millimetres" if unit == 1000 else "centimetres"}'
-        return rig_error("translation-unit", message, found, expected, f"divide the translation by {unit:g}")
+        code, found, expected = "translation-unit", f"{distance:.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
+        advice = f"divide the translation by {unit:g}"
     # KITTI, Waymo and Argoverse have x forward: rotated to x right, such a frame is plausible.
-    if plausible(rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))):
-        message, advice = "has x forward", "rotate it by 90° about z, unless your weights were trained with x forward"
+    elif plausible(rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))):
+        code, message = "bev-x-forward", '"ego_from_bev" has x forward'
         found, expected = "x forward, y left", "x right, y forward"
-        return rig_error("bev-x-forward", f'"ego_from_bev" {message}', found, expected, advice)
-    found, expected = (
-        f"tilt {tilt:.0f}°, y {heading:.0f}° from forward, height {height:.2f} m",
-        "x right, y forward, z up, z 1.84 m",
-    )
-    if plausible(inverse(pose)):
-        message = '"ego_from_bev" is bev_from_ego, the inverse'
-        return rig_error("transform-inverted", message, found, expected, "invert it")
-    if plausible(reordered(pose, 1)) or plausible(reordered(pose, -1)):
+        advice = "rotate it by 90° about z, unless your weights were trained with x forward"
+    elif plausible(inverse(pose)):
+        code, message, advice = "transform-inverted", '"ego_from_bev" is bev_from_ego, the inverse', "invert it"
+    elif plausible(reordered(pose, 1)) or plausible(reordered(pose, -1)):
+        code, advice = "quaternion-order", "put w first"
         message = '"ego_from_bev" has a quaternion that is not in the order w, x, y, z'
-        return rig_error("quaternion-order", message, found, expected, "put w first")
-    return _bev_frame_defect(pose)
-
-
-def _bev_frame_defect(pose: Array) -> Finding:
-    """The implausible property of the frame, where no common mistake explains it."""
-    height, (tilt, heading) = pose[2, 3], rig_checks.bev_angles_deg(pose)
-    if tilt > rig_checks.TILT_ERROR_DEG:
-        found, advice = f"{tilt:.0f}°", "z of the bev frame points up"
-        return rig_error("bev-tilted", '"ego_from_bev" is tilted', found, "level within 15°", advice)
-    if abs(heading) > rig_checks.HEADING_DEG:
-        message, found = 'y of "ego_from_bev" is not forward', f"y is {heading:.0f}° to the left"
-        return rig_error("bev-axes", message, found, "x right, y forward", "rotate it about z")
-    if abs(height - rig_checks.BEV_HEIGHT_M) > rig_checks.HEIGHT_ERROR_M:
-        message, found = '"ego_from_bev" is not at the height that the weights expect', f"{height:.2f} m"
+    # No common mistake explains it.
+    elif tilt > rig_checks.TILT_ERROR_DEG:
+        code, message, found, expected = "bev-tilted", '"ego_from_bev" is tilted', f"{tilt:.0f}°", "level within 15°"
+        advice = "z of the bev frame points up"
+    elif abs(heading) > rig_checks.HEADING_DEG:
+        code, message, found = "bev-axes", 'y of "ego_from_bev" is not forward', f"y is {heading:.0f}° to the left"
+        expected, advice = "x right, y forward", "rotate it about z"
+    elif abs(height - rig_checks.BEV_HEIGHT_M) > rig_checks.HEIGHT_ERROR_M:
+        code, message = "bev-height", '"ego_from_bev" is not at the height that the weights expect'
+        found, expected = f"{height:.2f} m", f"about {rig_checks.BEV_HEIGHT_M} m"
         advice = "give its height above the ground; pillars extend from 4.5 m below this frame to 2.5 m above it"
-        return rig_error("bev-height", message, found, f"about {rig_checks.BEV_HEIGHT_M} m", advice)
-    found, expected = (
-        f"{np.hypot(pose[0, 3], pose[1, 3]):.1f} m from the ego origin",
-        f"at most {rig_checks.MAX_BEV_DISTANCE_M:g} m",
-    )
-    return rig_error("bev-far", '"ego_from_bev" is not on the vehicle', found, expected, "check its translation")
+    else:
+        code, message, advice = "bev-far", '"ego_from_bev" is not on the vehicle', "check its translation"
+        found = f"{np.hypot(pose[0, 3], pose[1, 3]):.1f} m from the ego origin"
+        expected = f"at most {rig_checks.MAX_BEV_DISTANCE_M:g} m"
+    return Finding(code, "error", None, message, found, expected, advice)

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bevcli.findings import Finding, rig_error
+from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 
@@ -151,8 +151,8 @@ def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> 
     spread = max(turn_deg(float(np.degrees(np.angle(turned))), turn) for turned in turns)
     if abs(turn) < EGO_TURN_DEG[0] or spread > EGO_TURN_DEG[1]:
         return None
-    return rig_error(
-        "ego-axes", "all cameras are turned by the same angle from the directions in their names",
+    return Finding(
+        "ego-axes", "error", None, "all cameras are turned by the same angle from the directions in their names",
         f"turned by {turn:.0f}°", "0° ± 35°", "the ego frame is x forward, y left, z up: rotate the poses into it",
     )  # fmt: skip
 
@@ -195,33 +195,25 @@ def _direction_text(yaw_deg: float) -> str:
 
 def pose_defects(camera: Camera) -> list[Finding]:
     """The implausible properties of a pose, as errors; the first is the most telling."""
-    mounting, name = mounting_of(camera.ego_from_camera), camera.name
+    mounting, advice = mounting_of(camera.ego_from_camera), "check the camera's pose"
     (low, high), away_m = CAMERA_HEIGHTS_M, np.hypot(mounting.x, mounting.y)
-    defects = []
+    defects = list[tuple[str, str, str, str, str]]()
     if away_m > MAX_CAMERA_DISTANCE_M:
-        found = f"{away_m:.1f} m from the ego origin"
-        defects.append(
-            _defect("camera-far", name, "is not on the vehicle", found, f"at most {MAX_CAMERA_DISTANCE_M:g} m")
-        )
+        found, expected = f"{away_m:.1f} m from the ego origin", f"at most {MAX_CAMERA_DISTANCE_M:g} m"
+        defects.append(("camera-far", "is not on the vehicle", found, expected, advice))
     if not low <= mounting.height <= high:
         found, expected = f"{mounting.height:.2f} m", f"{low:g} to {high:g} m above the ground"
-        advice = "the ego origin is on the ground, under the rear axle"
-        defects.append(_defect("camera-height", name, "has an implausible height", found, expected, advice))
+        origin = "the ego origin is on the ground, under the rear axle"
+        defects.append(("camera-height", "has an implausible height", found, expected, origin))
     if abs(mounting.pitch_deg) > max(MAX_PITCH_DEG, seen_fov_deg(camera)[1] / 2):
-        where = "ground" if mounting.pitch_deg < 0 else "sky"
+        target = "ground" if mounting.pitch_deg < 0 else "sky"
         found, expected = f"pitch {mounting.pitch_deg:.0f}°", "the horizon in the image"
-        defects.append(_defect(f"looks-at-{where}", name, f"looks at the {where}", found, expected))
+        defects.append((f"looks-at-{target}", f"looks at the {target}", found, expected, advice))
     elif abs(mounting.roll_deg) > MAX_ROLL_DEG:
         message = "is upside down" if abs(mounting.roll_deg) > 150 else "is rolled about its viewing direction"
-        found, advice = f"roll {mounting.roll_deg:.0f}°", "check the camera's pose; a quaternion has w first"
-        defects.append(_defect("camera-rolled", name, message, found, f"within {MAX_ROLL_DEG:g}°", advice))
-    return defects
-
-
-def _defect(
-    code: str, name: str, message: str, found: str, expected: str, advice: str = "check the camera's pose"
-) -> Finding:
-    return Finding(code, "error", name, message, found, expected, advice)
+        found, order = f"roll {mounting.roll_deg:.0f}°", "check the camera's pose; a quaternion has w first"
+        defects.append(("camera-rolled", message, found, f"within {MAX_ROLL_DEG:g}°", order))
+    return [Finding(code, "error", camera.name, *texts) for code, *texts in defects]
 
 
 CENTER_TOLERANCE = 0.15  # offset of the principal point from the image centre, relative to it; real cameras: 0.08

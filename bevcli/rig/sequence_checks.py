@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bevcli.findings import Finding, errors_of, rig_error
+from bevcli.findings import Finding, errors_of
 from bevcli.frame import DerivedDrive, Drive, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
@@ -151,7 +151,7 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
         found = f"{len(jumps)} of {len(speeds)} steps; {np.linalg.norm(drive.steps[first]):.1f} m in "
         found += f"{drive.seconds[first]:.2f} s at {int(ego_motion.timestamps_ns[first + 1])} ns"
         message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
-        findings.append(rig_error("ego-jump", message, found, f"at most {MAX_SPEED:g} m/s", advice))
+        findings.append(Finding("ego-jump", "error", None, message, found, f"at most {MAX_SPEED:g} m/s", advice))
     findings += _direction(drive)
     moving = speeds > MIN_MOVING_SPEED
     if not findings and ego_motion.velocities_are_stated and moving.any():
@@ -160,7 +160,7 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
             found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
             message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
             expected = f"equal within a factor of {SPEED_FACTOR:g}"
-            findings.append(rig_error("ego-speed", message, found, expected, advice))
+            findings.append(Finding("ego-speed", "error", None, message, found, expected, advice))
     return tuple(findings)
 
 
@@ -180,7 +180,7 @@ def _units(drive: _Drive) -> Finding | None:
     advice = "give metres and nanoseconds; a speed that is wrong by 1000 or 1000000 shows which unit is wrong"
     found, expected = f"median {median:.0f} m/s", f"at most {MAX_SPEED:g} m/s"
     message = "the vehicle is impossibly fast in most steps: wrong unit of timestamps or translations"
-    return rig_error("ego-units", message, found, expected, advice)
+    return Finding("ego-units", "error", None, message, found, expected, advice)
 
 
 def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
@@ -195,27 +195,27 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
          replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
     ):  # fmt: skip
         if _Drive.of(undone).is_plausible:
-            return rig_error(code, message, _motion_text(drive), "level, driving forward", advice)
+            return Finding(code, "error", None, message, _motion_text(drive), "level, driving forward", advice)
     return None
 
 
 def _direction(drive: _Drive) -> list[Finding]:
     """A tilted ego frame, or driving sideways or backwards in most steps."""
-    if drive.tilt_deg > MAX_TILT_DEG:
-        advice = "z of the ego frame and of the world frame point up: check the axes"
-        return [rig_error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)]
     headings = drive.headings_deg
-    if len(headings) == 0:
-        return []
-    ahead = float((np.abs(headings) <= FORWARD_DEG).mean())
-    back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean())
-    if back >= MOST_STEPS:
+    ahead = float((np.abs(headings) <= FORWARD_DEG).mean()) if len(headings) else 1.0
+    back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean()) if len(headings) else 0.0
+    if drive.tilt_deg > MAX_TILT_DEG:
+        code, message, expected = "ego-tilted", "the ego frame is tilted in the world", "level"
+        advice = "z of the ego frame and of the world frame point up: check the axes"
+    elif back >= MOST_STEPS:
+        code, message, expected = "ego-backwards", "the vehicle drives backwards", "forward"
         advice = "x of the ego frame is forward: rotate the poses by 180° about z, unless the whole drive is in reverse"
-        return [rig_error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)]
-    if 1 - ahead - back >= MOST_STEPS:
+    elif 1 - ahead - back >= MOST_STEPS:
+        code, message, expected = "ego-sideways", "the vehicle drives sideways", "forward"
         advice = "the ego frame is x forward, y left: rotate the poses into it"
-        return [rig_error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)]
-    return []
+    else:
+        return []
+    return [Finding(code, "error", None, message, _motion_text(drive), expected, advice)]
 
 
 def _motion_text(drive: _Drive) -> str:

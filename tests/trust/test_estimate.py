@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import bevcli
 from bevcli.cli.main import app
-from bevcli.findings import rig_error
+from bevcli.findings import Finding
 from bevcli.workshop.trust import estimate
 from bevcli.workshop.trust.estimate import EstimatedScore, estimate_of_boxes, fits
 
@@ -45,7 +45,7 @@ def test_figures_that_no_fitted_drive_had_are_named(model: bevcli.Model) -> None
 
 
 def test_faults_come_with_a_note_that_the_score_is_lower(model: bevcli.Model) -> None:
-    fault = rig_error("camera-dead", "its images show nothing", "", "", "")
+    fault = Finding("camera-dead", "error", None, "its images show nothing", "", "", "")
     assert standing(model, 0.8).with_faults((fault,)).notes[-1] == estimate.FAULTY
     assert estimate.FAULTY not in standing(model, 0.8).with_faults(()).notes
 

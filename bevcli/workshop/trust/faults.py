@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.findings import Finding, errors_of, rig_error
+from bevcli.findings import Finding, errors_of
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
@@ -158,7 +158,7 @@ def color_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> t
         return ()
     found = f"mean of the 15 best scores {stated:.2f} as they are, {undone:.2f} with red and blue exchanged"
     message, advice = "red and blue are exchanged in the images", "state the order of the channels, or exchange them"
-    return (rig_error("color-order", message, found, "", advice),)
+    return (Finding("color-order", "error", None, message, found, "", advice),)
 
 
 def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
@@ -171,7 +171,8 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> 
         return ()
     message = f"{model.engine} with {model.precision} does not give the boxes of PyTorch"
     advice = "export the model again, or use another precision or engine"
-    return (rig_error("engine-broken", message, f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more", advice),)
+    found, expected = f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more"
+    return (Finding("engine-broken", "error", None, message, found, expected, advice),)
 
 
 def weights_findings(model: Model, boxes: Sequence[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
