@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import SHOWN_SCORE, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass
@@ -452,7 +452,7 @@ class Prediction:
         return f"Prediction({', '.join((_named(self.stamp), found, *further))})"
 
     def plot(
-        self, image: str | None = None, *, score: float = 0.25, color_order: ColorOrder = "bgr"
+        self, image: str | None = None, *, score: float = SHOWN_SCORE, color_order: ColorOrder = "bgr"
     ) -> NDArray[np.uint8]:
         """The images of the frame with the boxes, and the map from above, as one image (H, W, 3) uint8.
 

@@ -15,6 +15,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 
+MATCH_DISTANCE_M = 2.0  # between centres on the ground: for errors, recall, tracks, and what is shown as found
 # The devkit's names of the five true-positive errors, in m, 1 - IoU, radians, m/s, 1 - accuracy.
 ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 
@@ -64,7 +65,7 @@ class DetectionConfig(ClassRanges):
     class_ranges_m: Mapping[str, float] = field(default_factory=lambda: ranges_m(NUSCENES_CLASSES.values()))
     classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
-    error_distance_m: float = 2.0
+    error_distance_m: float = MATCH_DISTANCE_M
     min_recall: float = 0.1
     min_precision: float = 0.1
     mean_ap_weight: float = 5.0

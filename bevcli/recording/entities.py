@@ -89,6 +89,12 @@ STAGE_COLORS: tuple[Color, ...] = (
 )  # fmt: skip
 DUPLICATE_COLOR: Color = (150, 156, 170)
 RING_COLOR: Color = (92, 98, 112)
+RING_LABEL_COLOR: Color = (150, 156, 170)
+TEXT_COLOR: Color = (225, 228, 235)
+PROBE_COLOR: Color = (255, 80, 220)
+GROUND_GRID_COLOR: Color = (120, 205, 140)
+HORIZON_COLOR: Color = (255, 214, 64)
+PILLAR_COLOR: Color = (235, 238, 245)
 # Dark and hardly coloured, so that nothing on a map looks like a box. The views have a dark background in every theme.
 MAP_COLORS: dict[str, Color] = {
     "drivable_road": (58, 64, 75),

@@ -1,4 +1,4 @@
-"""Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map, and the trails of their tracks.
+"""Write boxes into a recording: in the 3D scene, in the BEV view, on the street map, and the trails of their tracks.
 
 It finds misses and duplicates.
 """
@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.matching import DetectionConfig, ScoredBoxes, descending_scores, match_greedily
+from bevcli.geometry.matching import MATCH_DISTANCE_M, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
 from bevcli.recording.components import Components, any_values, components, line_strips, log, ui_points
 
-MATCH_DISTANCE_M = DetectionConfig.error_distance_m
 LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = ui_points(0.8), ui_points(1.6)
@@ -120,7 +119,7 @@ def log_boxes_3d(
     classes: Mapping[str, Color],
     labels: list[str],
 ) -> None:
-    """Writes predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
+    """Write predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
 
     boxes: N in the recording's world. corners: (N, 8, 3) of these. labels: of the N boxes, "" for none.
     """
@@ -146,16 +145,15 @@ def log_boxes_3d(
         radii=ui_points(1.2),
     )
     log(stream, entities.VELOCITY, arrows)
-    for entity, (strips, color) in zip(
-        (entities.FALSE_BOXES, entities.DUPLICATES), _marks(corners, marks), strict=True
-    ):
+    marked = zip((entities.FALSE_BOXES, entities.DUPLICATES), _marks(corners, marks), strict=True)
+    for entity, (strips, color) in marked:
         log(stream, entity, components(rr.LineStrips3D, strips=strips, colors=color, radii=THICK))
 
 
 def log_boxes_bev(
     stream: rr.RecordingStream, boxes: Boxes3D, corners: Array, marks: Marks, colors: NDArray[np.uint8]
 ) -> None:
-    """Writes predicted boxes into the BEV view. boxes: N in the bev frame. corners: (N, 8, 3). colors: (N, 3)."""
+    """Write predicted boxes into the BEV view. boxes: N in the bev frame. corners: (N, 8, 3). colors: (N, 3)."""
     doubled = np.concatenate([colors, colors])
     outlines = components(rr.LineStrips2D, strips=footprints(corners), colors=doubled, radii=THICK, draw_order=30)
     log(stream, entities.BEV_BOXES, outlines)
@@ -169,9 +167,8 @@ def log_boxes_bev(
         draw_order=31,
     )
     log(stream, entities.BEV_VELOCITY, arrows)
-    for entity, (strips, color) in zip(
-        (entities.BEV_FALSE, entities.BEV_DUPLICATES), _marks(corners, marks), strict=True
-    ):
+    marked = zip((entities.BEV_FALSE, entities.BEV_DUPLICATES), _marks(corners, marks), strict=True)
+    for entity, (strips, color) in marked:
         flat = (strips[..., :2] * (1, -1)).astype(np.float32)
         log(stream, entity, components(rr.LineStrips2D, strips=flat, colors=color, radii=THIN, draw_order=32))
 
@@ -179,7 +176,7 @@ def log_boxes_bev(
 def log_layer(
     stream: rr.RecordingStream, name: str, boxes: Boxes3D, corners_bev: Array, color: Color, labels: list[str]
 ) -> None:
-    """Writes the boxes of one of two models, all in its colour, into the scene and into the BEV view.
+    """Write the boxes of one of two models, all in its colour, into the scene and into the BEV view.
 
     boxes: N in the recording's world. corners_bev: (N, 8, 3) in the bev frame. labels: of the N boxes, "" for none.
     """
@@ -206,22 +203,20 @@ def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
 def log_ground_truth(
     stream: rr.RecordingStream, in_world: Boxes3D, corners_bev: Array, found: np.ndarray, colors: np.ndarray
 ) -> None:
-    """Writes ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
+    """Write ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
 
     in_world: M in the recording's world. corners_bev: (M, 8, 3) in the bev frame. found: (M,) bool. colors: (M, 3)
     uint8.
     """
     pale = np.insert(colors[found], 3, 150, axis=1)
-    for entity, chosen, color in (
-        (entities.GROUND_TRUTH, found, pale),
-        (entities.MISSED, ~found, entities.MISSED_COLOR),
+    for entity, entity_bev, chosen, color in (
+        (entities.GROUND_TRUTH, entities.BEV_GROUND_TRUTH, found, pale),
+        (entities.MISSED, entities.BEV_MISSED, ~found, entities.MISSED_COLOR),
     ):
-        boxes = in_world[chosen]
+        boxes, strips = in_world[chosen], footprints(corners_bev[chosen])
         log(stream, entity, _solid(boxes, colors=color, radii=THIN) | any_values(name=boxes.classes))
-    for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         doubled = np.tile(np.insert(colors[chosen], 3, 200, axis=1), (2, 1))
-        strips = footprints(corners_bev[chosen])
-        log(stream, entity, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
+        log(stream, entity_bev, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
 def footprints(corners: Array) -> pa.Array:
@@ -261,7 +256,7 @@ def _marks(corners: Array, marks: Marks) -> list[tuple[NDArray[np.float32], Colo
 
 
 def log_class_mesh(stream: rr.RecordingStream, name: str, boxes: Boxes3D) -> None:
-    """Writes where the mesh of a class stands: one in each box of the class. boxes: in the recording's world."""
+    """Write where the mesh of a class stands: one in each box of the class. boxes: in the recording's world."""
     # The last one has no size: an entity without poses would show its mesh at the origin.
     poses = components(
         rr.InstancePoses3D,
@@ -273,7 +268,7 @@ def log_class_mesh(stream: rr.RecordingStream, name: str, boxes: Boxes3D) -> Non
 
 
 def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, before: Array | None) -> None:
-    """Writes the vehicle's position, and the way from its position in the frame before.
+    """Write the vehicle's position, and the way from its position in the frame before.
 
     here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
     """
@@ -288,7 +283,7 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
 
 
 def log_boxes_on_map(stream: rr.RecordingStream, origin: GeoOrigin, centers: Array, colors: np.ndarray | None) -> None:
-    """Writes the centres (N, 3) of boxes in the sequence's world frame. colors: (N, 3) uint8, None for no boxes."""
+    """Write the centres (N, 3) of boxes in the sequence's world frame. colors: (N, 3) uint8, None for no boxes."""
     places = origin.latitude_longitude(centers)
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))
 
@@ -310,7 +305,7 @@ class TrackHistory:
     shown: list[str] = field(default_factory=list)
 
     def add(self, identities: list[str], feet: Array, stamp: FrameStamp) -> None:
-        """Adds the positions of T tracks, and forgets what is too old. feet: (T, 3), in the recording's world."""
+        """Add the positions of T tracks, and forget what is too old. feet: (T, 3), in the recording's world."""
         if stamp.scene != self.scene:
             self.times_ns, self.positions = {}, {}
         self.scene = stamp.scene
@@ -323,6 +318,11 @@ class TrackHistory:
             if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
                 del self.times_ns[name], self.positions[name]
 
+    def trail(self, name: str) -> list[Array]:
+        """The line (K, 3) of a track's positions, in a list; an empty list for a single position."""
+        past = self.positions[name]
+        return [np.array(past)] if len(past) > 1 else []
+
 
 def log_tracks(
     stream: rr.RecordingStream,
@@ -333,7 +333,7 @@ def log_tracks(
     stamp: FrameStamp,
     bev_from_world: Array,
 ) -> None:
-    """Writes the tracks of a frame, and clears the entities of tracks without a box. Without tracks: nothing.
+    """Write the tracks of a frame, and clear the entities of tracks without a box. Without tracks: nothing.
 
     history: gets the boxes. boxes: N in the recording's world. corners: (N, 8, 3). colors: (N, 3). bev_from_world:
     (4, 4).
@@ -343,40 +343,32 @@ def log_tracks(
     # Anew in each scene: the times of a scene may lie before those of the one before.
     styled = history.shown if stamp.scene == history.scene else []
     tracked = boxes.instances != ""
-    identities, classes = boxes.instances[tracked].tolist(), boxes.classes[tracked].tolist()
-    centers, velocities = boxes.centers[tracked], np.nan_to_num(boxes.velocities[tracked])
-    feet = np.column_stack([centers[:, :2], centers[:, 2] - boxes.sizes_lwh[tracked, 2] / 2 + ABOVE_GROUND_M])
+    identities, boxes = boxes.instances[tracked].tolist(), boxes[tracked]
+    feet = boxes.centers - boxes.sizes_lwh[:, 2:] / 2 * (0, 0, 1) + (0, 0, ABOVE_GROUND_M)
     history.add(identities, feet, stamp)
-    feet_later = feet + np.column_stack([velocities, np.zeros(len(feet))]) * AHEAD_S
+    feet_later = feet + np.pad(np.nan_to_num(boxes.velocities), ((0, 0), (0, 1))) * AHEAD_S
     ahead = np.stack([feet, feet_later], axis=1)  # (T, 2, 3)
     outlines = corners[tracked][:, [0, 1, 2, 3, 0]] + [0, 0, ABOVE_GROUND_M]  # (T, 5, 3) closed
-    pasts = [history.positions[name] for name in identities]
-    trails = [np.array(past if len(past) > 1 else []).reshape(-1, 3) for past in pasts]  # (K, 3) each
-    no_points = np.zeros((0, 3))
-    points = [part for of_track in zip(ahead, outlines, trails, strict=True) for part in of_track]
-    lengths = [length for trail in trails for length in (2, 5, len(trail)) if length]
-    of_tracks, start = line_strips(np.concatenate([no_points, *points]), lengths), 0
-    shown: set[str] = set()
+    entity_of = dict(zip(identities, map(entities.track, boxes.classes.tolist(), identities), strict=True))
+    on_ground: list[Array] = []
     flat_colors: list[tuple[int, ...]] = []
-    for name, class_name, color, trail in zip(identities, classes, colors[tracked].tolist(), trails, strict=True):
-        count = 3 if len(trail) else 2
-        entity = entities.track(class_name, name)
-        row = components(rr.LineStrips3D, strips=of_tracks.slice(start, count))
-        own_colors = [(*color, opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+    for name, color, way, outline in zip(identities, colors[tracked].tolist(), ahead, outlines, strict=True):
+        entity, trail = entity_of[name], history.trail(name)
+        line_colors = [(*color, opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+        lines = [way, outline, *trail]
+        row = components(rr.LineStrips3D, strips=line_strips(np.concatenate(lines), list(map(len, lines))))
         if entity not in styled:  # what stays is written once: its bytes are more than those of the points
-            row |= components(rr.LineStrips3D, colors=np.array(own_colors, np.uint8), radii=TRAIL_WIDTH)
+            row |= components(rr.LineStrips3D, colors=np.array(line_colors, np.uint8), radii=TRAIL_WIDTH)
             row |= any_values(track=name)
         log(stream, entity, row)
-        shown.add(entity)
-        start += count
-        flat_colors += own_colors[: count - 1]
-    points = [part for of_track in zip(ahead, trails, strict=True) for part in of_track]
-    flat = apply(bev_from_world, np.concatenate([no_points, *points]))[:, :2] * (1, -1)
-    lengths = [length for trail in trails for length in (2, len(trail)) if length]
+        on_ground += [way, *trail]
+        flat_colors += line_colors[: 1 + len(trail)]
     of_strips = np.array(flat_colors, np.uint8) if flat_colors else None
-    strips = line_strips(flat, lengths)
+    flat = apply(bev_from_world, np.concatenate(on_ground or [np.zeros((0, 3))]))[:, :2] * (1, -1)
+    strips = line_strips(flat, [len(line) for line in on_ground])
     of_bev = components(rr.LineStrips2D, strips=strips, colors=of_strips, radii=THIN, draw_order=25)
     log(stream, entities.BEV_TRACKS, of_bev)
+    shown = set(entity_of.values())
     for entity in set(history.shown) - shown:
         stream.log(entity, rr.Clear(recursive=False))
     history.shown = sorted(shown)

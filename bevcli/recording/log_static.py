@@ -63,8 +63,6 @@ OF_A_MODEL = """\
 """
 LEGEND_COLUMNS = 2
 COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
-TEXT_COLOR: Color = (225, 228, 235)
-RING_LABEL_COLOR: Color = (150, 156, 170)
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
 WHEELBASE, TRACK = 2.75, 1.64
@@ -260,7 +258,9 @@ def log_scene(
     )
     # The labels are on the circles, ahead to the right, where they cover little.
     positions = [bev_image_points(rig, ring[[105]])[0] for ring in rings]
-    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=RING_LABEL_COLOR, draw_order=6)
+    labels = labels_2d(
+        positions, [f"{distance} m" for distance in distances], colors=entities.RING_LABEL_COLOR, draw_order=6
+    )
     log(stream, f"{entities.BEV_RINGS}/labels", labels, static=True)
 
 
@@ -335,7 +335,9 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     texts, colors_of_entries = zip(*legend, strict=True)
     circles = rr.Points2D(spots + (0.7, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
     stream.log(f"{entities.LEGEND}/colors", circles, static=True)
-    labels = labels_2d(spots + (5.0, -0.25), list(texts), colors=TEXT_COLOR)  # a label is drawn below its point
+    labels = labels_2d(
+        spots + (5.0, -0.25), list(texts), colors=entities.TEXT_COLOR
+    )  # a label is drawn below its point
     log(stream, f"{entities.LEGEND}/texts", labels, static=True)
 
 
@@ -413,4 +415,4 @@ def line_entries(config: ModelConfig | None) -> list[tuple[str, Color]]:
     if config is None:
         return []
     of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
-    return [*of_results, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
+    return [*of_results, *([("futures: colour of the box", entities.TEXT_COLOR)] if config.future_times_s else [])]

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from bevcli.errors import BevcliError, InputError
+from bevcli.geometry.boxes import SHOWN_SCORE
 from bevcli.options import option, options
 
 Images = Literal["jpeg", "av1"]
@@ -52,7 +53,7 @@ class RecordingOptions:
     )
     bev: str = option(default="pca", help="How the BEV features are drawn: norm, pca, channel:K or none.")
     score: float = option(
-        default=0.25,
+        default=SHOWN_SCORE,
         help="Hide and do not count boxes scored below this; predictions.json keeps all of them.",
         panel="Output",
         minimum=0,

@@ -28,7 +28,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.components import log
-from bevcli.recording.entities import colormap
+from bevcli.recording.entities import GROUND_GRID_COLOR, HORIZON_COLOR, PILLAR_COLOR, colormap
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
 from bevcli.viewer.drawing import FONT, Canvas, draw_lines
@@ -38,9 +38,6 @@ GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
 PILLAR_LINES_M = 25.0  # lines of farther pillars would be too dense
 PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m; a denser grid would hide the image
 LABELLED_M = (5.0, 10.0, 20.0, 40.0)
-GROUND: Color = (120, 205, 140)
-HORIZON: Color = (255, 214, 64)
-PILLAR: Color = (235, 238, 245)
 BACKDROP: Color = (44, 49, 58)
 
 
@@ -120,9 +117,9 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Canvas | None, 
     else:
         resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
         canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
-    draw_lines(canvas, ground_lines(shown), GROUND, opacity=0.55, bits=4)
-    draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 2, 0.9, 4)
-    draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, opacity=0.35, bits=4)
+    draw_lines(canvas, ground_lines(shown), GROUND_GRID_COLOR, opacity=0.55, bits=4)
+    draw_lines(canvas, visible_runs(horizon(shown)), HORIZON_COLOR, 2, 0.9, 4)
+    draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR_COLOR, opacity=0.35, bits=4)
     for pixel, distance, color in zip(*pillars_in(shown, ego_from_bev), strict=True):
         radius = float(np.clip(60 / distance, 1.2, 6)) * (width / 800)
         center = tuple(np.round(pixel * 16).astype(int).tolist())
@@ -277,8 +274,12 @@ def _write_legend(axes: Axes) -> None:
     style: dict[str, Any] = {"marker": "o", "linestyle": "none"}
     dots = [Line2D([], [], color=color, label=text, **style) for color, text in zip(colors, texts, strict=True)]
     lines = [
-        Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="horizon: infinitely far, at the camera's height"),
-        Line2D([], [], color=tuple(np.array(GROUND) / 255), label="ground grid of 5 m: should lie on the road"),
+        Line2D(
+            [], [], color=tuple(np.array(HORIZON_COLOR) / 255), label="horizon: infinitely far, at the camera's height"
+        ),
+        Line2D(
+            [], [], color=tuple(np.array(GROUND_GRID_COLOR) / 255), label="ground grid of 5 m: should lie on the road"
+        ),
     ]
     axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.94), labelspacing=0.9, **LEGEND_STYLE)
 
@@ -422,9 +423,9 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
     dots = rr.Points2D(points, colors=colors, radii=radii, draw_order=30)
     stream.log(entities.overlay(camera.name, "pillars"), dots, static=True)
     for kind, lines, color, width in (
-        ("ground_grid", ground_lines(camera), (*GROUND, 120), 0.6),
-        ("pillar_lines", pillar_lines(camera, ego_from_bev), (*PILLAR, 90), 0.6),
-        ("horizon", visible_runs(horizon(camera)), HORIZON, 1.0),
+        ("ground_grid", ground_lines(camera), (*GROUND_GRID_COLOR, 120), 0.6),
+        ("pillar_lines", pillar_lines(camera, ego_from_bev), (*PILLAR_COLOR, 90), 0.6),
+        ("horizon", visible_runs(horizon(camera)), HORIZON_COLOR, 1.0),
     ):
         inside = [part for line in lines for part in _clipped(line, camera)]
         strips = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)

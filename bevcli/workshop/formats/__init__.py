@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from bevcli.geometry.boxes import SHOWN_SCORE
 from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.sequences.format import Format
@@ -102,7 +103,7 @@ class WriteOptions:
         reads="path", default=None, help="mcap: also write the boxes of this run (a folder or predictions.json)."
     )
     score: float = option(
-        default=0.25, help="mcap: leave out boxes of the run scored below this.", minimum=0, maximum=1
+        default=SHOWN_SCORE, help="mcap: leave out boxes of the run scored below this.", minimum=0, maximum=1
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import ClassRanges, ranges_m
+from bevcli.geometry.matching import MATCH_DISTANCE_M, ClassRanges, ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import aligned, number
@@ -35,7 +35,7 @@ class TrackingConfig(ClassRanges):
     """
 
     class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _tracked_ranges_m(NUSCENES_CLASSES))
-    match_distance_m: float = 2.0
+    match_distance_m: float = MATCH_DISTANCE_M
     recall_levels: int = 40
     min_recall: float = 0.1
     frame_period_s: float = 0.5

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import SHOWN_SCORE, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import ObjectClass
@@ -39,7 +39,6 @@ from bevcli.writing import user_cache
 STREETS = (1_000_300, 1_000_313, 1_000_314, 1_000_315)  # busy ones, of three kinds of light, for evaluation only
 FRAMES = 4  # of each street
 SECTORS, RING_M = 16, 8.0  # of the polar map
-SHOWN_SCORE = 0.25  # boxes from this score on are shown by default
 RESAMPLES = 400
 FORMAT = "rig-gap/1"  # of what is kept
 MOST_EVERY = 4  # frames of the model's rate from one to the next, at a lower image rate

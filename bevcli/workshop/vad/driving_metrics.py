@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from shapely import LineString
 
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.matching import MATCH_DISTANCE_M
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.formats.map_lines import MapLines
 
@@ -135,7 +136,6 @@ def _scores(lines: MapLines, name: str) -> Array:
 # Forecasts: EPA, minADE, minFDE and miss rate, after ViP3D (Gu et al. 2023). A forecast counts only where its object
 # was found: detections and true objects are matched first.
 MIN_SCORE = 0.6
-MATCH_M = 2.0  # centres of detection and object
 HIT_M = 2.0  # last place of the best mode
 FALSE_POSITIVE_SHARE = 0.5
 UNMATCHABLE = 1e6
@@ -197,10 +197,10 @@ def match(predicted: Boxes3D, truth: Boxes3D) -> NDArray[np.int64]:
     distance = np.linalg.norm(predicted.centers[:, None, :2] - truth.centers[:, :2], axis=-1)
     distance[~_moves(predicted)] = UNMATCHABLE
     distance[:, ~_moves(truth)] = UNMATCHABLE
-    distance[distance > MATCH_M] = UNMATCHABLE
+    distance[distance > MATCH_DISTANCE_M] = UNMATCHABLE
     result = np.full(len(truth), -1)
     rows, columns = linear_sum_assignment(distance)
-    near = distance[rows, columns] <= MATCH_M
+    near = distance[rows, columns] <= MATCH_DISTANCE_M
     result[columns[near]] = rows[near]
     return result
 
