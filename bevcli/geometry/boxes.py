@@ -13,6 +13,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
 IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes3D.possible` leaves out
+SHOWN_SCORE = 0.25  # boxes scored below this are not shown, unless another limit is asked for
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,6 @@ _KEYS = [column.key for column in OPTIONAL_COLUMNS.values()]
 TABLE_COLUMNS = ("class", _KEYS[0], *NUMBERS, *_KEYS[1:])  # class, score, x, …, vy, attribute, …
 
 # The twelve edges of `Boxes3D.corners`, as pairs of corner indices.
-SHOWN_SCORE = 0.25  # boxes scored below this are not shown, unless another limit is asked for
 BOX_EDGES = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
 )  # fmt: skip
