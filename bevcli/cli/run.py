@@ -62,10 +62,10 @@ def run(
         from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.rig.sequence_checks import CheckedDrive
-        from bevcli.rig.standing_check import IMAGES_MOVE, StandingCheck
         from bevcli.runs.run_into_folder import run_into_folder
         from bevcli.sequences.format import format_of
         from bevcli.sequences.open import open_sequence
+        from bevcli.workshop.checks.standing_check import IMAGES_MOVE, StandingCheck
 
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either

@@ -17,7 +17,7 @@ from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import write_boxes
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader, read_recording, summarise
-from bevcli.workshop.video.video import CameraImages, draw_frame, frame_rate, tiles
+from bevcli.workshop.video.video import RecordedImages, draw_frame, frame_rate, tiles
 
 READ = (entities.WORLD, entities.EGO, entities.BOXES, entities.RUN, entities.SPEED, "world/cameras", "bev")
 
@@ -67,7 +67,7 @@ def _read(path: Path) -> list[dict]:
             summarise(path, file)
         finally:
             frame_rate(file)
-            images = CameraImages()
+            images = RecordedImages()
             for frame in RecordingReader(file).frames():
                 draw_frame(frame, tiles(frame), images)
     return json.loads(out.read_bytes())["frames"]

@@ -18,7 +18,7 @@ from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
-from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
 
 TIMES = np.array([0.5, 1.0])
 LINES = MapLines(
@@ -117,7 +117,7 @@ def test_a_video_shows_the_lines_in_their_colours(frames: list[RecordedFrame]) -
     divider = line_colors(["divider"])["divider"][::-1]
     counts = []
     for frame in frames:
-        from_above = draw_frame(frame, tiles(frame), CameraImages())[:, 1280:].astype(int)
+        from_above = draw_frame(frame, tiles(frame), RecordedImages())[:, 1280:].astype(int)
         counts.append((np.abs(from_above - divider).max(-1) < 60).sum())
     assert counts[0] > 50
     assert counts[1] == 0

@@ -22,7 +22,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
 from bevcli.workshop.scores.record import names_of, record
-from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
 
 CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS
@@ -176,7 +176,7 @@ def test_the_summary_and_the_video_name_both_models(two):
     [frame] = frames_of(two)
     assert "memory · a/b c · new" in summarise(two)
     assert "  boxes     4\n          3 a/b c\n          1 new\n" in summarise(two)
-    canvas = draw_frame(frame, tiles(frame), CameraImages()).astype(int)
+    canvas = draw_frame(frame, tiles(frame), RecordedImages()).astype(int)
     for own in (ORANGE, VIOLET):
         near = np.abs(canvas - own[::-1]).sum(-1) < 30
         assert near[:500, :1280].any()

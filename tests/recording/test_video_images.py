@@ -11,7 +11,7 @@ from bevcli.recording import entities, log_cameras, options
 from bevcli.recording.log_cameras import Av1Encoder
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video.video import Av1Decoder, CameraImages
+from bevcli.workshop.video.video import Av1Decoder, RecordedImages
 
 with_av = pytest.mark.skipif(not options.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
 
@@ -49,7 +49,7 @@ def test_the_images_of_a_recording_come_back(tmp_path):
 
     drive = Street(4)
     record(tmp_path / "av1.rrd", drive, RecordingOptions(images="av1"))
-    images = CameraImages()
+    images = RecordedImages()
     for place, frame in enumerate(RecordingReader(tmp_path / "av1.rrd").frames()):
         assert not frame.has(entities.image("CAM_BACK"), "EncodedImage:blob")
         assert cv2.PSNR(images.image(frame, "CAM_BACK"), scene(place)) > 33
@@ -58,7 +58,7 @@ def test_the_images_of_a_recording_come_back(tmp_path):
 @with_av
 def test_a_dropped_image_starts_a_new_stream(tmp_path):
     record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=4), RecordingOptions(images="av1"))
-    images, shown, keyframes = CameraImages(), [], []
+    images, shown, keyframes = RecordedImages(), [], []
     for frame in RecordingReader(tmp_path / "r.rrd").frames():
         shown.append(images.image(frame, "CAM_BACK") is not None)
         keyframes.append(frame.values(entities.image("CAM_BACK"), "VideoStream:is_keyframe"))

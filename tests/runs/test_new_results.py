@@ -19,7 +19,7 @@ from bevcli.recording import entities
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
 
 RED = (255, 0, 0)
 
@@ -74,5 +74,5 @@ def test_a_new_result_has_a_file_a_drawing_and_a_legend(mini_config, tmp_path):
         (line,) = frame.strips(f"{entities.BEV}/stop_line", "LineStrips2D:strips")
         np.testing.assert_allclose(line, [[-2, -10], [2, -10]], atol=1e-3)
         assert frame.texts(entities.RUN, "line_names")[0] == "stop line"
-        from_above = draw_frame(frame, tiles(frame), CameraImages())[:, 1280:].astype(int)
+        from_above = draw_frame(frame, tiles(frame), RecordedImages())[:, 1280:].astype(int)
         assert (np.abs(from_above - RED[::-1]).max(-1) < 60).sum() > 10

@@ -16,7 +16,7 @@ from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
-from bevcli.workshop.video.video import CameraImages, draw_frame, tiles
+from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_a_foreign_column_is_refused_in_one_line(recording, entity, component, v
 
 def read_all(frame):
     recorded_boxes(frame)
-    draw_frame(frame, tiles(frame), CameraImages())
+    draw_frame(frame, tiles(frame), RecordedImages())
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ class Av1Decoder:
         return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None
 
 
-class CameraImages:
+class RecordedImages:
     """The images of a recording: call `image` once for each camera of each frame, in order."""
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ def _camera_yaws(frame: RecordedFrame) -> dict[str, float]:
     return yaws
 
 
-def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: CameraImages) -> Canvas:
+def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedImages) -> Canvas:
     """The video frame, (HEIGHT, WIDTH, 3) uint8 BGR.
 
     layout: where each camera's image goes. images: decodes them; frames must come in order.
@@ -389,7 +389,7 @@ def frame_rate(recording: Path) -> tuple[int, float]:
 
 def _images(recording: Path) -> Iterator[np.ndarray]:
     layout: tuple[Tile, ...] = ()
-    images = CameraImages()
+    images = RecordedImages()
     for frame in RecordingReader(recording).frames():
         layout = layout or tiles(frame)
         yield draw_frame(frame, layout, images)

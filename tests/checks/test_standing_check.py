@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from command_line import MINI_TOML, command
 
-from bevcli.rig.standing_check import StandingCheck
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.checks.standing_check import StandingCheck
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 
