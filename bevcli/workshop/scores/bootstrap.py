@@ -70,8 +70,8 @@ def _score(copies, scores, hits, errors, truth_count, error_row, limits, recalls
         precision, at = _curve(copies, seen, scores, hits[row], truth_count, recalls)
         aps[row] = np.maximum(precision[first:] - min_precision, 0.0).mean() / (1 - min_precision)
         if row == error_row:
-            for place in range(len(errors)):
-                means[place] = _mean_error(copies, scores, hits[row], errors[place], at, first)
+            for index in range(len(errors)):
+                means[index] = _mean_error(copies, scores, hits[row], errors[index], at, first)
     return aps, means
 
 
@@ -79,7 +79,7 @@ def _score(copies, scores, hits, errors, truth_count, error_row, limits, recalls
 def _curve(copies, seen, scores, hits, truth_count, recalls):  # type: ignore[no-untyped-def]
     """Precision and score at the recalls (101,) each: between two true positives, those before and at the second."""
     precision, at = np.zeros(len(recalls)), np.zeros(len(recalls))
-    found, place = 0, 0
+    found, index = 0, 0
     for hit in hits:
         for copy in range(copies[hit]):
             before = seen[hit] - copies[hit] + copy  # predictions
@@ -87,24 +87,24 @@ def _curve(copies, seen, scores, hits, truth_count, recalls):  # type: ignore[no
             if before:
                 last_precision, last_score = found / before, scores[hit if copy else _last(copies, hit)]
             start, end, new = found / truth_count, (found + 1) / truth_count, (found + 1) / (before + 1)
-            while place < len(recalls) and recalls[place] < end:
-                share = (recalls[place] - start) / (end - start)
-                precision[place] = last_precision + share * (new - last_precision)
-                at[place] = last_score + share * (scores[hit] - last_score)
-                place += 1
+            while index < len(recalls) and recalls[index] < end:
+                share = (recalls[index] - start) / (end - start)
+                precision[index] = last_precision + share * (new - last_precision)
+                at[index] = last_score + share * (scores[hit] - last_score)
+                index += 1
             found += 1
-    if found and place < len(recalls) and recalls[place] == found / truth_count:
-        precision[place], at[place] = found / seen[-1], scores[_last(copies, len(copies))]
+    if found and index < len(recalls) and recalls[index] == found / truth_count:
+        precision[index], at[index] = found / seen[-1], scores[_last(copies, len(copies))]
     return precision, at
 
 
 @njit(nogil=True)
 def _last(copies, end):  # type: ignore[no-untyped-def]
     """The last prediction before `end` that counts."""
-    place = end - 1
-    while not copies[place]:
-        place -= 1
-    return place
+    index = end - 1
+    while not copies[index]:
+        index -= 1
+    return index
 
 
 @njit(nogil=True)

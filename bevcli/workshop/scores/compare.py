@@ -193,7 +193,7 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
     """The frames, the classes and the range that both models have, and notes about what is left out."""
     notes = []
     keys = [[(true.stamp, true.extras.get("sample_token")) for true in model.pairs.ground_truth] for model in models]
-    places = [{key: place for place, key in enumerate(own)} for own in keys]
+    places = [{key: index for index, key in enumerate(own)} for own in keys]
     common = [key for key in keys[0] if key in places[1]]
     if not common:
         raise InputError("the two predictions have no frame of the ground truth in common: choose two of one drive")
@@ -227,8 +227,8 @@ def _at(model: Compared, places: list[int]) -> Compared:
     pairs = model.pairs
     kept = replace(
         pairs,
-        predictions=tuple(pairs.predictions[place] for place in places),
-        ground_truth=tuple(pairs.ground_truth[place] for place in places),
+        predictions=tuple(pairs.predictions[index] for index in places),
+        ground_truth=tuple(pairs.ground_truth[index] for index in places),
         reference_from_ego=pairs.reference_from_ego[places],
     )
     assert model.predictions is not None

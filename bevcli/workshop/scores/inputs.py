@@ -233,7 +233,7 @@ def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D |
     """
     if predictions.frame_of_reference == "world" and not drive.has_ego_motion:
         raise InputError("the boxes are in the world frame, and the drive has no ego-motion (expected boxes in ego)")
-    frames = tuple(_true_boxes(drive.ground_truth_frame(place)) for place in range(len(drive.stamps)))
+    frames = tuple(_true_boxes(drive.ground_truth_frame(index)) for index in range(len(drive.stamps)))
     pairs = pair_frames(predictions, BoxesFile("world", frames))
     found = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
     return [found.get(stamp) for stamp in drive.stamps], pairs

@@ -108,9 +108,9 @@ def draw_both(tables: Sequence[ScoreTable], files: Sequence[Path]) -> Figure:
         _draw_remark(axes, f"{counted(counts[name], 'boxes')}, AP: A {of_a:.2f}, B {of_b:.2f}")
     lines, distances = panels[0, 0].get_legend_handles_labels()
     half = len(lines) // 2
-    order = [place for pair in zip(range(half), range(half, 2 * half), strict=True) for place in pair]  # A above B
-    labels = [f"{MODELS[place // half]}  {distances[place]}" for place in order]
-    figure.legend([lines[place] for place in order], labels, loc="upper right", ncols=half, frameon=False)
+    order = [index for pair in zip(range(half), range(half, 2 * half), strict=True) for index in pair]  # A above B
+    labels = [f"{MODELS[index // half]}  {distances[index]}" for index in order]
+    figure.legend([lines[index] for index in order], labels, loc="upper right", ncols=half, frameon=False)
     return figure
 
 

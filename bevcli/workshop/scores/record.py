@@ -68,9 +68,9 @@ def record(
     options = RecordingOptions(level="minimal") if score is None else RecordingOptions(level="minimal", score=score)
     labelled = 0
     with Recording(path, drive, _recorded(drive, inputs), options) as recording:
-        for place in range(len(drive.stamps)):
-            frame = drive.load(place)
-            recording.log(frame, [boxes[place] for boxes in of_frames])
+        for index in range(len(drive.stamps)):
+            frame = drive.load(index)
+            recording.log(frame, [boxes[index] for boxes in of_frames])
             labelled += frame.ground_truth is not None
             on_frame(frame)
     if labelled < len(drive.stamps):
@@ -159,5 +159,5 @@ def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
 
 def _label_counts(drive: Drive) -> Counter[str]:
     """The number of labels by class."""
-    truths = (drive.ground_truth_frame(place).ground_truth for place in range(len(drive.stamps)))
+    truths = (drive.ground_truth_frame(index).ground_truth for index in range(len(drive.stamps)))
     return count_classes(boxes for boxes in truths if boxes is not None)

@@ -70,8 +70,8 @@ class WorstFrames:
         if len(self.missed) == 1:
             return {"missed": self._largest(self.missed[0]), "invented": self._largest(self.invented[0])}
         lists = {
-            f"{model.lower()}_{kind}": self._largest(counts[place])
-            for place, model in enumerate(MODELS)
+            f"{model.lower()}_{kind}": self._largest(counts[index])
+            for index, model in enumerate(MODELS)
             for kind, counts in (("missed", self.missed), ("invented", self.invented))
         }
         mistakes = self.missed + self.invented
