@@ -6,8 +6,11 @@ import pytest
 from healthy_rigs import HEALTHY, SIX, copy_of
 from mistakes import (
     BEV_MISTAKES,
+    FIELD_MISTAKES,
     LENS_MISTAKES,
+    LENS_WARNINGS,
     POSE_MISTAKES,
+    both_rotations,
     inverted,
     millimetres,
     pose_of,
@@ -59,7 +62,7 @@ def test_the_real_nuscenes_calibration_gives_no_error(shared):
         assert [finding.code for finding in report.findings if finding.severity != "info"] == []
 
 
-@pytest.mark.parametrize(("code", "mistake"), POSE_MISTAKES)
+@pytest.mark.parametrize(("code", "mistake"), [*POSE_MISTAKES, ("rotation-twice", both_rotations)])
 @pytest.mark.parametrize(
     "camera", ["CAM_FRONT_LEFT", "CAM_BACK", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
 )
@@ -107,13 +110,21 @@ def test_a_rounded_quaternion_has_the_wrong_norm(tmp_path):
     assert (error.code, error.camera) == ("quaternion-norm", "CAM_FRONT_LEFT")
 
 
-@pytest.mark.parametrize(("code", "mistake"), LENS_MISTAKES)
+@pytest.mark.parametrize(("code", "mistake"), [*LENS_MISTAKES, *FIELD_MISTAKES])
 @pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_BACK"])
 def test_one_camera_with_a_wrong_lens_is_named(code, mistake, camera, tmp_path):
     document = copy_of("six")
     mistake(document["cameras"][camera])
     errors = errors_in(document, tmp_path)
     assert [(error.code, error.camera) for error in errors] == [(code, camera)]
+
+
+@pytest.mark.parametrize(("code", "mistake"), LENS_WARNINGS)
+def test_an_unusual_lens_is_a_warning(code, mistake, tmp_path):
+    document = copy_of("six")
+    mistake(document["cameras"]["CAM_FRONT"])
+    findings = report_of(document, tmp_path).findings
+    assert (code, "warning", "CAM_FRONT") in {(found.code, found.severity, found.camera) for found in findings}
 
 
 def test_the_message_names_the_image_size_of_the_intrinsics(tmp_path):
