@@ -22,9 +22,8 @@ from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, w
 from bevcli.rig.sequence_checks import check_scenes
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.format import format_of, is_drive
-from bevcli.sequences.native import FORMAT as NATIVE
+from bevcli.sequences.native import FORMAT as NATIVE, FolderOptions
 from bevcli.sequences.native.folder import FolderDrive, read_frames_table
-from bevcli.sequences.native.options import FolderOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions, RigOptions
 from bevcli.writing import write_whole

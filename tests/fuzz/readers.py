@@ -35,7 +35,7 @@ def _drive(folder: Path) -> None:
 
 
 def _unlisted(folder: Path) -> None:
-    from bevcli.sequences.native.unlisted import find_frames
+    from bevcli.workshop.formats.unlisted import find_frames
 
     find_frames(folder / "drive", ("CAM_FRONT", "CAM_BACK"))
 

@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.format import GROUP, format_of, formats, option_classes
-from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 
@@ -32,7 +32,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.images import AT_REST
-from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.options import RigOptions
 
 

@@ -24,7 +24,7 @@ from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
-from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.options import EgoMotionUse, InputOptions
 
 BOXES_FILE = "ground_truth.json"
@@ -61,7 +61,7 @@ class FolderDrive(ListedDrive):
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
         self.understood, advice = "", "add ego-motion, or remove the frame"
         if not entries:
-            from bevcli.sequences.native.unlisted import covered, find_frames
+            from bevcli.workshop.formats.unlisted import covered, find_frames
 
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             found = find_frames(path, rig.names, own, motion, has_poses=has_poses)

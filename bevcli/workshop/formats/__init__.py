@@ -12,7 +12,7 @@ from bevcli.geometry.boxes import SHOWN_SCORE
 from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.sequences.format import Format
-from bevcli.sequences.native.options import FolderOptions
+from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.options import FormatOptions, RigOptions
 
 # Any of these makes a folder a log of Argoverse 2, so that an incomplete one gets an error that names the missing file.

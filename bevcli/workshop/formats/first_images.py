@@ -8,8 +8,8 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.parsing.documents import CSV_BYTES, name_of
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text, size_of_image
-from bevcli.sequences.native.camera_names import match_names
 from bevcli.sequences.videos import size_of_video
+from bevcli.workshop.formats.camera_names import match_names
 
 LARGEST_IMAGE = 256 * MIB
 OTHERS = ("frame", "scene", "timestamp_ns")  # columns of frames.csv that are no cameras

@@ -25,8 +25,8 @@ from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
-from bevcli.sequences.native.name_times import SINCE_1970_NS, UNITS_NS, WORDS
-from bevcli.sequences.native.options import TimeKind
+from bevcli.sequences.native import TimeKind
+from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")

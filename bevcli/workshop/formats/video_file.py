@@ -8,12 +8,12 @@ from bevcli.frame import FrameStamp
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
 from bevcli.sequences.images import FrameEntry, ListedDrive, bev_frame_notes
+from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.native.folder import check_covered
-from bevcli.sequences.native.options import FolderOptions
-from bevcli.sequences.native.unlisted import covered, video_images
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import rotation_notes
 from bevcli.workshop.formats.calibrations import SEVERAL
+from bevcli.workshop.formats.unlisted import covered, video_images
 
 
 def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDrive:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.sequences.native.options import TimeKind
+from bevcli.sequences.native import TimeKind
 
 Times = NDArray[np.int64]
 Texts = Mapping[str, Sequence[str]]  # by camera, one of each image
@@ -93,18 +93,19 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
     dates = _dates(names)
     if dates is not None and (_has_rate(dates.values) or not _steps(dates.values)):
         return _in_time_zone(dates, motion)
-    found = [readings for column in columns if (readings := _readings(column))]
-    if not found:
+    candidates = [readings for column in columns if (readings := _readings(column))]
+    if not candidates:
         first = next(iter(names.values()))
         raise InputError(
             f"{where}: the names {first[0]} to {first[-1]} are no times of a camera in any unit (expected 0.5 to 240 "
             "images per second) and no different indices: state their unit by `times` (`--times`), or list the images "
             "in frames.csv"
         )
-    alone = [readings[0] for readings in found if len(readings) == 1]
-    known = [reading for reading in alone if reading.is_known_origin]
-    times = [reading for reading in alone if reading.kind != "index"]
-    return (known or times or alone or [_decided(where, names, found[0], motion)])[0]
+    sure = [readings[0] for readings in candidates if len(readings) == 1]
+    if not sure:
+        return _decided(where, names, candidates[0], motion)
+    # A time since 1970 goes before another time, and this before an index.
+    return min(sure, key=lambda reading: (not reading.is_known_origin, reading.kind == "index"))
 
 
 def _decided(where: Path, names: Texts, readings: list[Reading], motion: EgoMotion | None) -> Reading:

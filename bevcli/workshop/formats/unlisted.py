@@ -23,11 +23,11 @@ from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
-from bevcli.sequences.native.camera_names import match_names, renamed
-from bevcli.sequences.native.matching import CameraImages, Matched, match, measured_periods
-from bevcli.sequences.native.name_times import NUMBER, Reading, read_names
-from bevcli.sequences.native.options import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
+from bevcli.sequences.native import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
 from bevcli.sequences.videos import count_and_rate
+from bevcli.workshop.formats.camera_names import match_names, renamed
+from bevcli.workshop.formats.matching import CameraImages, Matched, match, measured_periods
+from bevcli.workshop.formats.name_times import NUMBER, Reading, read_names
 
 FILE_NAME = "timing.toml"
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
