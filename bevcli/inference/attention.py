@@ -3,7 +3,6 @@
 import math
 from contextlib import ExitStack
 from dataclasses import dataclass
-from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from bevcli.frame import AttentionView, CameraSamples, Probe
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.inference.preprocess import resize_shift
 from bevcli.model.config import ModelConfig
-from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.encoder import EncoderLayer
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
@@ -72,10 +71,9 @@ class AttentionProbe(ExitStack):
             (spatial, self._see_hits),
         ):
             self.enter_context(module.register_forward_hook(see))
-        # As in the plain model: faster classes compute no sampling locations.
-        for part, kind in ((temporal, TemporalSelfAttention), (spatial, SpatialCrossAttention)):
-            vars(part)["sample"] = MethodType(vars(kind)["sample"], part)
-            self.callback(vars(part).pop, "sample")
+        for sampling in (temporal.attention.sampling, spatial.attention.sampling):
+            self.callback(setattr, sampling, "sample_hits", sampling.sample_hits)
+            sampling.sample_hits = None  # which computes no locations
         return self
 
     def _see_temporal_samples(self, _module: object, arguments: tuple[Any, ...], sampled: Tensor) -> None:

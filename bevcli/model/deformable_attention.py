@@ -7,8 +7,9 @@ sum of weights · samples of each head -> output_projection -> result     o: the
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -35,6 +36,35 @@ class FeatureMaps:
     def scaled(self, scale: Tensor, shift: Tensor) -> "FeatureMaps":
         """The tokens times the scale plus the shift, in their dtype. scale, shift: (G, S, C) float32."""
         return FeatureMaps(torch.addcmul(shift, self.tokens, scale).to(self.tokens.dtype), self.level_shapes)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The M pairs of a value map and a query that samples it, ordered by map.
+
+    Attributes:
+        query: (M,) int64, index of the query in B·Q.
+        reference_points: (M, Z, 2) float32, x and y, 0 to 1 over the map; sample p lies around point p mod Z.
+        hits_per_map: G counts, of sum M.
+        prediction: (M,) int64, which of the predictions of its query belongs to the map: an index in the axis "maps" of
+            `DeformableAttention.predict`.
+    """
+
+    query: Tensor
+    reference_points: Tensor
+    hits_per_map: Sequence[int]
+    prediction: Tensor
+
+
+SampleHits = Callable[[Tensor, LevelShapes, Hits, Tensor, Tensor], Tensor]
+"""The weighted sums (M, C) float32 of hits, without gradients: see `bevcli.model.kernels.compiled.sample_hits`."""
+
+
+@cache
+def hits_of_maps(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`Hits.query` and `Hits.prediction` of maps that all cells sample. They are kept: CUDA graphs hold addresses."""
+    query = torch.arange(batch * cells, device=device).view(batch, 1, cells).expand(-1, maps, -1).flatten()
+    return query, torch.arange(maps, device=device)[None, :, None].repeat(batch, 1, cells).flatten()
 
 
 class DeformableAttention(nn.Module):
@@ -87,7 +117,7 @@ class DeformableAttention(nn.Module):
         """Offsets and logits of the weights of the samples of queries (..., query_channels).
 
         Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
-        (..., heads, maps, L, P), see `GridSampling.weights`.
+        (..., heads, maps, L, P), see `softmax_weights`.
         """
         offsets, logits = self.sampling_offsets(query), self.attention_weights(query)
         return offsets.float().unflatten(-1, (*self.shape, 2)), logits.unflatten(-1, self.shape)
@@ -102,6 +132,13 @@ class DeformableAttention(nn.Module):
             level_shapes: (height, width) of each of the L levels.
         """
         batch, queries, _ = query.shape
+        if self.sampling.sample_hits is not None:
+            of_hit = hits_of_maps(1, 1, batch * queries, query.device)
+            hits = Hits(of_hit[0], reference_points.reshape(-1, 1, 2), [queries] * batch, of_hit[1])
+            predicted = self.predict(query.flatten(0, 1))
+            sampled = self.sampling.sample_hits(self.values(tokens), level_shapes, hits, *predicted)
+            projected: Tensor = self.output_projection(sampled.view(batch, queries, -1))
+            return projected
         offsets, logits = (predicted[:, :, :, 0] for predicted in self.predict(query))
         reference = reference_points[:, :, None, None, None]
         sizes = self.sampling.level_sizes(level_shapes, offsets.device)
@@ -116,16 +153,34 @@ class DeformableAttention(nn.Module):
         return self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))
 
 
+def softmax_weights(logits: Tensor) -> Tensor:
+    """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
+    return logits.flatten(-2).softmax(-1).view_as(logits)
+
+
+def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
+    """(L, 2) float32 width and height of each level, on a device."""
+    sizes = torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32)
+    return upload(sizes, device)
+
+
 class GridSampling(nn.Module):
-    """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another."""
+    """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another.
 
-    def weights(self, logits: Tensor) -> Tensor:
-        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
-        return logits.flatten(-2).softmax(-1).view_as(logits)
+    Attributes:
+        sample_hits: a kernel that an attention calls in place of `forward`, without tables of locations and weights.
+        weights: `softmax_weights`, or the same faster.
+        level_sizes: the function, or one that keeps its results.
+    """
 
-    def level_sizes(self, level_shapes: LevelShapes, device: torch.device) -> Tensor:
-        """See the function `level_sizes`."""
-        return level_sizes(level_shapes, device)
+    def __init__(
+        self,
+        sample_hits: SampleHits | None = None,
+        weights: Callable[[Tensor], Tensor] = softmax_weights,
+        level_sizes: Callable[[LevelShapes, torch.device], Tensor] = level_sizes,
+    ) -> None:
+        super().__init__()
+        self.sample_hits, self.weights, self.level_sizes = sample_hits, weights, level_sizes
 
     def forward(
         self,
@@ -168,12 +223,6 @@ def sample_maps(values: Tensor, level_shapes: LevelShapes, locations: Tensor, we
         sampled = F.grid_sample(level_map, grid[level], align_corners=False)  # (G·heads, D, m, P)
         result = result + (sampled * level_weights[level, :, None]).sum(-1)
     return result.unflatten(0, (maps, heads)).permute(0, 3, 1, 2).flatten(2)  # (G, m, heads · D)
-
-
-def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
-    """(L, 2) float32 width and height of each level, on a device."""
-    sizes = torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32)
-    return upload(sizes, device)
 
 
 def sampling_locations(reference_points: Tensor, offsets: Tensor, sizes: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """Modulated deformable convolution, DCNv2 (Zhu et al. 2019), with one deformable group."""
 
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -12,6 +14,7 @@ class ModulatedDeformableConvolution(nn.Module):
         bias: (O,), None until a batch norm is folded into the convolution.
     """
 
+    folds_batch_norm: ClassVar[bool] = True
     bias: nn.Parameter | None
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:

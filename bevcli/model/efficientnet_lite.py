@@ -4,14 +4,14 @@ EfficientNet (Tan and Le 2019) without squeeze-and-excitation, with ReLU6, and w
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.resnet import Backbone
+from bevcli.model.backbone import Backbone, Stage
 
 VARIANTS = ((1.0, 1.0), (1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.4, 1.8))  # factors of width and depth of lite0 to lite4
 STEM_CHANNELS = 32  # of all variants
@@ -84,6 +84,9 @@ class EfficientNetLiteConfig:
 class EfficientNetLite(Backbone):
     """See `EfficientNetLiteConfig`. Images are RGB, with mean 127 and standard deviation 128 where it is pretrained."""
 
+    stem_parts = ("conv1", "bn1")
+    batch_norms: ClassVar[Mapping[str, str]] = {"conv1": "bn1"}
+
     def __init__(self, config: EfficientNetLiteConfig) -> None:
         super().__init__()
         self.output_stages = config.output_stages
@@ -107,6 +110,8 @@ class SameConvolution(nn.Conv2d):
     costs less than a copy of the input with padding on two sides.
     """
 
+    folds_batch_norm: ClassVar[bool] = True
+
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, groups: int = 1) -> None:
         super().__init__(in_channels, out_channels, kernel_size, stride=2, groups=groups, bias=False)
 
@@ -125,6 +130,10 @@ class SameConvolution(nn.Conv2d):
 
 class InvertedResidual(nn.Module):
     """1x1 convolution to more channels, depthwise and 1x1 convolution, each with batch norm, and a shortcut."""
+
+    batch_norms: ClassVar[Mapping[str, str]] = {
+        "expand": "expand_norm", "depthwise": "depthwise_norm", "project": "project_norm"
+    }  # fmt: skip
 
     def __init__(self, in_channels: int, channels: int, kernel_size: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -155,10 +164,10 @@ def _norm(channels: int) -> nn.BatchNorm2d:
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
 
 
-def _stage(number: int, config: EfficientNetLiteConfig) -> nn.Sequential:
+def _stage(number: int, config: EfficientNetLiteConfig) -> Stage:
     """The blocks of a stage (1 to 7); the first of them has the stride."""
     _, kernel_size, stride, expansion, _ = STAGES[number - 1]
     channels = config.channels(number)
     before = STEM_CHANNELS if number == 1 else config.channels(number - 1)
     inputs = [(before, stride)] + (config.blocks(number) - 1) * [(channels, 1)]
-    return nn.Sequential(*(InvertedResidual(size, channels, kernel_size, stride, expansion) for size, stride in inputs))
+    return Stage(*(InvertedResidual(size, channels, kernel_size, stride, expansion) for size, stride in inputs))

@@ -8,7 +8,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
+from bevcli.model.deformable_attention import (
+    DeformableAttention,
+    FeatureMaps,
+    Hits,
+    LevelShapes,
+    hits_of_maps,
+    sampling_locations,
+)
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.pillar_projection import PillarHits
 
@@ -159,16 +166,22 @@ class TemporalSelfAttention(nn.Module):
 
     def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, logits: Tensor) -> Tensor:
         """The attended values (B, Y·X, C) for given offsets and logits of the samples; see `forward`."""
-        batch, cells = offsets.shape[:2]
-        maps, tokens = bev_maps.shape[1], bev_maps.flatten(0, 1)
-        reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-        sizes = self.attention.sampling.level_sizes(self.level_shapes, offsets.device)
-        locations = sampling_locations(reference, offsets, sizes)  # (B, Y·X, heads, 2, 1, P, 2)
-        locations = locations.movedim(3, 1).flatten(0, 2)
-        weights = self.attention.sampling.weights(logits).movedim(3, 1).flatten(0, 2)
-        queries_per_map = [2 * cells // maps] * (maps * batch)
-        values = self.attention.values(tokens)
-        sampled = self.attention.sampling(values, self.level_shapes, locations, weights, queries_per_map)
+        (batch, cells), maps = offsets.shape[:2], bev_maps.shape[1]
+        tokens, queries_per_map = bev_maps.flatten(0, 1), [2 * cells // maps] * (maps * batch)
+        sampling = self.attention.sampling
+        if sampling.sample_hits is not None:
+            query, prediction = hits_of_maps(batch, 2, cells, reference_points.device)
+            points = reference_points.expand(batch, -1, -1, -1).reshape(-1, 1, 2)
+            hits = Hits(query, points, queries_per_map, prediction)
+            predicted = offsets.flatten(0, 1), logits.flatten(0, 1)
+            sampled = sampling.sample_hits(self.attention.values(tokens), self.level_shapes, hits, *predicted)
+        else:
+            reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
+            locations = sampling_locations(reference, offsets, sampling.level_sizes(self.level_shapes, offsets.device))
+            locations = locations.movedim(3, 1).flatten(0, 2)  # of (B, Y·X, heads, 2, 1, P, 2)
+            weights = sampling.weights(logits).movedim(3, 1).flatten(0, 2)
+            values = self.attention.values(tokens)
+            sampled = sampling(values, self.level_shapes, locations, weights, queries_per_map)
         return self.mean(sampled.unflatten(0, (batch, 2, cells)))
 
     def mean(self, sampled: Tensor) -> Tensor:
@@ -202,15 +215,20 @@ class SpatialCrossAttention(nn.Module):
     def sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
         """The weighted sums (M, C) of the hits; see `forward`."""
         # A cell has the same offsets and logits in every camera, so they are predicted once for each cell.
-        offsets, logits = (part[:, :, 0] for part in self.attention.predict(query.flatten(0, 1)))  # (B·Y·X, heads, …)
+        predicted = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, …) each
         tokens, level_shapes = image_features.tokens, image_features.level_shapes
+        sampling = self.attention.sampling
+        if sampling.sample_hits is not None:
+            by_map = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
+            return sampling.sample_hits(self.attention.values(tokens), level_shapes, by_map, *predicted)
+        offsets, logits = (part[:, :, 0] for part in predicted)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
-        offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, self.attention.sampling.weights(logits)))
-        sizes = self.attention.sampling.level_sizes(level_shapes, offsets.device)
+        offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, sampling.weights(logits)))
+        sizes = sampling.level_sizes(level_shapes, offsets.device)
         locations = sampling_locations(reference[:, None, None], offsets, sizes)  # (M, heads, L, P, 2)
         values = self.attention.values(tokens)
-        sampled: Tensor = self.attention.sampling(values, level_shapes, locations, weights, hits.hits_per_camera)
+        sampled: Tensor = sampling(values, level_shapes, locations, weights, hits.hits_per_camera)
         return sampled
 
 

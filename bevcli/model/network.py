@@ -98,7 +98,7 @@ class Network(TemporalModel):
 
     def bev_part_names(self) -> Iterator[tuple[str, ...]]:
         """The parts up to the BEV map, as `part_names`."""
-        yield "backbone: stem", "backbone.conv1", "backbone.bn1"
+        yield "backbone: stem", *(f"backbone.{name}" for name in self.backbone.stem_parts)
         for stage, name in enumerate(self.config.backbone.stage_names()):
             yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
         yield "neck (FPN)", "neck"

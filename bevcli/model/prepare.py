@@ -110,7 +110,7 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     """
     loaded = threading.Event()
     for name, module in list(network.named_modules()):
-        if isinstance(module, ResNet):
+        if type(module) is ResNet:  # of a subclass, another stem may need negative maxima
             network.set_submodule(f"{name}.pool", choose.in_place_of(module.pool, CompiledPool, loaded=loaded))
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()

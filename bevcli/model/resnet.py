@@ -1,12 +1,13 @@
-"""ResNet (He et al. 2016) with bottlenecks: the image backbone, and the base class of all backbones."""
+"""ResNet (He et al. 2016) with bottlenecks: the image backbone."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from bevcli.model.backbone import Backbone, Stage
 
 
 @dataclass(frozen=True)
@@ -57,57 +58,11 @@ class ResNetConfig:
         return ResNet(self)
 
 
-class Backbone(nn.Module):
-    """Images to feature maps of the configured output stages. A subclass makes `conv1`, `bn1` and the stages.
-
-    Attributes:
-        output_stages: the stages, from 1, whose maps are returned.
-        conv1: the convolution of the stem.
-        bn1: the batch norm after it.
-        stages: from the first to the last one whose map is returned.
-        frozen_stages: so many first stages, and the stem, keep their weights and statistics in a training.
-        frozen_maps: computes the maps of the first stages in place of the stem and these stages, during a training
-            that keeps their weights.
-    """
-
-    output_stages: tuple[int, ...]
-    conv1: nn.Conv2d
-    bn1: nn.BatchNorm2d
-    stages: nn.ModuleList
-    frozen_stages: int = 0
-    frozen_maps: Callable[[Tensor], list[Tensor]] | None = None
-
-    @abstractmethod
-    def stem(self, images: Tensor) -> Tensor:
-        """images: (B, 3, H, W) -> the input of the first stage."""
-
-    def freeze(self, stages: int) -> None:
-        """Keeps the stem and so many first stages as they are in a training; with 0 nothing is frozen."""
-        self.frozen_stages = stages
-        for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else ():
-            part.requires_grad_(False)
-
-    def train(self, mode: bool = True) -> "Backbone":
-        """As `nn.Module.train`; batch norms of frozen parts stay in evaluation mode."""
-        super().train(mode)
-        for part in [self.conv1, self.bn1, *self.stages[: self.frozen_stages]] if self.frozen_stages else ():
-            part.eval()
-        return self
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / stride, W / stride) for each output stage."""
-        maps: list[Tensor] = []
-        if self.frozen_maps is not None:
-            maps = self.frozen_maps(images)
-        x = maps[-1] if maps else self.stem(images)
-        for blocks in self.stages[len(maps) :]:
-            x = blocks(x)
-            maps.append(x)
-        return [maps[stage - 1] for stage in self.output_stages]
-
-
 class ResNet(Backbone):
     """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32."""
+
+    stem_parts = ("conv1", "bn1")
+    batch_norms: ClassVar[Mapping[str, str]] = {"conv1": "bn1"}
 
     def __init__(self, config: ResNetConfig) -> None:
         super().__init__()
@@ -122,7 +77,7 @@ class ResNet(Backbone):
             # The first bottleneck of a stage has the stride; the stem has that of the first stage.
             inputs = [(in_channels, 1 if number == 1 else 2)] + (blocks - 1) * [(4 * channels, 1)]
             stage = (Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs)
-            self.stages.append(nn.Sequential(*stage))
+            self.stages.append(Stage(*stage))
             in_channels = 4 * channels
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
@@ -134,6 +89,8 @@ class ResNet(Backbone):
 
 class Bottleneck(nn.Module):
     """1x1, 3x3 and 1x1 convolution, each with batch norm, and a shortcut around them."""
+
+    batch_norms: ClassVar[Mapping[str, str]] = {"conv1": "bn1", "conv2": "bn2", "conv3": "bn3"}
 
     def __init__(
         self, in_channels: int, channels: int, stride: int, style: Literal["pytorch", "caffe"], deformable: bool
@@ -171,6 +128,8 @@ class Bottleneck(nn.Module):
 
 class BasicBlock(nn.Module):
     """The residual block of ResNet-18: two 3x3 convolutions, each with batch norm, and a shortcut around them."""
+
+    batch_norms: ClassVar[Mapping[str, str]] = {"conv1": "bn1", "conv2": "bn2"}
 
     def __init__(self, in_channels: int, channels: int) -> None:
         super().__init__()

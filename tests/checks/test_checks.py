@@ -79,7 +79,7 @@ def test_the_kernels_are_those_that_a_model_gets(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: True)
     found = checks.kernels()
-    assert "SpatialByHits, TemporalByHits" in found["attention"]
+    assert "CompiledSampling" in found["attention"]
     assert found["bf16"] == "for images and products of encoder and decoder (AMX)"
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     assert checks.kernels()["bf16"] == "for images only (no AMX)"

@@ -10,6 +10,7 @@ import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
+from bevcli.model.backbone import Stage
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.encoder import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
@@ -75,15 +76,12 @@ def test_a_fused_bottleneck_equals_a_bottleneck(style, in_channels, stride, defo
         before = x.clone()
         with torch.inference_mode():
             expected = block(x)
-            whole = nn.Sequential(block)
-            use_onednn(whole)
-            assert isinstance(whole[0], FusedBlock)
-            found = whole(x)
-            torch.testing.assert_close(found, expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
-        if isinstance(block.downsample, nn.Identity):
-            assert found.data_ptr() == x.data_ptr()
-        else:
-            assert torch.equal(x, before)
+            for whole in (nn.Sequential(copy.deepcopy(block)), Stage(nn.Identity(), copy.deepcopy(block))):
+                use_onednn(whole)
+                assert isinstance(whole[-1], FusedBlock)
+                torch.testing.assert_close(whole(x), expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+                overwrites = isinstance(whole, Stage) and isinstance(block.downsample, nn.Identity)
+                assert torch.equal(x, before) == (not overwrites)
 
 
 @pytest.mark.parametrize("groups", [1, 4])

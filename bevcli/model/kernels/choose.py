@@ -4,7 +4,6 @@ The attentions of the encoder run one kernel for all hits, without tables of loc
 calibration, poses and sizes keep the result of the last call.
 """
 
-from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
@@ -14,18 +13,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, GridSampling, LevelShapes, level_sizes
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, SampleHits, level_sizes
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import CalibrationEmbedding
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, Hits, sample_hits
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.network import Network
-from bevcli.model.pillar_projection import PillarHits, Pillars
+from bevcli.model.pillar_projection import Pillars
 
 VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
 Kind = TypeVar("Kind", bound=nn.Module)
 Kinds = dict[type[nn.Module], type[nn.Module]]
-SampleHits = Callable[[Tensor, LevelShapes, Hits, Tensor, Tensor], Tensor]
-"""The weighted sums (M, C) float32 of hits, without gradients: see `bevcli.model.kernels.compiled.sample_hits`."""
+BY_HITS = (TemporalSelfAttention, SpatialCrossAttention)
 
 
 def in_place_of(plain: nn.Module, kind: type[Kind], **attributes: Any) -> Kind:
@@ -47,26 +45,26 @@ def choose_kernels(model: nn.Module, device: torch.device, *, gradients: bool = 
     if not gradients:
         functions["level_sizes"] = cache(level_sizes)  # CUDA graphs hold the addresses of the tables
         functions |= {"weights": softmax_of_few} if device.type == "cpu" else {}
-    by_hits: Kinds = {TemporalSelfAttention: TemporalByHits, SpatialCrossAttention: SpatialByHits}
-    kinds: Kinds = {}
     sampling: type[GridSampling] = GridSampling
-    kernel = sample_hits
+    kernel: SampleHits | None = None
     if device.type == "cpu":
-        sampling, kinds = CompiledSampling, {} if gradients else by_hits
+        sampling, kernel = CompiledSampling, sample_hits
     elif has_triton(device):
         from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
         from bevcli.model.kernels import triton_attention, triton_convolution  # only where Triton is installed
 
         sampling, kernel = triton_attention.TritonSampling, triton_attention.sample_hits
-        kinds = {} if gradients else {**by_hits, DeformableAttention: AttentionByHits}
         for name, module in list(model.named_modules()):
             if isinstance(module, ModulatedDeformableConvolution):
                 model.set_submodule(name, in_place_of(module, triton_convolution.TritonDeformableConvolution))
-    for name, module in list(model.named_modules()):
-        if isinstance(module, DeformableAttention):
-            module.sampling = in_place_of(sampling(), sampling, **functions)
-        if kind := kinds.get(type(module)):
-            model.set_submodule(name, in_place_of(module, kind, sample_hits=kernel))
+    attentions = [module for module in model.modules() if isinstance(module, DeformableAttention)]
+    for attention in attentions:
+        attention.sampling = sampling(**functions)
+    if not gradients and kernel is not None:
+        # Those with many queries; on a GPU all, where each kernel of its own takes time to launch.
+        encoder = [part.attention for part in model.modules() if isinstance(part, BY_HITS)]
+        for attention in encoder if device.type == "cpu" else attentions:
+            attention.sampling.sample_hits = kernel
 
 
 def has_triton(device: torch.device) -> bool:
@@ -75,7 +73,7 @@ def has_triton(device: torch.device) -> bool:
 
 
 def softmax_of_few(logits: Tensor) -> Tensor:
-    """As `GridSampling.weights`. On a CPU, PyTorch's softmax takes ten times as long for 4 or 8 samples."""
+    """As `softmax_weights`. On a CPU, PyTorch's softmax takes ten times as long for 4 or 8 samples."""
     flat = logits.flatten(-2)
     if flat.shape[-1] >= VECTORISED:
         return flat.softmax(-1).view_as(logits)
@@ -84,71 +82,30 @@ def softmax_of_few(logits: Tensor) -> Tensor:
 
 
 def fold_batch_norms(model: nn.Module, device: torch.device) -> None:
-    """Folds every batch norm into the convolution before it, in place, for inference on a device."""
+    """Folds batch norms into the convolutions before them, in place, for inference on a device: see `Backbone`."""
     for parent in list(model.modules()):
-        children: list[tuple[str, Any]] = list(parent.named_children())
-        for (name, convolution), (norm_name, norm) in pairwise(children):
-            if not isinstance(norm, nn.BatchNorm2d):
+        for name, norm_name in _batch_norms(parent):
+            convolution, norm = (parent.get_submodule(each) for each in (name, norm_name))
+            if type(norm) is not nn.BatchNorm2d or norm.running_mean is None or norm.running_var is None:
                 continue
-            assert norm.running_mean is not None
-            assert norm.running_var is not None
-            convolution.weight, convolution.bias = fuse_conv_bn_weights(
-                convolution.weight, None, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
+            if type(convolution) is not nn.Conv2d and not getattr(convolution, "folds_batch_norm", False):
+                continue
+            folded: Any = convolution
+            folded.weight, folded.bias = fuse_conv_bn_weights(
+                folded.weight, folded.bias, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
             )
             parent.set_submodule(norm_name, nn.Identity())
             if device.type == "cpu" and not isinstance(convolution, nn.Conv2d):  # a deformable one
-                parent.set_submodule(name, CompiledDeformableConvolution(convolution))
+                parent.set_submodule(name, CompiledDeformableConvolution(folded))
 
 
-class TemporalByHits(TemporalSelfAttention):
-    """A `TemporalSelfAttention` whose cells hit the history and the current map."""
-
-    sample_hits: SampleHits
-
-    def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, logits: Tensor) -> Tensor:
-        """As `TemporalSelfAttention.sample`."""
-        (batch, cells), maps = offsets.shape[:2], bev_maps.shape[1]
-        values = self.attention.values(bev_maps.flatten(0, 1))
-        query, prediction = map_queries(batch, 2, cells, reference_points.device)
-        points = reference_points.expand(batch, -1, -1, -1).reshape(-1, 1, 2)
-        hits = Hits(query, points, [2 * cells // maps] * (maps * batch), prediction)
-        sampled = self.sample_hits(values, self.level_shapes, hits, offsets.flatten(0, 1), logits.flatten(0, 1))
-        return self.mean(sampled.unflatten(0, (batch, 2, cells)))
-
-
-class SpatialByHits(SpatialCrossAttention):
-    """A `SpatialCrossAttention` whose hits are those of the pillars."""
-
-    sample_hits: SampleHits
-
-    def sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
-        """As `SpatialCrossAttention.sample`."""
-        predicted = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, …) each
-        values = self.attention.values(image_features.tokens)
-        by_map = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
-        return self.sample_hits(values, image_features.level_shapes, by_map, *predicted)
-
-
-class AttentionByHits(DeformableAttention):
-    """A `DeformableAttention` whose queries hit the one map around their reference points."""
-
-    sample_hits: SampleHits
-
-    def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
-        """As `DeformableAttention.attend`."""
-        batch, queries, _ = query.shape
-        of_hit = map_queries(1, 1, batch * queries, query.device)
-        hits = Hits(of_hit[0], reference_points.reshape(-1, 1, 2), [queries] * batch, of_hit[1])
-        sampled = self.sample_hits(self.values(tokens), level_shapes, hits, *self.predict(query.flatten(0, 1)))
-        result: Tensor = self.output_projection(sampled.view(batch, queries, -1))
-        return result
-
-
-@cache
-def map_queries(batch: int, maps: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """`Hits.query` and `Hits.prediction` of maps that all cells sample. They are kept: CUDA graphs hold addresses."""
-    query = torch.arange(batch * cells, device=device).view(batch, 1, cells).expand(-1, maps, -1).flatten()
-    return query, torch.arange(maps, device=device)[None, :, None].repeat(batch, 1, cells).flatten()
+def _batch_norms(parent: nn.Module) -> list[tuple[str, str]]:
+    """Names of convolutions, or of what else stands there, and of the batch norms that alone take their results."""
+    children = [name for name, _ in parent.named_children()]
+    if isinstance(parent, nn.Sequential) and type(parent).forward is nn.Sequential.forward:
+        return list(pairwise(children))
+    stated = getattr(parent, "batch_norms", {}).items()
+    return [(name, norm) for name, norm in stated if name in children and norm in children]
 
 
 class LastCall(nn.Module):

@@ -6,7 +6,6 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import GridSampling, LevelShapes
+from bevcli.model.deformable_attention import GridSampling, Hits, LevelShapes
 
 if TYPE_CHECKING:  # not every backbone has one
     from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
@@ -25,24 +24,6 @@ RANGES_PER_THREAD = 8
 SAMPLES_PER_RANGE = 1 << 15
 # Sampled taps of one tile: large enough for a fast matrix product, small enough to stay in the cache.
 TILE_BYTES = 8 << 20
-
-
-@dataclass(frozen=True)
-class Hits:
-    """The M pairs of a value map and a query that samples it, ordered by map.
-
-    Attributes:
-        query: (M,) int64, index of the query in B·Q.
-        reference_points: (M, Z, 2) float32, x and y, 0 to 1 over the map; sample p lies around point p mod Z.
-        hits_per_map: G counts, of sum M.
-        prediction: (M,) int64, which of the predictions of its query belongs to the map: an index in the axis "maps" of
-            `DeformableAttention.predict`.
-    """
-
-    query: Tensor
-    reference_points: Tensor
-    hits_per_map: Sequence[int]
-    prediction: Tensor
 
 
 class CompiledSampling(GridSampling):
@@ -168,7 +149,7 @@ class CompiledDeformableConvolution(nn.Module):
 
 
 class CompiledPool(nn.MaxPool2d):
-    """Takes the place of the max-pooling of a backbone's stem, which a ReLU follows: it gives 0 for negative maxima.
+    """Takes the place of the pooling in the stem of a ResNet, which applies ReLU to it: it gives 0 for negative maxima.
 
     Numbers that are not negative have the order of their bits, so that the loop compares integers.
 

@@ -6,12 +6,13 @@ own layers.
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.model.backbone import Stage
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.encoder import FeedForward
@@ -123,7 +124,8 @@ class PackedSameConvolution(PackedConvolution):
 class FusedInvertedResidual(nn.Module):
     """An `InvertedResidual` whose batch norms are folded."""
 
-    def __init__(self, block: InvertedResidual) -> None:
+    def __init__(self, block: InvertedResidual, *, overwrites: bool) -> None:
+        """overwrites: where it adds x, the result is written over x."""
         super().__init__()
         wide = [layer for layer in (block.expand, block.depthwise) if layer is not None]
         self.wide = nn.Sequential()
@@ -132,18 +134,19 @@ class FusedInvertedResidual(nn.Module):
                 self.wide.append(PackedSameConvolution(layer, "relu6"))
             else:
                 self.wide.append(PackedConvolution(layer, "relu6"))
-        self.project, self.adds = PackedConvolution(block.project), block.adds
+        self.project, self.adds, self.overwrites = PackedConvolution(block.project), block.adds, overwrites
 
     def forward(self, x: Tensor) -> Tensor:
-        """As the block's own `forward`. Where it adds x, the result is written over x."""
+        """As the block's own `forward`."""
         y = self.wide(x)
-        return self.project(y, x if self.adds else None)
+        return self.project(y, None if not self.adds else x if self.overwrites else x.clone())
 
 
 class FusedBlock(nn.Module):
     """A `Bottleneck` or a `BasicBlock` whose batch norms are folded."""
 
-    def __init__(self, block: Bottleneck | BasicBlock) -> None:
+    def __init__(self, block: Bottleneck | BasicBlock, *, overwrites: bool) -> None:
+        """overwrites: without a `downsample` the result is written over the input."""
         super().__init__()
         *first, last = [child for name, child in block.named_children() if name.startswith("conv")]
         self.first = nn.Sequential()
@@ -156,42 +159,48 @@ class FusedBlock(nn.Module):
                 convolution.set_submodule("product", PackedLinear(product, "relu"))
                 self.first.append(convolution)
         assert isinstance(last, nn.Conv2d)
-        self.last, self.downsample = PackedConvolution(last, "relu"), block.downsample
+        self.last, self.downsample, self.overwrites = PackedConvolution(last, "relu"), block.downsample, overwrites
 
     def forward(self, x: Tensor) -> Tensor:
-        """As the block's own `forward`. Without a `downsample` the result is written over x."""
-        y = self.first(x)
-        return self.last(y, self.downsample(x))
+        """As the block's own `forward`."""
+        y, shortcut = self.first(x), self.downsample(x)
+        return self.last(y, shortcut if self.overwrites or shortcut is not x else x.clone())
 
 
 def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
     """Replaces convolutions, linear layers and residual blocks of a module, in place, for inference.
 
-    Batch norms must be folded already. rounds: linear layers of float32 compute in `rounded_products`, except for those
-    that predict positions: boxes would move.
+    Batch norms must be folded already; a block with a batch norm of its own stays as it is. A block may write over its
+    input within a `Stage`. rounds: linear layers of float32 compute in `rounded_products`, except for those that
+    predict positions: boxes would move.
     """
     left = [(part, rounds)]
     while left:
         parent, rounds_parent = left.pop()
-        for name, child in parent.named_children():
+        for index, (name, child) in enumerate(parent.named_children()):
             rounds_child = rounds_parent and name != "reference_points" and not isinstance(child, RegressionBranch)
             fast = child
             parameter = next(child.parameters(), None)
             if parameter is None or not has_onednn(parameter.dtype):
                 pass
-            elif isinstance(child, Bottleneck | BasicBlock):
-                fast = FusedBlock(child)
-            elif isinstance(child, InvertedResidual):
-                fast = FusedInvertedResidual(child)
+            elif type(child) in BLOCKS and not any(isinstance(norm, nn.BatchNorm2d) for norm in child.modules()):
+                fast = BLOCKS[type(child)](child, overwrites=isinstance(parent, Stage) and index > 0)
             elif isinstance(child, FeedForward):  # dropout has no effect in inference
                 expand = PackedLinear(child.expand, child.activation, rounds=rounds_child)
                 fast = nn.Sequential(expand, PackedLinear(child.reduce, rounds=rounds_child))
-            elif isinstance(child, SameConvolution):
+            elif type(child) is SameConvolution:
                 fast = PackedSameConvolution(child)
-            elif isinstance(child, nn.Conv2d):
+            elif type(child) is nn.Conv2d and child.padding_mode == "zeros" and not isinstance(child.padding, str):
                 fast = PackedConvolution(child)
             # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
             elif type(child) is nn.Linear:
                 fast = PackedLinear(child, rounds=rounds_child)
             setattr(parent, name, fast)
             left.append((fast, rounds_child))
+
+
+BLOCKS: dict[type[nn.Module], Callable[..., nn.Module]] = {
+    Bottleneck: FusedBlock,
+    BasicBlock: FusedBlock,
+    InvertedResidual: FusedInvertedResidual,
+}

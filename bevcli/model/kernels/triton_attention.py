@@ -12,8 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from bevcli.model.deformable_attention import GridSampling, LevelShapes
-from bevcli.model.kernels.compiled import Hits
+from bevcli.model.deformable_attention import GridSampling, Hits, LevelShapes
 from bevcli.model.upload import upload
 
 QUERIES_PER_PROGRAM = 32

@@ -86,7 +86,8 @@ def made_up_model(config: ModelConfig) -> Network:
                     nn.init.constant_(parameter, RESIDUAL_GAIN)
                 elif parameter.ndim > 1 and not parameter.any():
                     nn.init.normal_(parameter, std=0.5 / math.sqrt(parameter[0].numel()))
-            model.backbone.conv1.weight *= sum(config.image.std) / 3 / USUAL_DEVIATION
+            first = next(part for part in model.backbone.modules() if isinstance(part, nn.Conv2d))
+            first.weight *= sum(config.image.std) / 3 / USUAL_DEVIATION
     return model
 
 

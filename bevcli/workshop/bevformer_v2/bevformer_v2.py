@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
+from bevcli.model.backbone import Stage
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import EncoderLayer
@@ -191,7 +192,7 @@ class BevFusion(nn.Module):
         super().__init__()
         self.bev_shape = bev_shape
         inputs = [frames * channels] + (config.blocks - 1) * [config.width]
-        self.blocks = nn.Sequential(*(BasicBlock(size, config.width) for size in inputs))
+        self.blocks = Stage(*(BasicBlock(size, config.width) for size in inputs))
         self.projection = nn.Linear(config.width, channels)
         self.norm = nn.LayerNorm(channels)
 

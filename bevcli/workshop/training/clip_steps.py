@@ -15,12 +15,12 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import ConfigError
 from bevcli.inference.load import weights_file
+from bevcli.model.backbone import Backbone
 from bevcli.model.config import ModelConfig
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network, build_network
-from bevcli.model.resnet import Backbone
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.samples import Batch
@@ -63,7 +63,7 @@ class FrozenStages:
 
     def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
         """stages: how many, from the first. dtype: of the computation and its results."""
-        self._device = backbone.conv1.weight.device
+        self._device = next(backbone.parameters()).device
         self._dtype = dtype
         part = copy.deepcopy(backbone)
         part.stages = nn.ModuleList(part.stages[:stages])
