@@ -39,7 +39,7 @@ DATA = re.compile(
 TEST_PROGRAMS = ("pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support")
 EXTRAS = "ros,video,onnx,openvino,tensorboard,ray,hub"
 # These tests run with the lowest versions, too. They use OpenCV, numba, PyTorch, SciPy, Shapely, trimesh, rerun, mcap,
-# rosbags, protobuf, PyAV, ONNX and its runtime, OpenVINO and pycurl.
+# rosbags, protobuf, PyAV, ONNX and its runtime, and OpenVINO.
 WITH_LOWEST = (
     "geometry/test_cameras.py",
     "model/test_deformable_attention_backends.py",

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from bevcli.inference.load import Model
     from bevcli.published import NamedWeights
-    from bevcli.weights import DownloadReport
     from bevcli.weights.fetch import FetchedWeights
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
@@ -115,31 +114,6 @@ def _bar(stream: TextIO) -> "rich.progress.Progress":
 
 
 @contextmanager
-def download_bar() -> "Iterator[DownloadReport]":
-    """Shows a download: the bytes that are there, of how many or None, and what is downloaded.
-
-    The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
-    """
-    bar: Progress | None = None
-
-    def show(done: int, total: int | None, what: str) -> None:
-        nonlocal bar
-        if bar is None:
-            bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [what]))
-            bar.skip(done // MB)
-        bar.reach(done // MB)
-
-    with ExitStack() as shown:
-        try:
-            yield show
-        except KeyboardInterrupt:
-            if bar is None:
-                raise
-            say("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(STOPPED) from None
-
-
-@contextmanager
 def odometry_bar() -> Iterator[Callable[[int, int], None]]:
     """Shows the steps that the option `odometry` measures, one bar a drive: those that are done, and of how many."""
     with ExitStack() as shown:
@@ -156,16 +130,34 @@ def odometry_bar() -> Iterator[Callable[[int, int], None]]:
 
 
 def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
-    """The file of weights, downloaded if it is not there."""
-    from bevcli.weights.fetch import fetch_weights
+    """The file of weights, downloaded if it is not there.
 
-    with download_bar() as show:
-        return fetch_weights(weights, show, force=force)
+    The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
+    """
+    from bevcli.weights.fetch import download_weights, fetch_weights
+
+    bar: Progress | None = None
+    with ExitStack() as shown:
+        try:
+            for done, total in download_weights(weights, force=force):
+                if bar is None:
+                    note = f"{weights.name}: {weights.source.url}"
+                    bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [note]))
+                    bar.skip(done // MB)
+                bar.reach(done // MB)
+        except KeyboardInterrupt:
+            if bar is None:
+                raise
+            say("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(STOPPED) from None
+    return fetch_weights(weights, force=force)
 
 
 def load_with_bar(options: ModelOptions) -> "Model":
     """The model of the options, whose weights are downloaded where `fetch` asks for it and they are not there."""
-    from bevcli.inference.load import load_model
+    from bevcli.inference.load import load_model, weights_to_fetch
 
-    with download_bar() as show:
-        return load_model(options=options, report=show)
+    weights = weights_to_fetch(options)
+    if weights is not None:
+        fetch_with_bar(weights)
+    return load_model(options=options)

@@ -31,11 +31,10 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.published import all_weights, hub_model, is_of_hub, named_weights, weights_folder
+from bevcli.published import NamedWeights, all_weights, hub_model, is_of_hub, named_weights, weights_folder
 from bevcli.registry import entries, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
-from bevcli.weights import DownloadReport
 
 DEFAULT_MODEL = "demo"
 WEIGHTS_SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
@@ -242,8 +241,6 @@ def load_model(
     model: str | Path | None = None,
     weights: str | Path | None = None,
     options: ModelOptions | None = None,
-    *,
-    report: DownloadReport = lambda done, total, what: None,
     **changes: Any,
 ) -> Model:
     """Load a model and its weights.
@@ -258,7 +255,6 @@ def load_model(
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which
             "demo" and "photographs" have, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
-        report: called during a download with the bytes that are there, the size of the file or None, and name and URL.
         changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a
             torch.device), `precision`, `untrained`, `engine`, `calibrate_with`, `fetch` (download missing weights) and
             `weights_dir`. In another `engine` than "torch", or in "int8", the model is exported when it first meets a
@@ -300,7 +296,7 @@ def load_model(
     path, bundled = chosen.weights, None if chosen.weights or chosen.untrained else bundled_weights(name)
     if path is None and not chosen.untrained:
         untrained = ", or pass `untrained=True` (`--untrained`) to try the program with random weights"
-        path = bundled or (of_hub.weights if of_hub else _published(name, chosen, report, untrained))
+        path = bundled or (of_hub.weights if of_hub else _published(name, chosen, untrained))
     engine, device, precision = choose_engine(chosen, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -334,9 +330,16 @@ def weights_file(path_or_name: Path) -> Path:
     return bundled_weights(name) or _published(name, ModelOptions())
 
 
-def _published(
-    name: str, options: ModelOptions, report: DownloadReport = lambda done, total, what: None, otherwise: str = ""
-) -> Path:
+def weights_to_fetch(options: ModelOptions) -> NamedWeights | None:
+    """The weights that `load_model` would download; None where there are none."""
+    name = str(options.model or DEFAULT_MODEL)
+    if not options.fetch or options.weights or options.untrained or bundled_weights(name):
+        return None
+    named = all_weights(options.weights_dir).get(name)
+    return named if named is not None and named.source.url and named.here is None else None
+
+
+def _published(name: str, options: ModelOptions, otherwise: str = "") -> Path:
     """The published weights of a name: downloaded ones, or with `fetch` ones that are downloaded now.
 
     otherwise: ends the message of the WeightsError where there are none.
@@ -351,7 +354,7 @@ def _published(
     elif options.fetch:
         from bevcli.weights.fetch import fetch_weights
 
-        return fetch_weights(named, report).path
+        return fetch_weights(named).path
     elif options.weights_dir in (None, weights_folder().absolute()):
         how = f"run `bevcli weights fetch {name}`, which downloads them"
     else:

@@ -2,7 +2,3 @@
 
 Only `fetch` connects to another machine, and only where it is called.
 """
-
-from collections.abc import Callable
-
-DownloadReport = Callable[[int, int | None, str], None]  # bytes done, of how many or None, name and URL

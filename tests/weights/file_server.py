@@ -108,11 +108,6 @@ class Files(BaseHTTPRequestHandler):
         while not self.stop.wait(0.02):
             self.wfile.write(b"x" * 100)
 
-    def slow_headers(self) -> None:
-        self.wfile.write(b"HTTP/1.1 200 OK\r\nX: ")
-        while not self.stop.wait(0.1):
-            self.wfile.write(b"H")
-
     def without_ranges(self) -> None:
         self.send(self.content[: len(self.content) * len(self.asked) // 2], ranges=False)
 
