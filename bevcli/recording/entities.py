@@ -124,23 +124,24 @@ def image(name: str) -> str:
 
 def track(class_name: str, identity: str) -> str:
     """The entity of a track, such as "world/tracks/car_12"."""
-    import rerun as rr
-
-    return f"{TRACKS}/{rr.escape_entity_path_part(f'{class_name}_{identity}')}"
+    return f"{TRACKS}/{_escaped(f'{class_name}_{identity}')}"
 
 
 def layer(root: str, name: str) -> str:
     """The entity of the boxes of one of two models, such as "bev/models/a". root: WORLD, BEV or that of a camera."""
-    import rerun as rr
-
-    return f"{root}/{MODELS}/{rr.escape_entity_path_part(name)}"
+    return f"{root}/{MODELS}/{_escaped(name)}"
 
 
 def class_mesh(class_name: str) -> str:
     """The entity of the mesh in all boxes of a class, such as "world/boxes/mesh/car"."""
+    return f"{BOXES}/mesh/{_escaped(class_name)}"
+
+
+def _escaped(name: str) -> str:
+    """A name as one part of a path, by rerun's rules."""
     import rerun as rr
 
-    return f"{BOXES}/mesh/{rr.escape_entity_path_part(class_name)}"
+    return rr.escape_entity_path_part(name)
 
 
 def overlay(name: str, kind: str) -> str:

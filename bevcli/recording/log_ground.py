@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import GroundLines, Probe
+from bevcli.frame import BevMap, Frame, GroundLines, Probe
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities, log_boxes, log_cameras
@@ -25,7 +26,6 @@ Ranges = tuple[tuple[float, float], tuple[float, float]]  # of x and of y, bev f
 FITTED_ON = 2  # frames
 CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
 PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
-PROBE_COLOR: Color = (255, 80, 220)
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
 FUTURES_OPACITY, FUTURES_WIDTH = 230, 1.0  # of 255; points of the user interface
 ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what lies on the ground
@@ -158,12 +158,14 @@ def log_on_ground(
 def log_probes(stream: rr.RecordingStream, probes: Sequence[Probe], ego_from_bev: Array, grid: BevGrid) -> None:
     """Marks the probed cells: with a dot in the BEV view, and with a pillar in the scene."""
     centers = np.array([probe.cell_center for probe in probes])
-    dots = components(rr.Points2D, positions=centers * (1, -1), colors=PROBE_COLOR, radii=ui_points(5.0), draw_order=50)
+    dots = components(
+        rr.Points2D, positions=centers * (1, -1), colors=entities.PROBE_COLOR, radii=ui_points(5.0), draw_order=50
+    )
     log(stream, entities.BEV_PROBES, dots)
     low, high = grid.pillar_heights()[[0, -1]]
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
     strips = apply(ego_from_bev, ends).astype(np.float32)
-    stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=PROBE_COLOR, radii=0.05))
+    stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=entities.PROBE_COLOR, radii=0.05))
 
 
 def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
@@ -214,3 +216,31 @@ def log_ground_lines(
         own = own_colors[visible.owners]
         strips = components(rr.LineStrips2D, strips=visible.segments, colors=own, radii=radii, draw_order=15)
         log(stream, entities.overlay(posed.camera.name, kind), strips)
+
+
+class SeenCells:
+    """The cells of a map that a frame's cameras see; elsewhere, a model fills in what it has learned about streets.
+
+    Those of the last rig are kept, as most drives have one.
+    """
+
+    def __init__(self) -> None:
+        self._rig: CameraRig | None = None
+        self._of_camera: dict[str, NDArray[np.bool_]] = {}
+
+    def of(self, ground_map: BevMap, frame: Frame, grid: BevGrid) -> BevMap:
+        """A map in which cells have no class if no camera with an image sees a point of their pillar.
+
+        grid: of the model, for the heights of the pillars' points.
+        """
+        rows, columns = ground_map.cells.shape
+        if frame.rig is not self._rig:
+            x_range_m, y_range_m = ground_map.x_range_m, ground_map.y_range_m
+            of_map = replace(grid, rows=rows, columns=columns, x_range_m=x_range_m, y_range_m=y_range_m)
+            points = apply(frame.rig.ego_from_bev, of_map.pillars()[::-1])  # (Y, X, Z, 3), the largest y first
+            self._of_camera = {camera.name: np.any(camera.sees(points), axis=-1) for camera in frame.rig.cameras}
+            self._rig = frame.rig
+        seen = np.zeros((rows, columns), dtype=bool)
+        for camera in frame.images:
+            seen |= self._of_camera[camera]
+        return replace(ground_map, cells=np.where(seen, ground_map.cells, 0))

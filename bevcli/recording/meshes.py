@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import MIB, open_regular, read_bytes, run_python
 from bevcli.printing import reason_of
 from bevcli.recording.entities import EGO_COLOR, class_colors
-
-if TYPE_CHECKING:
-    from bevcli.recording.log_static import Mesh, VehicleMesh
+from bevcli.recording.vehicle import Mesh, VehicleMesh
 
 Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # the fields of a Mesh
 SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
@@ -45,7 +43,7 @@ MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
 FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 
 
-def load_vehicle(path: Path) -> "VehicleMesh":
+def load_vehicle(path: Path) -> VehicleMesh:
     """The vehicle from a mesh file: .glb, .gltf, .ply, .obj, .stl or .off, read by trimesh.
 
     The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
@@ -57,8 +55,6 @@ def load_vehicle(path: Path) -> "VehicleMesh":
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
     longer than 50 m.
     """
-    from bevcli.recording.log_static import VehicleMesh
-
     mesh = read_mesh(path)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     if not np.isfinite(mesh.vertices).all() or not (high - low).max() <= LONGEST_M:
@@ -73,7 +69,7 @@ def load_vehicle(path: Path) -> "VehicleMesh":
     return VehicleMesh(mesh, (outline, arrow + (x1, middle)))  # from above: a rectangle, and an arrow at its front
 
 
-def read_class_meshes(classes: Mapping[str, ObjectClass]) -> "dict[str, Mesh]":
+def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
     """The meshes of the classes that have one, by class, scaled to a cube of 1 m around the origin.
 
     Parts of a mesh without a colour have that of the class. A file that did not change is read once in a process.
@@ -83,7 +79,7 @@ def read_class_meshes(classes: Mapping[str, ObjectClass]) -> "dict[str, Mesh]":
     return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
 
 
-def _read(name: str, path: Path, color: Color) -> "Mesh":
+def _read(name: str, path: Path, color: Color) -> Mesh:
     try:
         with open_regular(path) as file:
             changed_ns = os.fstat(file.fileno()).st_mtime_ns
@@ -93,7 +89,7 @@ def _read(name: str, path: Path, color: Color) -> "Mesh":
 
 
 @lru_cache(maxsize=16)
-def _unit_cube(path: Path, color: Color, changed_ns: int) -> "Mesh":
+def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
     """changed_ns: time of the file's last change; a file that has changed is read again."""
     mesh = read_mesh(path, color)
     if len(mesh.faces) > MOST_TRIANGLES:
@@ -107,13 +103,11 @@ def _unit_cube(path: Path, color: Color, changed_ns: int) -> "Mesh":
     return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
 
 
-def read_mesh(path: Path, color: Color = EGO_COLOR) -> "Mesh":
+def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
     """All triangles of a mesh file, with the axes of the ego frame. color: of the parts that have none.
 
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.
     """
-    from bevcli.recording.log_static import Mesh  # not in the process that reads a file: it imports rerun
-
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
     try:

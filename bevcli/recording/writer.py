@@ -29,6 +29,7 @@ from bevcli.recording.log_cameras import ImageLayer, PosedCamera
 from bevcli.recording.log_ground import (
     BevColors,
     BevImages,
+    SeenCells,
     future_lines,
     log_flat_image,
     log_ground_lines,
@@ -37,7 +38,6 @@ from bevcli.recording.log_ground import (
 )
 from bevcli.recording.log_static import Recorded, RecordedBoxes, RecordedDrive, RecordedModel
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.seen_map import SeenCells
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 PosedCameras = tuple[PosedCamera, ...]
