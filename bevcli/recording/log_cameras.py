@@ -1,10 +1,8 @@
 """Writes the cameras of a frame into a recording: poses, images, boxes and other overlays of the images."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,6 +16,9 @@ from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
 from bevcli.recording.components import Components, components, log, ui_points
 
+if TYPE_CHECKING:
+    from bevcli.recording.av1 import Av1Encoder
+
 NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
 PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
@@ -28,9 +29,6 @@ LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
 UNSEEN = ui_points(0.01)  # of a point that shows only its label
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
 POINT = ui_points(2.0)
-AV1_QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
-AV1_PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
-KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
 
 
 @dataclass(frozen=True)
@@ -209,51 +207,13 @@ def transform(parent_from_entity: Array) -> Components:
     return components(rr.Transform3D, translation=parent_from_entity[:3, 3], mat3x3=columns)
 
 
-class Av1Encoder:
-    """Encodes the images of one camera, in order; the data of each image is complete when `encode` returns.
-
-    An image with an odd width or height gets another row or column that repeats its last one.
-    """
-
-    def __init__(self, width: int, height: int) -> None:
-        import av
-
-        os.environ.setdefault("SVT_LOG", "1")  # the encoder writes its settings to stderr otherwise
-        self._pad = height % 2, width % 2
-        self._context = av.CodecContext.create("libsvtav1", "w")
-        assert isinstance(self._context, av.VideoCodecContext)
-        self._context.width, self._context.height = width + self._pad[1], height + self._pad[0]
-        self._context.pix_fmt = "yuv420p"
-        self._context.time_base, self._context.framerate = Fraction(1, 1), Fraction(1, 1)
-        self._context.gop_size = KEYFRAME_EVERY
-        low_delay = "pred-struct=1:lookahead=0:rtc=1:lp=2"
-        self._context.options = {"preset": str(AV1_PRESET), "crf": str(AV1_QUALITY), "svtav1-params": low_delay}
-        self._count = 0
-
-    def encode(self, pixels_bgr: NDArray[np.uint8]) -> tuple[bytes, bool]:
-        """The data of an image (H, W, 3), and whether it can be decoded without the images before it."""
-        import av
-
-        if any(self._pad):
-            pixels_bgr = np.pad(pixels_bgr, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels_bgr), format="bgr24")
-        frame = frame.reformat(format="yuv420p")
-        frame.pts, self._count = self._count, self._count + 1
-        (packet,) = self._context.encode(frame)
-        return bytes(packet), bool(packet.is_keyframe)
-
-    def close(self) -> None:
-        """Ends the stream and frees the encoder."""
-        self._context.encode(None)
-
-
 @dataclass
 class CameraImages:
     """Writes the images of all cameras. as_video: AV1, in place of the bytes of the image files."""
 
     stream: rr.RecordingStream
     as_video: bool
-    encoders: dict[str, Av1Encoder] = field(default_factory=dict)
+    encoders: "dict[str, Av1Encoder]" = field(default_factory=dict)
 
     def log(self, camera: str, image: CameraImage | None) -> None:
         """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
@@ -264,6 +224,8 @@ class CameraImages:
                 self.encoders.pop(camera).close()
         elif self.as_video:
             if camera not in self.encoders:
+                from bevcli.recording.av1 import Av1Encoder  # needs PyAV
+
                 height, width = image.pixels_bgr.shape[:2]
                 self.encoders[camera] = Av1Encoder(width, height)
             data, is_keyframe = self.encoders[camera].encode(image.pixels_bgr)

@@ -1,7 +1,6 @@
 """`bevcli eval`: scores predictions."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +42,7 @@ def evaluate(
 
     if len(predictions) > 2:
         raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
-    score: Callable[..., Any] = evaluate if len(predictions) == 1 else compare
+    score: Any = evaluate if len(predictions) == 1 else compare
     scores = score(
         *predictions,
         ground_truth,

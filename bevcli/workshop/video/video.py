@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -50,6 +51,9 @@ from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
 
+if TYPE_CHECKING:
+    from bevcli.recording.av1 import Av1Decoder
+
 MOST_PIXELS = 64 << 20
 STRIPS = "LineStrips2D:strips"
 OPACITIES = 10  # steps of opacity, faint to opaque
@@ -60,27 +64,6 @@ BELOW_BOXES = (
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 H264_QUALITY = 21  # x264's crf
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
-
-
-class Av1Decoder:
-    """Decodes the images that an `Av1Encoder` made, in order."""
-
-    def __init__(self) -> None:
-        import av
-
-        self._context = av.CodecContext.create("libdav1d", "r")
-        self._context.options = {"max_frame_delay": "1", "threads": "1"}
-
-    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
-        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe and for damaged data."""
-        import av
-
-        assert isinstance(self._context, av.VideoCodecContext)
-        try:
-            images = self._context.decode(av.Packet(data))
-        except av.FFmpegError:
-            return None
-        return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None
 
 
 class RecordedImages:
@@ -96,6 +79,8 @@ class RecordedImages:
         if data:
             if camera not in self._decoders:
                 require_av("the images of this recording are AV1")
+                from bevcli.recording.av1 import Av1Decoder
+
                 self._decoders[camera] = Av1Decoder()
             return self._decoders[camera].decode(data)
         encoded = frame.blob(entity, "EncodedImage:blob")
