@@ -283,7 +283,10 @@ def test_a_frame_of_a_nuscenes_root_is_seen_in_its_scene(tmp_path: Path) -> None
     ("change", "message"),
     [
         ({"resamples": 0}, "`resamples` is 0"),
-        ({"tracking": True}, "`tracking=True`: two files of predictions are compared by their boxes only"),
+        (
+            {"tracking": True},
+            r"`tracking=True` \(`--tracking`\): two files of predictions are compared by their boxes only",
+        ),
         ({"max_range": -1.0}, "the largest range is not positive"),
     ],
 )

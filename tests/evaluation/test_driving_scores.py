@@ -124,7 +124,7 @@ def test_objects_of_frames_without_predictions_are_not_found(tmp_path: Path) -> 
 def test_missing_files_are_named(tmp_path: Path) -> None:
     found = write(tmp_path / "found", car, path(1.0), LINE, ("predictions.json", "map_lines.json"))
     truth = write(tmp_path / "truth", car, path(1.0), LINE, ("ground_truth.json", "other.json"))
-    with pytest.raises(InputError, match=r"ground_truth_lines\.json: `map`: the file is missing"):
+    with pytest.raises(InputError, match=r"ground_truth_lines\.json: `map` \(`--map`\): the file is missing"):
         evaluate(found, truth, map=True)
 
 

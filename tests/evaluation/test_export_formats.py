@@ -197,4 +197,4 @@ def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
 def test_an_unknown_format_names_the_known_ones() -> None:
     sample = Path(__file__).parents[2] / "samples/street/ground_truth.json"
     answer = CliRunner().invoke(app, ["export", str(sample), "--format", "dxf"])
-    assert "--format dxf: unknown format (expected csv, json, kitti, " in str(answer.exception)
+    assert "`form=dxf` (`--format`): unknown format (expected csv, json, kitti, " in str(answer.exception)
