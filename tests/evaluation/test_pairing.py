@@ -93,9 +93,8 @@ def test_frames_of_one_side_are_left_out_or_counted_with_a_note() -> None:
     half = boxes_file(PREDICTIONS[:2])
     left_out = pair_frames(half, boxes_file(TRUTH))
     assert len(left_out.predictions) == 2
-    assert left_out.notes == (
-        "2 of 4 ground-truth frames have no prediction: left out (`count_missing=True` (`--count-missing`) counts them)",
-    )
+    found = "2 of 4 ground-truth frames have no prediction: left out"
+    assert left_out.notes == (f"{found} (`count_missing=True` (`--count-missing`) counts them)",)
     counted = pair_frames(half, boxes_file(TRUTH), count_missing=True)
     assert [len(frame.boxes) for frame in counted.predictions[2:]] == [0, 0]
     assert "count as missed" in counted.notes[0]
