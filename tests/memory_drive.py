@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.model.step import NUSCENES_YAWS_DEG
 
 
 def make_camera(name: str, yaw_deg: float, width: int = 320, height: int = 180) -> Camera:

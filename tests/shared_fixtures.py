@@ -12,6 +12,7 @@ import torch
 from warm_python import WarmPython
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.machine import keep_freed_memory
 from bevcli.model.bevformer.bevformer import BEVFormer
@@ -20,7 +21,6 @@ from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.viewer import recording_file
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig

@@ -7,9 +7,8 @@ import numpy as np
 from memory_drive import MemoryDrive, make_camera
 from recorded_drive import with_truth
 
-from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, default_ego_from_bev
 from bevcli.inference.options import ModelOptions
-from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions
 from bevcli.workshop.batch.job import Job

@@ -21,6 +21,16 @@ LARGEST_RAY_ERROR = 1e-5  # of a normalised coordinate
 OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
 NOISE_M = 0.05  # standard deviation per level and axis of `camera_pose_noise`
 
+# Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
+NUSCENES_YAWS_DEG = {
+    "CAM_FRONT": 0.0,
+    "CAM_FRONT_RIGHT": -55.0,
+    "CAM_FRONT_LEFT": 55.0,
+    "CAM_BACK": 180.0,
+    "CAM_BACK_LEFT": 110.0,
+    "CAM_BACK_RIGHT": -110.0,
+}
+
 
 @dataclass(frozen=True)
 class Distortion:

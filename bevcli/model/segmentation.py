@@ -13,15 +13,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from bevcli.frame import BevMap, class_bits
+from bevcli.frame import MAP_CLASSES, BevMap, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig, DecoderLayer, branch, inverse_sigmoid
 from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.encoder import FeedForward
 
 # Each stuff class has one query of its own. The thing class has many; training matches them to instances.
-STUFF_CLASSES = ("drivable_road", "lane_boundary", "pedestrian_crossing")
-THING_CLASS = "vehicle"
+STUFF_CLASSES, THING_CLASS = tuple(MAP_CLASSES)[:-1], tuple(MAP_CLASSES)[-1]
 
 
 @dataclass(frozen=True)

@@ -12,23 +12,13 @@ from torch import Tensor
 from bevcli.errors import InputError
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig
 from bevcli.geometry.transforms import Pose, wrap_angle
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
-
-# Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
-NUSCENES_YAWS_DEG = {
-    "CAM_FRONT": 0.0,
-    "CAM_FRONT_RIGHT": -55.0,
-    "CAM_FRONT_LEFT": 55.0,
-    "CAM_BACK": 180.0,
-    "CAM_BACK_LEFT": 110.0,
-    "CAM_BACK_RIGHT": -110.0,
-}
 
 
 @dataclass(frozen=True)

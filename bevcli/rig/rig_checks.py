@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from bevcli.findings import Finding
-from bevcli.geometry.cameras import Camera
+from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.transforms import Array
 
 _STEP_DEG = 0.1
@@ -340,7 +340,7 @@ def _matrix_error(camera: Camera) -> Finding | None:
     return Finding("principal-point", "error", camera.name, message, found, expected, advice)
 
 
-BEV_HEIGHT_M = 1.84  # of LIDAR_TOP in nuScenes
+BEV_HEIGHT_M = float(default_ego_from_bev()[2, 3])
 HEIGHT_ERROR_M, HEIGHT_WARNING_M = 1.2, 0.4
 TILT_ERROR_DEG, TILT_WARNING_DEG = 15.0, 6.0
 TILT_INFO_DEG = 1.0  # the demo model's training drives are level; nuScenes' LIDAR_TOP is tilted by 1 to 3

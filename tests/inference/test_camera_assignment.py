@@ -2,7 +2,8 @@ import pytest
 from memory_drive import make_rig
 
 from bevcli.errors import InputError
-from bevcli.model.step import NUSCENES_YAWS_DEG, assign_cameras
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
+from bevcli.model.step import assign_cameras
 
 MODEL = tuple(NUSCENES_YAWS_DEG)
 

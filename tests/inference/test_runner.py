@@ -7,13 +7,13 @@ from memory_drive import MemoryDrive, WithoutImages, make_rig
 from stepping import CPU, run
 
 from bevcli.errors import InputError
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.geometry.transforms import apply
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.step import NUSCENES_YAWS_DEG
 
 
 def assert_same(one, other):

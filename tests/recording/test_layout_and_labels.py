@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from memory_drive import make_camera, make_rig
 
-from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.model.step import NUSCENES_YAWS_DEG
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, default_ego_from_bev
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, camera_rows, rows_by_yaw
 from bevcli.recording.log_cameras import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.files import is_there
@@ -36,7 +36,7 @@ from bevcli.sequences.nuscenes.tables import open_index, read_rows
 from bevcli.sequences.options import InputOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
-CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+CAMERAS = tuple(NUSCENES_YAWS_DEG)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,11 @@ import torch
 from torch import nn
 
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network, build_network
-from bevcli.model.step import NUSCENES_YAWS_DEG
 from bevcli.sequences.images import ImageReader, MessageSource
 
 WIDTH, HEIGHT = 1600, 900
