@@ -21,8 +21,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.published import hub_model, is_of_hub, read_sources
-from bevcli.registry import entries, known_models, load
+from bevcli.published import hub_model, read_sources
+from bevcli.registry import entries, is_of_hub, known_models, load
 
 T = TypeVar("T")
 

@@ -168,11 +168,6 @@ class HubModel:
     source: str
 
 
-def is_of_hub(name: str) -> bool:
-    """True for the name of a model of the Hugging Face Hub, "hf:OWNER/NAME"."""
-    return name.startswith("hf:")
-
-
 def hub_model(name: str, *, fetch: bool = False) -> HubModel:
     """The model of a hub, downloaded if it is not on this machine.
 

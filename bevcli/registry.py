@@ -96,6 +96,11 @@ def load(group: Group, name: str) -> Any:
         ) from error
 
 
+def is_of_hub(name: str) -> bool:
+    """True for the name of a model of the Hugging Face Hub, "hf:OWNER/NAME"."""
+    return name.startswith("hf:")
+
+
 def known_models() -> tuple[str, ...]:
     """The names of the models whose TOML files come with the package."""
     files = resources.files("bevcli").joinpath("configs").iterdir()

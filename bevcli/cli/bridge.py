@@ -16,7 +16,7 @@ import typer
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
-from bevcli.published import is_of_hub
+from bevcli.registry import is_of_hub
 from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}

@@ -12,6 +12,7 @@ from bevcli.cli.main import PlainCommand
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, print_note, say
+from bevcli.registry import is_of_hub
 from bevcli.weights.options import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def fetch(
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
     from bevcli.cli.progress import fetch_with_bar
-    from bevcli.published import hub_model, is_of_hub, named_weights
+    from bevcli.published import hub_model, named_weights
 
     if is_of_hub(name):
         found = hub_model(name, fetch=True)

@@ -31,8 +31,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.published import NamedWeights, all_weights, hub_model, is_of_hub, named_weights, weights_folder
-from bevcli.registry import entries, load
+from bevcli.published import NamedWeights, all_weights, hub_model, named_weights, weights_folder
+from bevcli.registry import entries, is_of_hub, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
 
