@@ -9,6 +9,8 @@ import typer
 
 from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.main import PlainCommand
+from bevcli.cli.progress import fetch_with_bar
+from bevcli.errors import OutputError
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, print_note, say
@@ -17,7 +19,6 @@ from bevcli.weights.options import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
-    from bevcli.model.parts import ModelPart
     from bevcli.published import NamedWeights
 
 PANEL = "Train"
@@ -59,7 +60,6 @@ def fetch(
     A cut download goes on where it ended. The file is checked: its hash if that is known, else its size and the keys
     and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
     """
-    from bevcli.cli.progress import fetch_with_bar
     from bevcli.published import hub_model, named_weights
 
     if is_of_hub(name):
@@ -95,26 +95,25 @@ def inspect(
     the paper's terms (backbone, BEV queries, attentions, detection head, …) with the shapes of their weights and the
     number of their parameters.
     """
-    from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
-    from bevcli.config import load_config
-    from bevcli.model.parts import model_parts
+    from bevcli import checkpoints, config as configs
+    from bevcli.model.parts import model_parts, parts_as_text
 
     if file is None and model is None:
         raise typer.BadParameter("give FILE, or --model NAME, or both")
     data: dict[str, object] = {}
     texts = []
-    checkpoint = None if file is None else read_checkpoint(file)
+    checkpoint = None if file is None else checkpoints.read_checkpoint(file)
     if checkpoint is not None:
         data |= _as_data(checkpoint)
         texts.append(_as_text(checkpoint))
     if model is not None:
-        config = load_config(model)
+        config = configs.load_config(model)
         if checkpoint is not None:
-            require_fit(checkpoint, model, expected_state(config))
+            checkpoints.require_fit(checkpoint, model, checkpoints.expected_state(config))
         parts = model_parts(config)
         data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
         data["parts"] = [asdict(part) for part in parts]
-        texts.append(_parts_as_text(config.name, parts))
+        texts.append(parts_as_text(config.name, parts))
     say(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
@@ -130,7 +129,6 @@ def convert(
     It must fit one of our models.
     """
     from bevcli.checkpoints import convert as convert_file
-    from bevcli.errors import OutputError
 
     if destination.exists() and not force:
         raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")
@@ -233,16 +231,4 @@ def _as_text(checkpoint: "Checkpoint") -> str:
         f"{checkpoint.path}: {size:.1f} MB, {len(checkpoint.state)} tensors, {values:.1f} M values",
         *(f"  {name:<15} {value}" for name, value in rows if value),
     ]
-    return "\n".join(lines)
-
-
-def _parts_as_text(model: str, parts: tuple["ModelPart", ...]) -> str:
-    from bevcli.model.parts import describe_shapes
-
-    width = max(len(part.name) for part in parts)
-    lines = [f"{f'model {model}':<{width}}  {'parameters':>12}  shapes of the weights"]
-    lines += [
-        f"{part.name:<{width}}  {part.parameters:>12,}  {describe_shapes(part.shapes)}".rstrip() for part in parts
-    ]
-    lines.append(f"{'total':<{width}}  {sum(part.parameters for part in parts):>12,}")
     return "\n".join(lines)

@@ -54,5 +54,16 @@ def describe_shapes(shapes: tuple[Shape, ...]) -> str:
     return ", ".join(_text(shape) if count == 1 else f"{count} of {_text(shape)}" for shape, count in counts.items())
 
 
+def parts_as_text(model: str, parts: tuple[ModelPart, ...]) -> str:
+    """A table of the parts with the shapes of their weights."""
+    width = max(len(part.name) for part in parts)
+    lines = [f"{f'model {model}':<{width}}  {'parameters':>12}  shapes of the weights"]
+    lines += [
+        f"{part.name:<{width}}  {part.parameters:>12,}  {describe_shapes(part.shapes)}".rstrip() for part in parts
+    ]
+    lines.append(f"{'total':<{width}}  {sum(part.parameters for part in parts):>12,}")
+    return "\n".join(lines)
+
+
 def _text(shape: Shape) -> str:
     return " × ".join(map(str, shape))

@@ -17,7 +17,6 @@ from bevcli.workshop.training.job import (
     TrainingConfig,
     TrainingJob,
     join_process_group,
-    leave_process_group,
 )
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.trainer import Trainer
@@ -33,7 +32,7 @@ def train_in_a_group_of_two(rank: int, folder: Path) -> None:
     group = ProcessGroup(rank, 2)
     assert_averages(group)
     train(group, folder)
-    leave_process_group(group)
+    group.leave()
 
 
 def assert_averages(group: ProcessGroup) -> None:
@@ -79,4 +78,4 @@ def test_without_torchrun_a_process_is_its_own_leader(monkeypatch: pytest.Monkey
     group = join_process_group(torch.device("cpu"))
     assert group == ProcessGroup(0, 1)
     assert group.leads
-    leave_process_group(group)
+    group.leave()

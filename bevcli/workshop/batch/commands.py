@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
+from bevcli.cli.progress import Progress, fetch_with_bar, load_with_bar
+from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError, WeightsError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -57,7 +59,6 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.cli.progress import load_with_bar
     from bevcli.workshop.batch.batch import prepare_batch
 
     if options.retry_failed and not options.resume:
@@ -90,8 +91,6 @@ def run_with_progress(
     retry_failed: bool = False,
 ) -> "BatchSummary":
     """Run a batch with its progress on stderr. A stopped one ends the command with the exit code of the signal."""
-    from bevcli.cli.progress import Progress
-    from bevcli.cli.stop_signals import StopSignals
     from bevcli.workshop.batch.run_batch import run_batch
 
     alone = workers.in_this_process
@@ -150,15 +149,12 @@ def reproduce(
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
     question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
-    from bevcli.cli.progress import load_with_bar
     from bevcli.published import named_weights
-    from bevcli.workshop.batch.batch import model_for_batch
-    from bevcli.workshop.batch.job import Job, all_own_options, find_drives, with_absolute_paths
-    from bevcli.workshop.batch.report import METRICS
+    from bevcli.workshop.batch import batch as work, job as jobs, report
 
     named = named_weights(name, model.weights_dir)
     split = NuScenesOptions(options.version, options.split)
-    drives, notes = find_drives([str(options.data)], split)
+    drives, notes = jobs.find_drives([str(options.data)], split)
     if any(drive.scene is None for drive in drives):
         no_root = f"{options.data}: is not a nuScenes root (expected a folder with v1.0-*/scene.json)"
         raise InputError(drives[0].problem or no_root)
@@ -167,15 +163,15 @@ def reproduce(
     if model.weights is None:
         _get(named, model)
     out = options.out or Path("runs") / f"reproduce-{name}-{options.split}"
-    job = Job(
+    job = jobs.Job(
         str(out.absolute()),
-        with_absolute_paths(replace(model, model=name)),
-        own=all_own_options({"version": options.version}),
+        jobs.with_absolute_paths(replace(model, model=name)),
+        own=jobs.all_own_options({"version": options.version}),
         run=replace(run_options, track=False, recording=RecordingOptions(level="minimal")),
         evaluate=True,
         retries=workers.retries,
     )
-    loaded = model_for_batch(job, workers, load_with_bar)
+    loaded = work.model_for_batch(job, workers, load_with_bar)
     job = replace(job, source=InputOptions().for_model(loaded.config, temporal=run_options.temporal))
     summary = run_with_progress(job, loaded, drives, notes, workers, resume=options.resume, retry_failed=options.resume)
     if not any(record.get("scores") for record in summary.records):
@@ -183,7 +179,7 @@ def reproduce(
             (text for one in summary.records if (text := one.get("error") or one.get("not_scored"))), "no frames"
         )
         raise InputError(f"{options.data}: no scene could be scored: {why}")
-    metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
+    metrics = json.loads((out / report.METRICS).read_text(encoding="utf-8"))
     comparison = compare_with_published(metrics, named.source.published)
     say(json.dumps(comparison, indent=1) if as_json else table_of(comparison["scores"]))
     for note in comparison["notes"]:
@@ -195,8 +191,6 @@ def reproduce(
 
 def _get(named: "NamedWeights", model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
-    from bevcli.cli.progress import fetch_with_bar
-
     if named.here is not None:
         return
     if named.file is None:

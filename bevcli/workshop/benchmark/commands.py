@@ -2,17 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from bevcli.cli.bridge import Json, Part
 from bevcli.errors import BevcliError
-from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions, complete_model
+from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.options import option, options
 from bevcli.printing import print_note, say
 from bevcli.registry import known_models
-
-if TYPE_CHECKING:
-    from bevcli.inference.load import Model
 
 PANEL = "Deploy"
 
@@ -53,37 +50,21 @@ def bench(
     should run on the machine at the same time.
     """
     from bevcli.config import load_config
-    from bevcli.workshop.benchmark.measure import run_benchmark
-    from bevcli.workshop.benchmark.versions import compare_engines
+    from bevcli.workshop.benchmark import made_up, measure, versions
 
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("--engines compares all of them on the CPU: leave out other options")
-        table = compare_engines(load_config(options.model), options.frames, print_note)
+        table = versions.compare_engines(load_config(options.model), options.frames, print_note)
         say(json.dumps(table.as_data(), indent=1) if as_json else table.text())
         return
-    model, against_plain = _model(options, model_options), options.against == "plain"
-    result = run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)
-    say(json.dumps(result.as_data(), indent=1) if as_json else result.text())
-
-
-def _model(options: BenchOptions, model_options: ModelOptions) -> "Model":
-    """The exported file, or a model with made-up weights in the engine that is asked for."""
-    from bevcli.config import load_config
-    from bevcli.inference.load import Model, choose_engine, load_model
-    from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
-    from bevcli.workshop.engines.engine import CALIBRATION_FRAMES
-
-    if options.model.endswith(EXPORTED_SUFFIX):
-        model = load_model(options.model, options=model_options)
-    else:
-        config = load_config(options.model)
-        engine, device, precision = choose_engine(model_options, config)
-        model = Model(made_up_model(config), device, precision, engine=engine)
+    model = made_up.model_to_time(options.model, model_options)
     parts = " and ".join(f"--{name}" for name in ("against", "profile") if getattr(options, name) is not None)
     if parts:
         model.require_parts(parts)
     if model.needs_export:
-        drive = MadeUpDrive(CALIBRATION_FRAMES)
+        drive = made_up.MadeUpDrive(made_up.CALIBRATION_FRAMES)
         model = model.in_engine(drive.rig, drive, report=print_note)
-    return model
+    against_plain = options.against == "plain"
+    result = measure.run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)
+    say(json.dumps(result.as_data(), indent=1) if as_json else result.text())

@@ -8,13 +8,17 @@ import numpy as np
 import torch
 from torch import nn
 
+from bevcli.config import load_config
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
+from bevcli.inference.load import Model, choose_engine, load_model
+from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network, build_network
 from bevcli.sequences.images import ImageReader, MessageSource
+from bevcli.workshop.engines.engine import CALIBRATION_FRAMES as CALIBRATION_FRAMES
 
 WIDTH, HEIGHT = 1600, 900
 FOCAL_LENGTH = 1266.0  # pixels, of all nuScenes cameras but the one at the back
@@ -106,3 +110,12 @@ def _jpeg(seed: int) -> bytes:
     image = 110 + sum(cv2.resize(layer, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for layer in layers)
     encoded = cv2.imencode(".jpg", np.clip(image, 0, 255).astype(np.uint8))[1]
     return encoded.tobytes()
+
+
+def model_to_time(name: str, options: ModelOptions) -> Model:
+    """The exported file of a name, or a model with made-up weights for the engine that is asked for."""
+    if name.endswith(EXPORTED_SUFFIX):
+        return load_model(name, options=options)
+    config = load_config(name)
+    engine, device, precision = choose_engine(options, config)
+    return Model(made_up_model(config), device, precision, engine=engine)

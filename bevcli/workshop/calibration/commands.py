@@ -4,10 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
+from bevcli.cli.progress import Progress
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions
+from bevcli.writing import check_output
 
 PANEL = "Look"
 
@@ -27,15 +30,13 @@ def calibrate(
     Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --calibration FILE` uses the corrected rig. With --odometry the
     motion comes from the images, too: it and the calibration are measured in turn until both stand still.
     """
-    from bevcli.cli.progress import Progress
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.calibration.calibrate import STEPS, calibrate as measure
-    from bevcli.workshop.calibration.in_turn import ALL_STEPS, calibrate_in_turn
-    from bevcli.writing import check_output
+    from bevcli.workshop.calibration import calibrate as at_once, in_turn
 
-    steps, measure_it = (ALL_STEPS, calibrate_in_turn) if source.odometry else (STEPS, measure)
+    steps, measure_it = (
+        (in_turn.ALL_STEPS, in_turn.calibrate_in_turn) if source.odometry else (at_once.STEPS, at_once.calibrate)
+    )
     reading = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
-    drive = open_sequence(sequence, reading, ground_truth=False, **format_options)
+    drive = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
     with Progress(steps, "steps", drive.notes) as progress:

@@ -5,6 +5,7 @@ import json
 from bevcli.cli.bridge import Json
 from bevcli.options import option, options
 from bevcli.printing import print_note, say
+from bevcli.workshop.checks.checks import CHECKS, as_text, tell
 
 PANEL = "Start"
 
@@ -24,8 +25,6 @@ def checks(options: ChecksOptions, as_json: Json = False) -> None:
     Each line that cannot be told says why; the command itself never fails. Names of the user and the environment are
     left out. Connects to no other machine.
     """
-    from bevcli.workshop.checks.checks import CHECKS, as_text, tell
-
     facts = {title: tell(check) for title, check in CHECKS.items()}
     if options.speed:
         from bevcli.workshop.checks.speed import measure_speed

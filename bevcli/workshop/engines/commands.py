@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import bevcli
 from bevcli.cli.bridge import Part, argument, model_option
 from bevcli.inference.options import FILE_ENGINE, ModelOptions
 from bevcli.options import option, options
@@ -34,17 +35,14 @@ def export_onnx(
     an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
     docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.inference.load import load_model
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.exported import check_exported, difference_lines
-    from bevcli.workshop.engines.write_model import write_model
+    from bevcli.workshop.engines import exported, write_model
 
-    loaded = load_model(model, options=replace(model_options, device="cpu"))
-    drive = None if options.check is None else open_sequence(options.check, rate_hz=loaded.config.rate_hz)
-    target, loaded = write_model(loaded, file, options)
+    loaded = bevcli.load_model(model, options=replace(model_options, device="cpu"))
+    drive = None if options.check is None else bevcli.open_sequence(options.check, rate_hz=loaded.config.rate_hz)
+    target, loaded = write_model.write_model(loaded, file, options)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
-        say("\n".join(difference_lines(list(check_exported(target, loaded, drive)))))
+        say("\n".join(exported.difference_lines(list(exported.check_exported(target, loaded, drive)))))
 
 
 @options()
@@ -85,17 +83,15 @@ def quantize(
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.engines.exported import check_exported, difference_lines, load_exported
-    from bevcli.workshop.engines.write_model import write_quantized
+    from bevcli.workshop.engines import exported, write_model
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
     engine = model_options.engine or FILE_ENGINE
     drive = None
     if options.check is not None:
-        drive = open_sequence(options.check, rate_hz=load_exported(model, engine).config.rate_hz)
-    target = write_quantized(model, options.calibrate, options.frames, engine, file)
+        drive = bevcli.open_sequence(options.check, rate_hz=exported.load_exported(model, engine).config.rate_hz)
+    target = write_model.write_quantized(model, options.calibrate, options.frames, engine, file)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
-        say("\n".join(difference_lines(list(check_exported(target, model, drive, engine)))))
+        say("\n".join(exported.difference_lines(list(exported.check_exported(target, model, drive, engine)))))

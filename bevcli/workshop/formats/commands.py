@@ -4,7 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
+from bevcli.cli.progress import Progress, odometry_bar
 from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
@@ -29,7 +31,6 @@ def convert(
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
-    from bevcli.cli.progress import Progress, odometry_bar
     from bevcli.workshop.formats.convert import drive_to_convert, write_drive
 
     with odometry_bar() as show_steps:
@@ -60,7 +61,5 @@ def export(
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    from bevcli.workshop.formats.export import export
-
-    target, what = export(predictions, options, report=print_note)
+    target, what = bevcli.export(predictions, options, report=print_note)
     say(f"{target}: {what}")

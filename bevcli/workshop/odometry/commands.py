@@ -4,10 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
+from bevcli.cli.progress import Progress
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.odometry import OdometryOptions, OdometryOutputOptions
+from bevcli.writing import check_output
 
 PANEL = "Look"
 
@@ -28,36 +31,28 @@ def odometry(
     the same for `bevcli viz`. A drive with more than 15 frames per second is thinned to 10, unless --rate or --every
     is given. Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --odometry` measures first and then runs a model.
     """
-    from bevcli.cli.progress import Progress
-    from bevcli.sequences.open import open_sequence
-    from bevcli.workshop.odometry.compare import compare
-    from bevcli.workshop.odometry.drives import at_most_rate
-    from bevcli.workshop.odometry.measure import MeasuredMotion, measure_steps
-    from bevcli.workshop.odometry.picture import WatchedDrive, stitched, write_picture
-    from bevcli.workshop.odometry.recording import write_recording
-    from bevcli.workshop.odometry.report import against_stated, check_measured, report_text, to_json, write_report
-    from bevcli.writing import check_output
+    from bevcli.workshop.odometry import compare, drives, measure, picture, recording, report
 
     reading = replace(source, ego_motion="measured")
-    found = open_sequence(sequence, reading, ground_truth=False, **format_options)
-    drive = WatchedDrive(found if source.rate_hz or source.every else at_most_rate(found))
+    found = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
+    drive = picture.WatchedDrive(found if source.rate_hz or source.every else drives.at_most_rate(found))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
     steps = []
     with Progress(len(drive.stamps) - 1, "steps", drive.notes) as progress:
-        for step in measure_steps(drive, options):
+        for step in measure.measure_steps(drive, options):
             steps.append(step)
             progress.advance()
-    motion = MeasuredMotion.of(drive, steps)
-    check_measured(motion)
+    motion = measure.MeasuredMotion.of(drive, steps)
+    report.check_measured(motion)
     stated = drive.stated_poses
-    difference = None if stated is None else against_stated(motion, stated)
+    difference = None if stated is None else report.against_stated(motion, stated)
     indices = [stamp.index for stamp in drive.stamps]
-    findings = () if drive.ego_motion is None else compare(drive.ego_motion, motion, indices)
-    written = write_report(motion, out, difference, findings)
-    road = stitched(drive, motion.poses)
-    write_picture(out / "odometry.png", motion, road, stated)
-    write_recording(out / "odometry.rrd", motion, drive, road, stated)
+    findings = () if drive.ego_motion is None else compare.compare(drive.ego_motion, motion, indices)
+    written = report.write_report(motion, out, difference, findings)
+    road = picture.stitched(drive, motion.poses)
+    picture.write_picture(out / "odometry.png", motion, road, stated)
+    recording.write_recording(out / "odometry.rrd", motion, drive, road, stated)
     written += [out / "odometry.png", out / "odometry.rrd"]
-    say((to_json if as_json else report_text)(motion, difference, findings))
+    say((report.to_json if as_json else report.report_text)(motion, difference, findings))
     say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -6,7 +6,11 @@ from typing import Annotated
 
 import typer
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
+from bevcli.cli.progress import Progress, load_with_bar
+from bevcli.cli.stop_signals import StopSignals
+from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
@@ -35,38 +39,27 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.progress import Progress, load_with_bar
-    from bevcli.cli.stop_signals import StopSignals
-    from bevcli.errors import InputError
-    from bevcli.sequences.open import open_sequence
-    from bevcli.sequences.view import select_range
-    from bevcli.workshop.robustness.conditions import choose_conditions
-    from bevcli.workshop.robustness.stress import read_results, stress, stress_table
-    from bevcli.workshop.synth.drives import RenderedDrives
+    from bevcli.workshop.robustness import conditions, stress as work
 
-    conditions = choose_conditions(output.severity, output.only)
-    other = None if options.against is None else read_results(options.against)
+    chosen_conditions = conditions.choose_conditions(output.severity, output.only)
+    other = None if options.against is None else work.read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
     loaded = load_with_bar(model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
-        drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
+        drives = [bevcli.open_sequence(path, chosen, **format_options) for path in sequence or ()]
     else:
-        seeds, cache = drive_options.rendered, drive_options.cache
-        rendered = RenderedDrives(seeds, cache, loaded.config, class_map=source.class_map)
-        drives = [rendered.open(index) for index in range(len(rendered))]
-        if source.frames is not None:
-            drives = [select_range(drive, source.frames) for drive in drives]
+        drives = work.rendered_drives(drive_options, loaded.config, source)
     loaded = loaded.in_engine(drives[0].rig, drives[0], report=print_note)
     out = output.out or Path("runs") / f"stress-{loaded.name}"
-    total = len(conditions) * sum(len(drive.stamps) for drive in drives)
+    total = len(chosen_conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [note for drive in drives for note in drive.notes]
     with Progress(total, "frames", notes) as progress, StopSignals("frame") as signals:
-        results = stress(
+        results = work.stress(
             loaded,
             drives,
-            conditions,
+            chosen_conditions,
             out,
             options,
             force=output.force,
@@ -78,7 +71,7 @@ def stress(
     if as_json:
         say(json.dumps(results.to_dict(other), indent=1))
     else:
-        say(f"drives  {len(drives)}\n\n{stress_table(results, other)}")
+        say(f"drives  {len(drives)}\n\n{work.stress_table(results, other)}")
     for name in () if other is None else results.differences(other):
         print_note(f'"{name}" differs from {options.against}: the corruption errors compare unlike tests')
     if not results.is_complete:

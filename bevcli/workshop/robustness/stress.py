@@ -17,17 +17,20 @@ from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
+from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
-from bevcli.sequences.view import DriveView, scenes_of, select
+from bevcli.sequences.options import InputOptions
+from bevcli.sequences.view import DriveView, scenes_of, select, select_range
 from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.scores.detection import evaluate_detections, known_mean
 from bevcli.workshop.scores.evaluate import finite
-from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
+from bevcli.workshop.synth.drives import FrameMemory, KeptFrames, RenderedDrives
+from bevcli.workshop.synth.options import DriveOptions
 from bevcli.writing import write_whole
 
 RESULTS, FORMAT = "stress.json", "bevcli-stress/1"
@@ -146,6 +149,14 @@ class StressState:
 
 class _Stopped(Exception):
     """The caller has asked to stop."""
+
+
+def rendered_drives(options: DriveOptions, config: ModelConfig, source: InputOptions) -> list[Drive]:
+    """The rendered drives of the options; `frames` and `class_map` are those of `source`. Raises InputError."""
+    assert options.rendered is not None
+    rendered = RenderedDrives(options.rendered, options.cache, config, class_map=source.class_map)
+    drives = [rendered.open(index) for index in range(len(rendered))]
+    return drives if source.frames is None else [select_range(drive, source.frames) for drive in drives]
 
 
 def stress(

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
 from bevcli.printing import print_note, say
@@ -37,12 +38,9 @@ def evaluate(
     With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
     frames.
     """
-    from bevcli.workshop.scores.compare import compare
-    from bevcli.workshop.scores.evaluate import evaluate
-
     if len(predictions) > 2:
         raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
-    score: Any = evaluate if len(predictions) == 1 else compare
+    score: Any = bevcli.evaluate if len(predictions) == 1 else bevcli.compare
     scores = score(
         *predictions,
         ground_truth,

@@ -4,6 +4,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bevcli.cli.bridge import argument
+from bevcli.cli.commands import show
+from bevcli.cli.progress import Progress
+from bevcli.cli.run import run
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
@@ -18,14 +21,12 @@ DEMO_RESOLUTION = (800, 450)
 
 def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
-    from bevcli.cli.progress import Progress
-    from bevcli.workshop.synth.drive import render as render_sequence
-    from bevcli.workshop.synth.shading_kernels import shade_pixels
+    from bevcli.workshop.synth import drive, shading_kernels
 
-    if not is_compiled(shade_pixels):
+    if not is_compiled(shading_kernels.shade_pixels):
         say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
     with Progress(options.frames, "frames") as progress:
-        summary = render_sequence(out, options, progress=lambda frame: progress.advance())
+        summary = drive.render(out, options, progress=lambda frame: progress.advance())
     size = f"{counted(summary.frames, 'frames')}, {counted(len(summary.cameras), 'cameras')}"
     say(f"{summary.folder}: {size}, {summary.weather}, seed {summary.seed}")
 
@@ -35,9 +36,6 @@ def demo(options: DemoOptions) -> None:
 
     The demo model was trained on rendered drives only.
     """
-    from bevcli.cli.commands import show
-    from bevcli.cli.run import run
-
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=DEMO_RESOLUTION, force=options.force))
     run(

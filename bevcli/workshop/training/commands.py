@@ -5,7 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import bevcli
 from bevcli.cli.bridge import Json, Part, model_option
+from bevcli.cli.progress import Progress, odometry_bar
+from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import counted, print_note, say
@@ -45,43 +48,33 @@ def train(
 
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
     """
-    import torch
-
-    from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import choose_device
-    from bevcli.workshop.training.job import leave_process_group, prepare_training
-    from bevcli.workshop.training.model_file import write_model_file
-    from bevcli.workshop.training.trainer import Trainer
+    from bevcli.workshop.training import model_file, train as work, trainer as loop
 
     if file_options.init is not None:
         if model or options != TrainOptions():
             raise InputError("--init trains nothing: remove the model and the options of a training")
         device = choose_device(model_options.device)
-        say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
+        say(*model_file.write_model_file(file_options.init, drives, file_options.preset or "quick", device))
         return
     if file_options.preset is not None:
         raise InputError("--preset is for --init: remove it")
     if not model:
         raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
-    torch.manual_seed(options.seed)
-    job = prepare_training(model, choose_device(model_options.device), drives, options)
+    job = work.seeded_job(model, model_options.device, drives, options)
     with job.lock:
-        trainer = Trainer(job, resume=options.resume)
+        trainer = loop.Trainer(job, resume=options.resume)
         if job.group.leads:
+            work.check_steps_left(trainer)
             _run(trainer)
         else:
             with StopSignals("step") as signals:
                 trainer.run(stop=signals.received)
-    leave_process_group(job.group)
+    job.group.leave()
 
 
 def _run(trainer: "Trainer") -> None:
     """Train in the process that prints. Raises typer.Exit after a stop."""
-    from bevcli.cli.progress import Progress
-    from bevcli.cli.stop_signals import StopSignals
-    from bevcli.workshop.training.train import check_steps_left
-
-    check_steps_left(trainer)
     job, first = trainer.job, trainer.done
     updates, steps = job.config.clips.updates, job.config.steps - first
 
@@ -126,12 +119,10 @@ def validate(
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
     """
-    from bevcli.cli.progress import Progress, odometry_bar
-    from bevcli.inference.load import load_model
     from bevcli.workshop.synth.drives import count_frames
     from bevcli.workshop.training.train import drives_to_score, has_ground_truth, score_drives
 
-    loaded = load_model(model, options=model_options)
+    loaded = bevcli.load_model(model, options=model_options)
     with odometry_bar() as show_steps:
         name = model or loaded.name
         drives, notes, loaded = drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
@@ -148,7 +139,6 @@ def validate(
 
 def _estimate(model: "Model", drives: "Drives", options: ValidationOptions, *, as_json: bool, temporal: bool) -> None:
     """Print the estimated score of each drive; none of them has ground truth."""
-    from bevcli.cli.progress import Progress
     from bevcli.workshop.synth.drives import FolderDrives, count_frames
     from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
 

@@ -72,6 +72,11 @@ class ProcessGroup:
         for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
             tensor.copy_(mean.view_as(tensor))
 
+    def leave(self) -> None:
+        """End the communication with the other processes."""
+        if self.size > 1:
+            torch.distributed.destroy_process_group()
+
 
 def join_process_group(device: torch.device) -> ProcessGroup:
     """Joins the group in which torchrun started this process; a group of one without torchrun.
@@ -84,12 +89,6 @@ def join_process_group(device: torch.device) -> ProcessGroup:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())
-
-
-def leave_process_group(group: ProcessGroup) -> None:
-    """Ends the communication with the other processes."""
-    if group.size > 1:
-        torch.distributed.destroy_process_group()
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from bevcli.inference.options import ModelOptions
 from bevcli.options import refuse, spread
 from bevcli.workshop.synth.drives import Drives, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.job import leave_process_group, prepare_training, rig_for_drives
+from bevcli.workshop.training.job import TrainingJob, prepare_training, rig_for_drives
 from bevcli.workshop.training.options import TrainOptions, ValidationOptions
 from bevcli.workshop.training.trainer import WEIGHTS, Trainer
 from bevcli.workshop.training.validation import Validation, check_scored_drives, validate as validate_runner
@@ -52,16 +52,21 @@ def train(
     """
     chosen, drives, left = spread(options, TrainOptions, DriveOptions)
     refuse(left, "train", TrainOptions, DriveOptions)
-    torch.manual_seed(chosen.seed)
-    job = prepare_training(str(model), choose_device(device), drives, chosen)
+    job = seeded_job(str(model), device, drives, chosen)
     with job.lock:
         trainer = Trainer(job, resume=chosen.resume)
         check_steps_left(trainer)
         for note in (*job.notes, *job.changed_settings(), *(start.table() for start in job.warm_starts)):
             report(note)
         trainer.run(after_step, after_validation, should_stop)
-    leave_process_group(job.group)
+    job.group.leave()
     return job.out / WEIGHTS
+
+
+def seeded_job(model: str, device: str, drives: DriveOptions, options: TrainOptions) -> TrainingJob:
+    """The job of a training, whose first weights are those of its seed. Raises as `train`."""
+    torch.manual_seed(options.seed)
+    return prepare_training(model, choose_device(device), drives, options)
 
 
 def check_steps_left(trainer: Trainer) -> None:
