@@ -1,30 +1,25 @@
 """The short commands of the core: `bevcli samples`, `viz` and `project-debug`."""
 
-import shlex
 import shutil
-import tempfile
 import textwrap
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
 from bevcli.options import Option, defaults, named
-from bevcli.printing import counted, say
+from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.rig import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.writing import output_errors, write_whole
-
-if TYPE_CHECKING:
-    from bevcli.frame import Frame
-
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look"}
 RIG = ("calibration", "extrinsics", "transform", "fov_deg", "height", "yaw_deg")
@@ -79,12 +74,12 @@ def viz(
     A drive needs no model: its labels are shown, or with --boxes those against boxes of one or two models. The input
     options and --score are for a drive.
     """
-    from bevcli.viewer.recording_file import is_recording, recording_in
+    from bevcli.cli import viewing
 
     if options.frame is not None and options.screenshot is None and (options.summary or options.video or options.out):
         raise typer.BadParameter("is only valid with --screenshot, or for the viewer", param_hint="--frame")
-    if not is_recording(shown):
-        _record_drive(shown, options, recording, source, format_options)
+    if not viewing.is_recording(shown):
+        viewing.record_drive(shown, options, recording, source, format_options)
         return
     kinds = (ViewOptions, RecordingOptions, InputOptions, *option_classes())
     usual = {name: (kind, value) for kind in kinds for name, value in defaults(kind).items()}
@@ -98,98 +93,7 @@ def viz(
     if given := [name for name, value in for_drives.items() if value != usual[name][1]]:
         option = named(usual[given[0]][0], given[0])
         raise InputError(f"{shown}: is a recording, and {option} is for a drive: remove it, or pass the drive")
-    show(recording_in(shown), options)
-
-
-def show(recording: Path, options: ViewOptions, name: Path | None = None) -> None:
-    """Show a recording, or write what the options name. name: for texts, in place of that of a temporary file."""
-    from bevcli.viewer.recording_file import open_recording
-
-    with open_recording(recording) as file:
-        if file != recording:
-            say(f"note: {recording} is incomplete (its run was stopped or is still going)")
-        if options.summary or options.screenshot or options.video:
-            _write_views(recording, file, options, name or recording)
-        else:
-            _open_viewer(file, options)
-
-
-def _record_drive(
-    path: Path, options: ViewOptions, recording: RecordingOptions, source: InputOptions, format_options: FormatValues
-) -> None:
-    """Record a drive and boxes, and show the recording."""
-    from bevcli.cli.progress import Progress, odometry_bar
-    from bevcli.cli.run import input_warnings
-    from bevcli.sequences.open import open_sequence
-    from bevcli.viewer.recording_file import RECORDING, check_is_drive
-    from bevcli.workshop.scores.record import names_of, record
-
-    check_is_drive(path)
-    if options.out is not None and options.out.suffix.lower() != ".rrd":
-        raise InputError(f"{options.out}: the file must end in .rrd")
-    boxes = names_of(options.boxes)
-    with odometry_bar() as show_steps:
-        drive = open_sequence(path, replace(source, after_step=show_steps), **format_options)
-    indices = [stamp.index for stamp in drive.stamps]
-    if options.frame is not None and options.frame not in indices:
-        raise InputError(f"--frame {options.frame}: the drive has frames {min(indices)} to {max(indices)}")
-    with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
-        file = options.out or Path(folder) / RECORDING
-        with Progress(len(drive.stamps), "frames", drive.notes) as progress:
-
-            def warn(frame: "Frame") -> None:
-                for warning in input_warnings(frame):
-                    progress.message(f"warning: {warning}")
-                progress.advance()
-
-            record(
-                drive,
-                boxes,
-                file,
-                score=recording.score,
-                class_map=source.class_map,
-                report=progress.message,
-                on_frame=warn,
-            )
-        if options.out is not None:
-            say(f"{file}: {counted(len(drive.stamps), 'frames')}; next: bevcli viz {shlex.quote(str(file))}")
-        if options.out is None or options.summary or options.screenshot or options.video:
-            show(file, options, path if options.out is None else file)
-
-
-def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: Path) -> None:
-    """Write what the options name. read_from: the recording, or a repaired copy of it. name: for texts."""
-    from bevcli.cli.progress import Progress
-    from bevcli.viewer.native import take_screenshot
-    from bevcli.viewer.recording_reader import summarise
-    from bevcli.workshop.video.video import frame_rate, write_video
-
-    if options.summary:
-        say(summarise(recording, read_from).replace(str(recording), str(name), 1))
-    if options.screenshot is not None:
-        views = take_screenshot(read_from, options.screenshot, options.frame)
-        say(f"{options.screenshot}: {len(views)} views")
-    if options.video is not None:
-        count, rate = frame_rate(read_from)
-        with Progress(count, "frames") as progress:
-            for _ in write_video(read_from, options.video, count, rate):
-                progress.advance()
-        say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
-
-
-def _open_viewer(recording: Path, options: ViewOptions) -> None:
-    from bevcli.viewer.native import display_is_there, show_window
-    from bevcli.viewer.web import WebViewer, web_viewer_assets
-
-    if display_is_there() and not options.web:
-        if show_window(recording, options.frame):
-            return
-        say("note: the viewer's window did not open; use the browser instead")
-    if options.frame is not None:
-        say(f"note: in the browser, set the timeline to frame {options.frame}")
-    viewer = WebViewer(web_viewer_assets(), recording, options.host, options.port)
-    say(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
-    viewer.serve()
+    viewing.show(viewing.recording_in(shown), options)
 
 
 def project_debug(
@@ -222,26 +126,26 @@ def project_debug(
 
     Exit code: 0 without errors, 3 with findings of severity error.
     """
-    from bevcli.config import load_config
-    from bevcli.inference.training_rigs import training_rig_notes
-    from bevcli.rig.check_calibration import check_calibration
-    from bevcli.rig.rig_report import INDENT, WIDTH, with_findings
-    from bevcli.sequences.open import open_sequence
+    from bevcli import config
+    from bevcli.inference import training_rigs
+    from bevcli.rig import rig_report
 
     given = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in given:
         raise InputError("--calibration and --sequence exclude each other: pass the drive, and its --calibration")
-    check = check_calibration(input, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
+    check = bevcli.check_calibration(
+        input, options.sequence, options.frame, allow_outside=source.allow_outside, **given
+    )
     model, gap = options.model or "demo", None
     if not check.errors:
         if options.sequence is not None:
             given["calibration"] = input
         how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
-        open_drive = partial(open_sequence, options.sequence or input, **how)
+        open_drive = partial(bevcli.open_sequence, options.sequence or input, **how)
         if options.motion:
             from bevcli.workshop.calibration.core_options import check_motion
 
-            check = replace(check, report=with_findings(check.report, check_motion(open_drive)))
+            check = replace(check, report=rig_report.with_findings(check.report, check_motion(open_drive)))
         if options.model is not None or options.against is not None:
             from bevcli.workshop.trust.gap_option import gap_of_rigs
 
@@ -253,8 +157,8 @@ def project_debug(
         say(check.to_json())
     else:
         notes = [
-            textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
-            for note in training_rig_notes(check.rig, load_config(model))
+            textwrap.fill(f"Model {model}: {note}.", rig_report.WIDTH, subsequent_indent=rig_report.INDENT) + "\n"
+            for note in training_rigs.training_rig_notes(check.rig, config.load_config(model))
         ]
         if gap is not None:
             notes.append(f"{gap.text()}\n")

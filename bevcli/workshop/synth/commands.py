@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bevcli.cli.bridge import argument
-from bevcli.cli.commands import show
 from bevcli.cli.progress import Progress
 from bevcli.cli.run import run
 from bevcli.inference.options import ModelOptions
@@ -48,6 +47,8 @@ def demo(options: DemoOptions) -> None:
         format_options={},
     )
     if options.view:
+        from bevcli.cli.viewing import show
+
         show(options.out / "results/recording.rrd", ViewOptions())
 
 
