@@ -3,7 +3,7 @@
 # make test       the fast tests, in two processes of one thread each; make test-all: all tests
 # make docs       the site of the documents of this version in build/site/VERSION, and the list of versions in build/site
 # make dist       the sdist and the wheel of the last commit in dist
-# make fuzz       15,500 broken files and wrong contents of every kind, up to 25 minutes on two cores
+# make fuzz       11,700 broken files and wrong contents of every kind, up to 25 minutes on two cores
 # make check      lint, who imports whom, and types; make format: fix what ruff can fix
 # make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile

@@ -16,11 +16,11 @@ import trimesh
 from damage import HUGE, damage, edited
 from mutations import TEXT, changed_tree
 from PIL import Image
-from run_cases import CAMERAS, TRACKER
 from small_model import small_inputs, small_model, step_of_file
 
 from bevcli.config import as_table
 from bevcli.inference.load import Model
+from bevcli.inference.tracking import TrackerConfig
 from bevcli.recording.meshes import load_vehicle
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch.job import read_record
@@ -32,6 +32,9 @@ from bevcli.workshop.engines.exported import load_exported
 onnx = pytest.importorskip("onnx")
 for package in ("onnxruntime", "openvino"):
     pytest.importorskip(package)
+
+CAMERAS = ("CAM_FRONT", "CAM_BACK")
+TRACKER = TrackerConfig(birth_score=0.0, keep_score=0.0)
 
 
 def onnx_file(seeds: Path, case: Path, random: Random) -> None:

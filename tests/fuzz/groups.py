@@ -14,9 +14,6 @@ from random import Random
 
 from dangling_cases import damaged_checkpoint, dangling_tokens
 from file_cases import batch_record, mesh, onnx_file, sqlite_schema
-from name_cases import bag_order, name_bytes
-from recording_cases import cut_recording, foreign_columns, reordered_recording
-from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
 from server_cases import server_behaviour
 
 
@@ -34,20 +31,11 @@ class Group:
 
 
 GROUPS = {
-    "output damaged between kill and resume": Group(resumed_after_damage, 1000),
-    "input exchanged between kill and resume": Group(exchanged_input, 800),
-    "input or output exchanged under way": Group(exchanged_under_way, 300),
-    "state with right hash and wrong content": Group(false_state, 600),
     "dangling tokens": Group(dangling_tokens, 400),
     "damaged checkpoint": Group(damaged_checkpoint, 400),
     "ONNX": Group(onnx_file, 600),
     "mesh with siblings": Group(mesh, 400),
     "batch record": Group(batch_record, 1000),
     "SQLite schema": Group(sqlite_schema, 700),
-    "foreign columns of recordings": Group(foreign_columns, 400),
-    "order of recordings": Group(reordered_recording, 100),
-    "cuts of recordings": Group(cut_recording, 200),
     "servers of weights": Group(server_behaviour, 1000),
-    "order of bags": Group(bag_order, 200),
-    "name bytes": Group(name_bytes, 200),
 }

@@ -1,6 +1,7 @@
 """`bevcli convert`: the native folder has the same frames as the input."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -40,6 +41,12 @@ def test_missing_images_and_camera_order_are_kept(edit, tmp_path):
                 a.world_from_ego_at[camera].matrix, b.world_from_ego_at[camera].matrix, atol=1e-9
             )
         np.testing.assert_allclose(a.kinematics.velocity, b.kinematics.velocity, atol=1e-12)
+
+
+def test_drives_and_outputs_may_have_names_of_any_bytes(drive, tmp_path):
+    name, out = (os.fsdecode(each) for each in (b"in\xff\n\x1b[2J", b"out\xe2\x28\xa1"))
+    assert convert(drive.rename(tmp_path / name), tmp_path / out).exit_code == 0
+    assert len(open_sequence(tmp_path / out).stamps) == 4
 
 
 def test_ground_truth_maps_are_converted(drive, tmp_path):
