@@ -1,11 +1,11 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation_from_quaternion
@@ -73,6 +73,11 @@ class EgoMotion:
         columns = [column.name for column in fields(self) if column.name != "velocities_are_stated"]
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
+    def covered(self, timestamps_ns: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each time is in the stored range, or at most 50 ms outside of it."""
+        times = np.asarray(timestamps_ns, dtype=np.int64)
+        return (times >= self.first_ns - TOLERANCE_NS) & (times <= self.last_ns + TOLERANCE_NS)
+
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.
 
@@ -94,7 +99,7 @@ class EgoMotion:
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
         times, first, last = self.timestamps_ns, self.first_ns, self.last_ns
-        if timestamp_ns < first - TOLERANCE_NS or timestamp_ns > last + TOLERANCE_NS:
+        if not self.covered(timestamp_ns):
             raise InputError(
                 f"ego-motion covers {first} to {last} ns, but an image or frame is at {timestamp_ns} ns "
                 "(at most 50 ms outside is allowed): add ego-motion for that time, or remove the frame"
@@ -104,6 +109,13 @@ class EgoMotion:
         if row == len(times) - 1:
             return row, 0.0
         return row, (clipped - int(times[row])) / (int(times[row + 1]) - int(times[row]))
+
+
+def nearest(times: NDArray[Any], wanted: ArrayLike) -> NDArray[np.int64]:
+    """(...) the index of the time nearest to each wanted one (...), the earlier of two. times: (T,), increasing."""
+    later = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    earlier, later = later - 1, np.minimum(later, len(times) - 1)
+    return np.where(wanted - times[earlier] <= times[later] - wanted, earlier, later)
 
 
 # Times (T,) in ns, translations (T, 3) in metres in the world frame, and quaternions (T, 4) of world_from_ego.

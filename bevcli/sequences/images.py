@@ -205,6 +205,11 @@ class FrameEntry:
     dropped: Mapping[str, str]
     origin: str
 
+    @property
+    def times_ns(self) -> list[int]:
+        """The times of the frame and of its images."""
+        return [self.stamp.timestamp_ns, *(source.timestamp_ns for source in self.sources.values())]
+
 
 def leads_out(path: Path, folder: Path) -> bool:
     """True for a path that is not below the folder, by its names alone: links are followed when the image is read."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
 # static: the vehicle stands, and the ego-motion is not read. measured: as optional, and `odometry` replaces it.
 EgoMotionUse = Literal["required", "optional", "static", "measured"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 def parse_frames(text: str) -> slice:
@@ -217,7 +218,7 @@ class RigOptions(FormatOptions):
         flag="--ego-motion",
         metavar="FILE",
     )
-    pose_times: Literal["s", "ms", "us", "ns"] | None = option(
+    pose_times: TimeUnit | None = option(
         default=None, help="Unit of the times in --ego-motion. Default: the only possible one."
     )
     pose_angles: Literal["degrees", "radians", "compass"] | None = option(

@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.ego_motion import EgoMotion, nearest
 from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 
@@ -192,6 +192,4 @@ def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
     # A tick later than half a frame period after the last frame has no frame of its own.
     end = seconds[-1] + 0.5 * np.median(np.diff(seconds))
     ticks = np.arange(0, end, 1 / rate_hz)
-    later = np.clip(np.searchsorted(seconds, ticks), 1, len(seconds) - 1)
-    earlier = later - 1
-    return np.unique(np.where(ticks - seconds[earlier] <= seconds[later] - ticks, earlier, later))
+    return np.unique(nearest(seconds, ticks))

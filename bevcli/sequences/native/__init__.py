@@ -11,12 +11,12 @@ from typing import Literal
 from bevcli.errors import InputError
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
-from bevcli.sequences.options import RigOptions
+from bevcli.sequences.options import RigOptions, TimeUnit
 
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
 # Seconds and their parts, a date with a time of day, or the index of an image.
-TimeKind = Literal["s", "ms", "us", "ns", "date", "index"]
+TimeKind = Literal[TimeUnit, "date", "index"]
 RATES_HZ = (0.001, 10_000.0)
 LARGEST_NS = 1 << 61  # of a stated time, so that sums have 64 bits
 

@@ -13,7 +13,6 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import TOLERANCE_NS
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
@@ -182,7 +181,7 @@ def check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...],
         times = {"the frame": entry.stamp.timestamp_ns}
         times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
         for what, time in times.items():
-            if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
+            if not poses.motion.covered(time):
                 raise InputError(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed{read_as}): {advice}"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.ego_motion import nearest
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
 from bevcli.sequences.nuscenes import versions_in
 
@@ -340,5 +341,5 @@ def sweep_frames(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int | 
 def _nearest(index: NuScenesIndex, by_camera: list[Ints], time: int) -> Ints:
     """Rows of each camera's image nearest to a time in us, without images that are too far away."""
     times = index.images.times_us
-    nearest = np.array([rows[np.argmin(np.abs(times[rows] - time))] for rows in by_camera])
-    return nearest[np.abs(times[nearest] - time) <= NEAR_US]
+    closest = np.array([rows[nearest(times[rows], time)] for rows in by_camera])
+    return closest[np.abs(times[closest] - time) <= NEAR_US]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import velocities_between
+from bevcli.geometry.ego_motion import nearest
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import LARGEST_INTEGER, parse_json, without_garbage_collection
 from bevcli.parsing.files import open_regular, read_bytes
@@ -197,8 +198,7 @@ def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
         pose_rows = lidar_rows.copy()
         for sample in np.flatnonzero(lidar_rows < 0):  # the nearest image; any in a scene without images
             rows = image_rows[slice(*starts[sample_scenes[sample] :][:2])]
-            distances = np.abs(data["times_us"][rows] - sample_times[sample])
-            pose_rows[sample] = rows[distances.argmin()] if len(rows) else 0
+            pose_rows[sample] = rows[nearest(data["times_us"][rows], sample_times[sample])] if len(rows) else 0
         annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
     scenes = Scenes(names, _starts(sample_scenes, len(names)), starts)
     translations, quaternions = data["translations"][pose_rows], data["quaternions"][pose_rows]

@@ -14,7 +14,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
+from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes, nearest
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
@@ -252,7 +252,7 @@ def _entries(
 def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
     sources = {}
     for name, times in images.items():
-        nearest = int(times[np.abs(times - time).argmin()]) if len(times) else None
-        if nearest is not None and abs(nearest - time) <= NEAR_NS:
-            sources[name] = ImageSource(folder / name / f"{nearest}.jpg", nearest)
+        image_ns = int(times[nearest(times, time)]) if len(times) else None
+        if image_ns is not None and abs(image_ns - time) <= NEAR_NS:
+            sources[name] = ImageSource(folder / name / f"{image_ns}.jpg", image_ns)
     return sources

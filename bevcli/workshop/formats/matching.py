@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.frame import FrameStamp
+from bevcli.geometry.ego_motion import nearest
 from bevcli.sequences.images import FrameEntry, ImageSource
 
 FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
@@ -33,11 +34,7 @@ class CameraImages:
 
     def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""
-        later = np.clip(np.searchsorted(self.times_ns, times_ns), 1, max(len(self.times_ns) - 1, 1))
-        earlier = later - 1
-        later = np.minimum(later, len(self.times_ns) - 1)
-        is_earlier = times_ns - self.times_ns[earlier] <= self.times_ns[later] - times_ns
-        chosen = np.where(is_earlier, earlier, later)
+        chosen = nearest(self.times_ns, times_ns)
         return chosen, np.abs(self.times_ns[chosen] - times_ns) <= FARTHEST * self.period_ns
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.sequences.native import TimeKind
 
 Times = NDArray[np.int64]
@@ -71,9 +71,7 @@ class Reading:
 
     def is_covered(self, motion: EgoMotion) -> bool:
         """True where the poses cover at least half of the times."""
-        times = np.concatenate(list(self.values.values()))
-        inside = (times >= motion.first_ns - TOLERANCE_NS) & (times <= motion.last_ns + TOLERANCE_NS)
-        return bool(inside.mean() >= 0.5)
+        return bool(motion.covered(np.concatenate(list(self.values.values()))).mean() >= 0.5)
 
 
 def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKind | None) -> Reading:

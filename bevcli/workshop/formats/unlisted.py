@@ -18,7 +18,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_there, read_text
 from bevcli.printing import counted
@@ -142,12 +142,7 @@ def find_frames(
 def covered(found: Found, motion: EgoMotion) -> Found:
     """The frames that the poses cover, if these are at least half of them; otherwise all, which is an error later."""
     entries, line = found
-    first, last = motion.first_ns - TOLERANCE_NS, motion.last_ns + TOLERANCE_NS
-    kept = []
-    for entry in entries:
-        times = [entry.stamp.timestamp_ns, *(source.timestamp_ns for source in entry.sources.values())]
-        if first <= min(times) and max(times) <= last:
-            kept.append(entry)
+    kept = [entry for entry in entries if motion.covered(entry.times_ns).all()]
     if len(kept) == len(entries) or 2 * len(kept) < len(entries):
         return found
     return tuple(kept), f"{line}; {counted(len(entries) - len(kept), 'frames')} outside of the poses left out"

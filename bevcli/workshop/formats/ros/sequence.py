@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DriveFacts, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.ego_motion import EgoMotion, nearest
 from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences import images
@@ -285,7 +285,7 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameE
         sources: dict[str, images.Source] = {}
         dropped = {}
         for name, own in times.items():
-            index = number if name == leading else _nearest(own, time)
+            index = number if name == leading else int(nearest(own, time))
             if abs(int(own[index]) - time) > 0.501 * periods[name]:
                 dropped[name] = f"{topics[name]} has no image within {periods[name] / 2e6:.0f} ms of {time} ns"
             else:
@@ -301,12 +301,7 @@ def _covered(
     """The frames with poses around all of their images, and notes. Localisation often starts later than the cameras."""
     if motion is None:
         return entries, ()
-    first, last = motion.first_ns - TOLERANCE_NS, motion.last_ns + TOLERANCE_NS
-    kept = tuple(
-        entry
-        for entry in entries
-        if all(first <= timed.timestamp_ns <= last for timed in (entry.stamp, *entry.sources.values()))
-    )
+    kept = tuple(entry for entry in entries if motion.covered(entry.times_ns).all())
     if not kept:
         begin, end = entries[0].stamp.timestamp_ns, entries[-1].stamp.timestamp_ns
         raise InputError(
@@ -316,10 +311,3 @@ def _covered(
     left_out = len(entries) - len(kept)
     note = f"{left_out} of {len(entries)} frames are left out: there are no poses at their times"
     return kept, (note,) if left_out else ()
-
-
-def _nearest(times: NDArray[np.int64], time: int) -> int:
-    later = int(np.clip(np.searchsorted(times, time), 1, max(len(times) - 1, 1)))
-    if len(times) == 1:
-        return 0
-    return later if times[later] - time < time - times[later - 1] else later - 1
