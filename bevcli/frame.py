@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import SHOWN_SCORE, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, SHOWN_SCORE, Color, ObjectClass
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
 from bevcli.printing import counted, valid_text
 

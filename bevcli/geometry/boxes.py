@@ -13,7 +13,6 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
 
 IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes3D.possible` leaves out
-SHOWN_SCORE = 0.25  # boxes scored below this are not shown, unless another limit is asked for
 
 
 @dataclass(frozen=True)

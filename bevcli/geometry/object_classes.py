@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+SHOWN_SCORE = 0.25  # boxes scored below this are not shown, unless another limit is asked for
 Color = tuple[int, int, int]
 
 

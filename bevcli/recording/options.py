@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.geometry.boxes import SHOWN_SCORE
+from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.options import option, options
 
 Images = Literal["jpeg", "av1"]

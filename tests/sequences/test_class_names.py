@@ -52,7 +52,7 @@ def test_a_class_map_renames_without_case(labelled: Path) -> None:
     sequence = open_sequence(labelled, class_map={"Lorry": "Truck", "tricycle": "bicycle"})
     assert classes(sequence) == ["car", "truck", "bicycle", "truck", "pedestrian"]
     assert not any("other classes" in note for note in sequence.notes)
-    with pytest.raises(InputError, match='`class_map` Lorry=tank: "tank" is not a class'):
+    with pytest.raises(InputError, match=r'`class_map` .`--class-map`. Lorry=tank: "tank" is not a class'):
         open_sequence(labelled, class_map={"Lorry": "tank"})
 
 

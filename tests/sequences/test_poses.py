@@ -177,7 +177,7 @@ def test_poses_of_a_camera_are_asked_for(first_world, circle, tmp_path):
     found = read(tmp_path, text, poses_of="image_0")
     np.testing.assert_allclose(relative(found.motion), relative(circle), atol=1e-6)
     assert "of image_0" in found.notes[0]
-    with pytest.raises(InputError, match=r"`poses_of=left`: is not in the rig \(expected one of vehicle, CAM"):
+    with pytest.raises(InputError, match=r"`poses_of=left` .`--poses-of`.: is not in the rig \(.* vehicle, CAM"):
         read(tmp_path, text, poses_of="left")
 
 
@@ -197,7 +197,7 @@ def standing(text_yaw: str) -> str:
 def test_angles_that_nothing_decides_are_asked_for(unit, turn, tmp_path):
     with pytest.raises(
         InputError,
-        match=r"may have yaw in radians .* or yaw in degrees .*does not move.*pass `pose_angles=degrees` or ",
+        match=r"may have yaw in radians .* or yaw in degrees .*does not move.*pass `pose_angles=degrees` .* or ",
     ):
         read(tmp_path, standing("0"))
     found = read(tmp_path, standing("0"), pose_angles=unit)
@@ -224,7 +224,7 @@ SLOW = lines([f"{place}" for place in range(COUNT)], X / 1000, Y / 1000, ZERO, *
 
 def test_times_with_two_readings_are_asked_for(tmp_path):
     frames = [5_000_000, 10_000_000]
-    with pytest.raises(InputError, match=r"may be seconds or milliseconds: pass `pose_times=s` or `pose_times=ms`"):
+    with pytest.raises(InputError, match=r"may be seconds or milliseconds: pass `pose_times=s` .* or `pose_times=ms`"):
         read(tmp_path, SLOW, frames=frames)
     assert read(tmp_path, SLOW, frames=frames, pose_times="ms").motion.last_ns == 59_000_000
     assert "seconds" in read(tmp_path, SLOW, frames=[5 * 10**9, 55 * 10**9]).notes[0]  # only these cover the frames

@@ -182,7 +182,7 @@ def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, nativ
 
 def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, None))
-    with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*`ego_motion_file=FILE`"):
+    with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*`--ego-motion FILE`"):
         open_sequence(path)
     assert open_sequence(path, ego_motion="static").load(0).images
     messages = [message for message in messages_of(native, motion) if message[0] != "/tf_static"]
@@ -736,7 +736,7 @@ def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, nativ
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
     with pytest.raises(InputError, match='has no scene "one"'):
         open_sequence(path, scene="one")
-    with pytest.raises(InputError, match="`topics` is for a ROS bag: remove it"):
+    with pytest.raises(InputError, match=r"`topics` .`--topic`. is for a ROS bag: remove it"):
         open_sequence(drive, topics={"CAM_FRONT": "/a"})
 
 

@@ -99,7 +99,7 @@ def test_range_of_frames(frames, expected):
 
 @pytest.mark.parametrize("frames", [slice(5, 9), slice(2, 2)])
 def test_range_without_frames_is_an_error(frames):
-    with pytest.raises(InputError, match=r"`frames=\d:\d`: .*has 5: 0:5"):
+    with pytest.raises(InputError, match=r"`frames=\d:\d` .`--frames`.: .*has 5: 0:5"):
         select_range(MadeDrive(np.arange(5)), frames)
 
 

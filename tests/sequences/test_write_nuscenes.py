@@ -164,6 +164,6 @@ def test_an_existing_root_is_replaced_only_with_force(drive, tmp_path):
 
 def test_unknown_formats_and_boxes_are_refused(drive, tmp_path):
     answer = CliRunner().invoke(app, ["convert", str(drive), str(tmp_path / "out"), "--format", "kitti"])
-    assert "--format kitti: unknown format (expected " in str(answer.exception)
+    assert "`form=kitti` (`--format`): unknown format (expected " in str(answer.exception)
     answer = convert(drive, tmp_path / "out", "--boxes", drive)
-    assert "--boxes: a nuScenes root takes no boxes of a run" in str(answer.exception)
+    assert "`boxes` (`--boxes`): a nuScenes root takes no boxes of a run" in str(answer.exception)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from bevcli.geometry.boxes import SHOWN_SCORE
+from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.sequences.format import Format

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
-from bevcli.geometry.boxes import SHOWN_SCORE, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.matching import DetectionConfig
-from bevcli.geometry.object_classes import ObjectClass
+from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import image_for_rig, network_scale
