@@ -111,16 +111,16 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    stated = {name: options[name] for name in defaults(RigOptions).keys() - NAMES if name in options}
+    of_rig = {name: options[name] for name in defaults(RigOptions).keys() - NAMES if name in options}
     if folder is None and is_drive(path):
-        given = gather(RigOptions, None, stated).draft(path)
-        if given is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
+        beside = gather(RigOptions, None, of_rig).draft(path)
+        if beside is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
             return _check_other_sequence(path, frame, options)
-        if given is not None and _is_other_drive(path):
-            return _check_other_sequence(path, frame, options, given.findings)
-        draft, folder = given or draft_rig(path / CALIBRATION, path), path
+        if beside is not None and _is_other_drive(path):
+            return _check_other_sequence(path, frame, options, beside.findings)
+        draft, folder = beside or draft_rig(path / CALIBRATION, path), path
     else:
-        draft = draft_rig(path, folder, **stated)
+        draft = draft_rig(path, folder, **of_rig)
     if folder is not None and _is_other_drive(folder):
         return _check_other_sequence(folder, frame, {**options, "calibration": path}, draft.findings)
     of_drive: tuple[Finding, ...] = ()
@@ -159,20 +159,20 @@ def _check_other_sequence(
 
 
 def _read_folder(
-    folder: Path, rig: CameraRig, frame: int, given: Mapping[str, Any]
+    folder: Path, rig: CameraRig, frame: int, options_given: Mapping[str, Any]
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images by camera of one of its frames."""
     findings: list[Finding] = []
-    outside = bool(given.get("allow_outside"))
-    own = FolderOptions(**{name: given[name] for name in NAMES & given.keys()})
+    outside = bool(options_given.get("allow_outside"))
+    native = FolderOptions(**{name: options_given[name] for name in NAMES & options_given.keys()})
     options = InputOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
-        sequence = FolderDrive(folder, options, own, rig)
+        sequence = FolderDrive(folder, options, native, rig)
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderDrive(folder, replace(options, ego_motion="static"), own, rig)
+            sequence = FolderDrive(folder, replace(options, ego_motion="static"), native, rig)
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:

@@ -255,9 +255,9 @@ def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> N
         axes.text(0, 0.45, "none: the rig is plausible", color="#7fd6a0", fontsize=10, va="top")
     top = 0.45
     for finding in findings:
-        where = f"{finding.camera}: " if finding.camera else ""
+        camera = f"{finding.camera}: " if finding.camera else ""
         numbers = f" ({finding.found})" if finding.found else ""
-        lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 56)[:4]
+        lines = textwrap.wrap(f"{camera}{finding.message}{numbers}", 56)[:4]
         if top + LINE * len(lines) > height - LINE:
             axes.text(0, top, "more in findings.json", color=FAINT, fontsize=9, va="top")
             break
@@ -379,10 +379,10 @@ def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: M
 def _findings_markdown(report: RigReport) -> str:
     lines = ["## Findings", ""]
     for finding in report.findings:
-        where = f"`{finding.camera}` " if finding.camera else ""
-        lines.append(f"- **{finding.severity}** {where}{finding.message}.")
-        stated = (("found", finding.found), ("expected", finding.expected))
-        numbers = [f"{word} {value}" for word, value in stated if value]
+        camera = f"`{finding.camera}` " if finding.camera else ""
+        lines.append(f"- **{finding.severity}** {camera}{finding.message}.")
+        texts = (("found", finding.found), ("expected", finding.expected))
+        numbers = [f"{word} {value}" for word, value in texts if value]
         lines += [f"    - {text}" for text in (", ".join(numbers), finding.advice) if text]
     if not report.findings:
         lines.append("None: the rig is plausible.")
@@ -427,7 +427,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
         ("pillar_lines", pillar_lines(camera, ego_from_bev), (*PILLAR_COLOR, 90), 0.6),
         ("horizon", visible_runs(horizon(camera)), HORIZON_COLOR, 1.0),
     ):
-        inside = [part for line in lines for part in _clipped(line, camera)]
+        inside = [run for line in lines for run in _clipped(line, camera)]
         strips = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)
         stream.log(entities.overlay(camera.name, kind), strips, static=True)
 

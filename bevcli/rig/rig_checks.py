@@ -99,7 +99,12 @@ def direction_of_name(name: str) -> float | None:
     Degrees counter-clockwise from straight ahead; None if the name states none, or a contradiction.
     """
     words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
-    ends = {end for part, end in WORDS.items() for word in words if word.startswith(part) or word.endswith(part)}
+    ends = {
+        end
+        for word_part, end in WORDS.items()
+        for word in words
+        if word.startswith(word_part) or word.endswith(word_part)
+    }
     sides = {side for side in ("left", "right") for word in words if word.startswith(side) or word.endswith(side)}
     if len(ends) > 1 or len(sides) > 1:
         return None
@@ -134,8 +139,8 @@ def check_names(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
                 "one pose is a copy of the other: give each camera its own",
             ))  # fmt: skip
     yaws = {camera.name: mounting_of(camera.ego_from_camera).yaw_deg for camera in cameras}
-    stated = {name: direction_of_name(name) for name in yaws if name not in copied}
-    named = {name: direction for name, direction in stated.items() if direction is not None}
+    directions = {name: direction_of_name(name) for name in yaws if name not in copied}
+    named = {name: direction for name, direction in directions.items() if direction is not None}
     if sum(turn_deg(direction, yaws[name]) for name, direction in named.items()) < SWAP_GAIN_DEG:
         return tuple(findings)
     turned = _turned_ego_frame(named, yaws)

@@ -227,8 +227,8 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     total = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items() if count)
     lines = [f"Findings: {total}"]
     for finding in findings:
-        where = f"{finding.camera}: " if finding.camera else ""
-        head = f"{finding.severity:<9} {where}{finding.message}  [{finding.code}]"
+        camera = f"{finding.camera}: " if finding.camera else ""
+        head = f"{finding.severity:<9} {camera}{finding.message}  [{finding.code}]"
         lines.append("")
         lines += textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False, break_on_hyphens=False)
         for word, value in (("found", finding.found), ("expected", finding.expected), ("do", finding.advice)):

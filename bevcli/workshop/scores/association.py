@@ -58,11 +58,11 @@ def scored_tracks(
     twice.
     """
     order = time_order(stamps)
-    given = gather([frames[index] for index in order], ego_xy[order])
-    instances = given.column("instances")
-    limits = np.array([ranges_m.get(name, -1.0) for name in given.boxes.classes.tolist()])
-    kept = (given.ranges_m < limits) & (given.boxes.num_points != 0) & (instances != "")
-    rows, names = given.frames[kept], instances[kept]
+    scored = gather([frames[index] for index in order], ego_xy[order])
+    instances = scored.column("instances")
+    limits = np.array([ranges_m.get(name, -1.0) for name in scored.boxes.classes.tolist()])
+    kept = (scored.ranges_m < limits) & (scored.boxes.num_points != 0) & (instances != "")
+    rows, names = scored.frames[kept], instances[kept]
     scores = np.concatenate([_scores(frames[index]) for index in order])[kept]
     ordered = [stamps[index] for index in order]
     _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)
@@ -72,7 +72,7 @@ def scored_tracks(
     _require_unique(rows, tracks, names, ordered, side)
     scores = _means_of_tracks(tracks, scores)
     times = np.array([stamp.timestamp_ns for stamp in ordered], dtype=np.int64)
-    boxes = TrackedBoxes(rows, tracks, given.boxes.centers[kept, :2], given.boxes.classes[kept], scores)
+    boxes = TrackedBoxes(rows, tracks, scored.boxes.centers[kept, :2], scored.boxes.classes[kept], scores)
     return _interpolated(boxes, times)
 
 

@@ -116,9 +116,16 @@ class Comparison:
         return write_comparison(tables, self.files, Path(folder))
 
 
-def _row(name: str, boxes: str, each: Difference) -> tuple[str, ...]:
-    low, high = map(_signed, each.interval)
-    return (name, boxes, *map(number, each.values), _signed(each.difference), f"{low} to {high}", each.better)
+def _row(name: str, boxes: str, difference: Difference) -> tuple[str, ...]:
+    low, high = map(_signed, difference.interval)
+    return (
+        name,
+        boxes,
+        *map(number, difference.values),
+        _signed(difference.difference),
+        f"{low} to {high}",
+        difference.better,
+    )
 
 
 def _signed(value: float) -> str:
@@ -193,32 +200,32 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
     """The frames, the classes and the range that both models have, and notes about what is left out."""
     notes = []
     keys = [[(true.stamp, true.extras.get("sample_token")) for true in model.pairs.ground_truth] for model in models]
-    places = [{key: index for index, key in enumerate(own)} for own in keys]
+    places = [{key: index for index, key in enumerate(index_of)} for index_of in keys]
     common = [key for key in keys[0] if key in places[1]]
     if not common:
         raise InputError("the two predictions have no frame of the ground truth in common: choose two of one drive")
     if len(common) < max(map(len, keys)):
         frames = counted(len(common), "frames")
         notes.append(f"only the {frames} of both are compared: A has {len(keys[0])}, B has {len(keys[1])}")
-    classes = {name: kind for name, kind in models[0].classes.items() if name in models[1].classes}
+    classes = {name: settings for name, settings in models[0].classes.items() if name in models[1].classes}
     if not classes:
         raise InputError("the two models have no class in common: rename classes with `class_map` (`--class-map`)")
     others = [name for model in models for name in model.classes if name not in classes]
     if others:
         notes.append(f"only classes of both are compared, without {', '.join(dict.fromkeys(others))}")
-    for name, kind in classes.items():
-        classes[name] = replace(kind, range_m=min(kind.range_m, models[1].classes[name].range_m))
+    for name, settings in classes.items():
+        classes[name] = replace(settings, range_m=min(settings.range_m, models[1].classes[name].range_m))
     ends = [model.predictions.range_m for model in models if model.predictions and model.pairs.ego_pose_known]
-    known = [end for end in ends if end is not None and end < max(kind.range_m for kind in classes.values())]
-    if max_range is None and known:
-        max_range = min(known)
+    nearer = [end for end in ends if end is not None and end < max(settings.range_m for settings in classes.values())]
+    if max_range is None and nearer:
+        max_range = min(nearer)
         notes.append(
             f"nothing beyond {max_range:g} m is scored: the BEV grid of a model ends there (`max_range` (`--max-range "
             "M`) sets another limit)"
         )
     return [
-        replace(_at(model, [own[key] for key in common]), classes=classes, max_range_m=max_range)
-        for model, own in zip(models, places, strict=True)
+        replace(_at(model, [index_of[key] for key in common]), classes=classes, max_range_m=max_range)
+        for model, index_of in zip(models, places, strict=True)
     ], notes
 
 
@@ -239,7 +246,7 @@ def _at(model: Compared, places: list[int]) -> Compared:
 
 def _joined_notes(scores: Sequence[Scores]) -> list[str]:
     """The notes of both, and with the name of the model those of one."""
-    of_a, of_b = (each.notes for each in scores)
+    of_a, of_b = (score.notes for score in scores)
     only_a = [f"A: {note}" for note in of_a if note not in of_b]
     only_b = [f"B: {note}" for note in of_b if note not in of_a]
     return [*(note for note in of_a if note in of_b), *only_a, *only_b]
@@ -247,16 +254,16 @@ def _joined_notes(scores: Sequence[Scores]) -> list[str]:
 
 def _differences(scores: Sequence[Scores], resamples: int) -> dict[str, Difference]:
     """AP by class, "mAP" and "NDS"."""
-    detections = [each.detection for each in scores]
+    detections = [score.detection for score in scores]
     count = detections[0].frame_count
     draws = draw_frames(count, resamples)
     drawn = [[_numbers(table) for table in resampled(detection, draws)] for detection in detections]
     of_a, of_b = (_numbers(detection.overall) for detection in detections)
-    found = {}
+    differences = {}
     for name in of_a:
         gains = [b[name] - a[name] for a, b in zip(*drawn, strict=True)]
-        found[name] = Difference((of_a[name], of_b[name]), interval(gains) if count > 1 else (math.nan, math.nan))
-    return found
+        differences[name] = Difference((of_a[name], of_b[name]), interval(gains) if count > 1 else (math.nan, math.nan))
+    return differences
 
 
 def _numbers(table: ScoreTable) -> dict[str, float]:

@@ -145,10 +145,10 @@ def recall_curve(is_match: NDArray[np.bool_], scores: Array, ground_truth_count:
 
 
 def _running_mean(values: Array) -> Array:
-    known = ~np.isnan(values)
-    if not known.any():
+    is_known = ~np.isnan(values)
+    if not is_known.any():
         return np.ones(len(values))  # as in the devkit
-    counts = np.cumsum(known)
+    counts = np.cumsum(is_known)
     return np.divide(np.nancumsum(values), counts, out=np.zeros(len(values)), where=counts > 0)
 
 
@@ -223,8 +223,8 @@ class ScoreTable:
     @property
     def nd_score(self) -> float:
         """NDS, the nuScenes detection score: the weighted mean of mAP and of all defined error scores."""
-        known = [score for score in self.error_scores.values() if not math.isnan(score)]
-        return (self.mean_ap_weight * self.mean_ap + sum(known)) / (self.mean_ap_weight + len(known))
+        defined = [score for score in self.error_scores.values() if not math.isnan(score)]
+        return (self.mean_ap_weight * self.mean_ap + sum(defined)) / (self.mean_ap_weight + len(defined))
 
     def of_classes_with_ground_truth(self) -> ScoreTable:
         """The table of only those classes that have ground truth."""
@@ -263,7 +263,7 @@ class DetectionScores:
     def by_range(self) -> dict[tuple[float, float], ScoreTable]:
         """By the radii of rings around the ego vehicle, nearest first, the classes that have ground truth there."""
         bins = self.config.range_bins_m
-        return {ends: self._table_of_present(part.within(*ends) for part in self.matches) for ends in bins}
+        return {ends: self._table_of_present(match.within(*ends) for match in self.matches) for ends in bins}
 
     @cached_property
     def by_visibility(self) -> dict[tuple[float, float], ScoreTable]:
@@ -271,16 +271,16 @@ class DetectionScores:
 
         Empty where ground truth has no visibilities.
         """
-        if all(np.isnan(part.ground_truth.column("visibilities")).all() for part in self.matches):
+        if all(np.isnan(match.ground_truth.column("visibilities")).all() for match in self.matches):
             return {}
         bins = self.config.visibility_bins
-        return {ends: self._table_of_present(part.visible(*ends) for part in self.matches) for ends in bins}
+        return {ends: self._table_of_present(match.visible(*ends) for match in self.matches) for ends in bins}
 
     def _table_of_present(self, matches: Iterable[ClassMatches]) -> ScoreTable:
-        return self._table([part for part in matches if part.truth_counts.any()])
+        return self._table([match for match in matches if match.truth_counts.any()])
 
     def _table(self, matches: Sequence[ClassMatches]) -> ScoreTable:
-        scores = {part.name: _score_class(part, self.config, self.unmeasured) for part in matches}
+        scores = {match.name: _score_class(match, self.config, self.unmeasured) for match in matches}
         return ScoreTable(scores, self.config.mean_ap_weight)
 
 
@@ -316,19 +316,19 @@ def evaluate_detections(
     return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
 
 
-def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:
-    truth_count = int(part.truth_counts.sum())
-    scores = part.predictions.column("scores")
+def _score_class(matches: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:
+    truth_count = int(matches.truth_counts.sum())
+    scores = matches.predictions.column("scores")
     curves = {
         distance: recall_curve(matched[counts] >= 0, scores[counts], truth_count)
-        for distance, matched, counts in zip(config.distances_m, part.matched, part.counts, strict=True)
+        for distance, matched, counts in zip(config.distances_m, matches.matched, matches.counts, strict=True)
     }
     row = config.error_row
-    hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
-    errors, curve = true_positive_errors(part, hits, config, unmeasured), curves[config.error_distance_m]
+    hits = np.flatnonzero(matches.counts[row] & (matches.matched[row] >= 0))
+    errors, curve = true_positive_errors(matches, hits, config, unmeasured), curves[config.error_distance_m]
     return ClassScores(
         ground_truth_count=truth_count,
-        prediction_count=int(part.counts[row].sum()),
+        prediction_count=int(matches.counts[row].sum()),
         recall=len(hits) / truth_count if truth_count else float("nan"),
         aps={distance: curve.average_precision(config) for distance, curve in curves.items()},
         errors={name: curve.mean_error(config, scores[hits], values) for name, values in errors.items()},
@@ -337,17 +337,17 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
 
 
 def true_positive_errors(
-    part: ClassMatches, hits: NDArray[np.int64], config: DetectionConfig, unmeasured: Iterable[str]
+    matches: ClassMatches, hits: NDArray[np.int64], config: DetectionConfig, unmeasured: Iterable[str]
 ) -> dict[str, Array | None]:
     """The errors of the true positives of one class by the devkit's names, each (M,); None where not defined.
 
     hits: (M,), indices of predictions that match a ground truth at the error distance. unmeasured: as in
     `DetectionScores`.
     """
-    kind = config.classes[part.name]
-    truths = part.ground_truth[part.matched[config.error_row][hits]]
-    errors = _pair_errors(truths, part.predictions[hits], symmetric=kind.symmetric)
-    return dict(errors) | dict.fromkeys((*kind.undefined_errors, *unmeasured))
+    object_class = config.classes[matches.name]
+    truths = matches.ground_truth[matches.matched[config.error_row][hits]]
+    errors = _pair_errors(truths, matches.predictions[hits], symmetric=object_class.symmetric)
+    return dict(errors) | dict.fromkeys((*object_class.undefined_errors, *unmeasured))
 
 
 def _pair_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bool) -> dict[str, Array]:

@@ -84,7 +84,7 @@ def open_ground_truth(
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
-    if path.is_dir() and any(kind.annotated and kind.recognises(path) for kind in formats()):
+    if path.is_dir() and any(form.annotated and form.recognises(path) for form in formats()):
         return _open_drive(path, InputOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, class_map, classes)
@@ -235,8 +235,8 @@ def boxes_of_drive(predictions: BoxesFile, drive: Drive) -> tuple[list[Boxes3D |
         raise InputError("the boxes are in the world frame, and the drive has no ego-motion (expected boxes in ego)")
     frames = tuple(_true_boxes(drive.ground_truth_frame(index)) for index in range(len(drive.stamps)))
     pairs = pair_frames(predictions, BoxesFile("world", frames))
-    found = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
-    return [found.get(stamp) for stamp in drive.stamps], pairs
+    boxes_at = {true.stamp: frame.boxes for frame, true in zip(pairs.predictions, pairs.ground_truth, strict=True)}
+    return [boxes_at.get(stamp) for stamp in drive.stamps], pairs
 
 
 def _common_frames(

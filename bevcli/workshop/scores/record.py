@@ -83,14 +83,14 @@ def names_of(paths: Iterable[Path]) -> dict[str, Path]:
 
     Raises InputError where a file is given twice.
     """
-    given = list(paths)
-    short = [path.resolve().parent if path.name == "predictions.json" else path for path in given]
+    files = list(paths)
+    short = [path.resolve().parent if path.name == "predictions.json" else path for path in files]
     names = [_name_of(path) for path in short]
     if len(set(names)) < len(names):
         names = [f"{path.resolve().parent.name}/{name}" for path, name in zip(short, names, strict=True)]
     if len(set(names)) < len(names):
-        raise InputError(f"`boxes` (`--boxes`): {given[0]} and {given[-1]} have the same name: rename one")
-    return dict(zip(names, given, strict=True))
+        raise InputError(f"`boxes` (`--boxes`): {files[0]} and {files[-1]} have the same name: rename one")
+    return dict(zip(names, files, strict=True))
 
 
 def _name_of(boxes: GivenBoxes) -> str:
@@ -106,7 +106,7 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
     if isinstance(boxes, str | Path):
         return open_predictions(Path(boxes), class_map)
     of_one_frame = isinstance(boxes, Boxes3D)
-    wrong: list[object] = [each for each in boxes if each is not None and not isinstance(each, Boxes3D)]
+    wrong: list[object] = [of_frame for of_frame in boxes if of_frame is not None and not isinstance(of_frame, Boxes3D)]
     if of_one_frame or wrong:
         found = "those of one frame" if of_one_frame else f"a {type(wrong[0]).__name__}"
         raise InputError(
@@ -118,21 +118,21 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
             f"`boxes` (`--boxes`): {name}: found {len(boxes)} (expected {len(drive.stamps)}, one for each frame)"
         )
     pairs = zip(drive.stamps, boxes, strict=True)
-    frames = tuple(FrameBoxes(stamp, None, each) for stamp, each in pairs if each is not None)
+    frames = tuple(FrameBoxes(stamp, None, of_frame) for stamp, of_frame in pairs if of_frame is not None)
     return ScoredInput(BoxesFile("world" if drive.has_ego_motion else "ego", frames), Path(name))
 
 
-def _by_frame(drive: Drive, name: str, given: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
+def _by_frame(drive: Drive, name: str, source: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
     """The boxes of one model for each frame of the drive. Raises InputError, which names the model."""
     try:
-        of_frames, pairs = boxes_of_drive(given.boxes, drive)
+        of_frames, pairs = boxes_of_drive(source.boxes, drive)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    found = len(pairs.predictions)
-    rest = len(given.boxes.frames) - found
+    matched = len(pairs.predictions)
+    rest = len(source.boxes.frames) - matched
     more = f"; not in the drive: {counted(rest, 'further frames')}" if rest else ""
     key = pairs.matched_by if pairs.matched_by in RELIABLE else f"{pairs.matched_by}, as scenes or times differ"
-    report(f"{name}: has boxes of {found} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
+    report(f"{name}: has boxes of {matched} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
     sides = zip(pairs.predictions, pairs.ego_xy, strict=True)
     away = np.concatenate([np.linalg.norm(frame.boxes.centers[:, :2] - ego, axis=1) for frame, ego in sides])
     if len(away) and away.min() > FAR_M:
@@ -153,7 +153,7 @@ def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
     classes = dict(first.boxes.classes or classes)
     limit = first.range_m or float("inf")
     ranges = {name: min(range_m, limit) for name, range_m in ranges_m(classes.values()).items()}
-    untrained = any(each.boxes.extras.get("untrained") is True for each in inputs.values())
+    untrained = any(source.boxes.extras.get("untrained") is True for source in inputs.values())
     return RecordedBoxes(tuple(inputs), classes, ranges, untrained, of_map)
 
 

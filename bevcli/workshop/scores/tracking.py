@@ -192,9 +192,9 @@ def _overall(truth: TrackedBoxes, levels: Mapping[str, Array]) -> dict[str, floa
 
 
 def _worst(truth: TrackedBoxes) -> dict[str, float]:
-    own = {"gt": len(truth), "fn": len(truth), "ml": len(np.unique(truth.tracks))}
-    stated = {name: float(own[name] if value is None else value) for name, value in WORST.items()}
-    return {"amota": WORST_AMOTA, "amotp": WORST_AMOTP, **stated}
+    counts = {"gt": len(truth), "fn": len(truth), "ml": len(np.unique(truth.tracks))}
+    metrics = {name: float(counts[name] if value is None else value) for name, value in WORST.items()}
+    return {"amota": WORST_AMOTA, "amotp": WORST_AMOTP, **metrics}
 
 
 SUMMED = ("mt", "ml", "tp", "fp", "fn", "ids", "frag")

@@ -150,7 +150,7 @@ def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
         outcomes = [best_outcome(matches, config.error_row) for matches in model.detection.matches]
         missed.append(_by_frame([outcome.missed for outcome in outcomes], frame_count))
         invented.append(_by_frame([outcome.false for outcome in outcomes], frame_count))
-        boxes = _by_frame([part.ground_truth for part in model.detection.matches], frame_count)
+        boxes = _by_frame([match.ground_truth for match in model.detection.matches], frame_count)
     return WorstFrames(
         models[0].pairs.ground_truth,
         boxes,

@@ -140,8 +140,8 @@ def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
     if not formats:
         return None
     pixels = np.frombuffer(frame.blob(entity, "Image:buffer"), dtype=np.uint8)
-    stated = formats[0] if isinstance(formats[0], dict) else {}
-    shape = (*(size if isinstance(size := stated.get(key), int) else 0 for key in ("height", "width")), 3)
+    layout = formats[0] if isinstance(formats[0], dict) else {}
+    shape = (*(size if isinstance(size := layout.get(key), int) else 0 for key in ("height", "width")), 3)
     if pixels.size != math.prod(shape) or not pixels.size:
         raise frame.wrong(entity, "Image:buffer", f"{shape[1]} x {shape[0]} pixels RGB", f"{pixels.size} bytes")
     return pixels.reshape(shape)[..., ::-1]
@@ -199,10 +199,10 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
     layers = [entities.layer(entities.camera(tile.camera), name) for name in _layers(frame)]
-    for each in (boxes, *layers):
-        draw_strips(canvas, frame, each, to_canvas)
-    for each in (boxes, *layers):
-        draw_labels(canvas, frame, f"{each}/labels", to_canvas, 0.36)
+    for entity in (boxes, *layers):
+        draw_strips(canvas, frame, entity, to_canvas)
+    for entity in (boxes, *layers):
+        draw_labels(canvas, frame, f"{entity}/labels", to_canvas, 0.36)
     draw_title(canvas, tile.camera, has_image=image is not None)
 
 
@@ -321,7 +321,7 @@ def write_video(recording: Path, video: Path, count: int, rate: float) -> Iterat
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
     encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
-    with whole_file(video) as own, plain_name(own) as unfinished:
+    with whole_file(video) as whole, plain_name(whole) as unfinished:
         with encoder(unfinished, rate) as write:
             for index, image in enumerate(_images(recording)):
                 write(image)
