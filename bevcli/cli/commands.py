@@ -128,7 +128,7 @@ def project_debug(
     """
     from bevcli import config
     from bevcli.inference import training_rigs
-    from bevcli.rig import rig_report
+    from bevcli.rig.check_calibration import INDENT, WIDTH
 
     given = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in given:
@@ -145,7 +145,7 @@ def project_debug(
         if options.motion:
             from bevcli.workshop.calibration.core_options import check_motion
 
-            check = replace(check, report=rig_report.with_findings(check.report, check_motion(open_drive)))
+            check = check.with_findings(check_motion(open_drive))
         if options.model is not None or options.against is not None:
             from bevcli.workshop.trust.gap_option import gap_of_rigs
 
@@ -157,7 +157,7 @@ def project_debug(
         say(check.to_json())
     else:
         notes = [
-            textwrap.fill(f"Model {model}: {note}.", rig_report.WIDTH, subsequent_indent=rig_report.INDENT) + "\n"
+            textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
             for note in training_rigs.training_rig_notes(check.rig, config.load_config(model))
         ]
         if gap is not None:

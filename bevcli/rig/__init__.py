@@ -1,7 +1,7 @@
 """Diagnosis of a calibration: what is wrong with a camera rig, and drawings that show it. `CheckOptions`.
 
-check_calibration    reads a calibration or a sequence, runs all checks, also of times; the result is written or used
-rig_report           coverage of the BEV grid, the rig next to nuScenes', and the terminal's text
+check_calibration    reads a calibration or a sequence, runs all checks, also of times; the result as text and files
+coverage             the BEV cells that cameras see, and the rig next to nuScenes'
 sequence_checks      all checks of a sequence: the rig in their order, and ego-motion; those before a run
 rig_checks           mounting, names and lenses of cameras; the bev frame
 mistakes             units, inverted transforms, quaternion order, axes: explanations of implausible poses

@@ -5,21 +5,25 @@ The times of the images are checked here.
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.findings import Finding, errors_of
+from bevcli.findings import SEVERITIES, Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.options import defaults, gather
-from bevcli.rig.rig_report import Coverage, RigReport, check_rig, report_text, with_findings
-from bevcli.rig.sequence_checks import check_scenes
+from bevcli.printing import aligned, counted
+from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
+from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.sequence_checks import check_scenes, rig_findings
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FORMAT as NATIVE, FolderOptions
@@ -35,6 +39,10 @@ JITTER_WARNING_S = 0.05
 NAMES = {"times", "image_rate_hz", "start_ns", "ego_motion_file", "pose_times", "pose_angles", "poses_of"}
 
 
+WIDTH = 100
+INDENT = " " * 10
+
+
 @dataclass(frozen=True)
 class CalibrationCheck:
     """The result of `check_calibration`.
@@ -42,35 +50,38 @@ class CalibrationCheck:
     Attributes:
         name: of the calibration file or the sequence.
         rig: the cameras that could be read.
-        report: the findings, the coverage of the BEV grid, and the comparison with nuScenes.
+        findings: errors first, then warnings, then infos.
+        coverage: how many cameras see each cell of the BEV grid.
+        measures: the rig next to nuScenes'; empty where errors make the comparison meaningless.
         images: by camera, (H, W, 3) uint8 BGR, of the chosen frame; empty without a sequence.
         further: results of other parts, by their key in findings.json.
     """
 
     name: str
     rig: CameraRig
-    report: RigReport
+    findings: tuple[Finding, ...]
+    coverage: Coverage
+    measures: tuple[Measure, ...]
     images: Mapping[str, NDArray[np.uint8]]
     further: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """All findings: errors first, then warnings, then infos."""
-        return self.report.findings
 
     @property
     def errors(self) -> tuple[Finding, ...]:
         """The findings of severity error."""
         return errors_of(self.findings)
 
+    def with_findings(self, findings: Iterable[Finding]) -> "CalibrationCheck":
+        """The check with more findings, such as those about a sequence."""
+        return replace(self, findings=_by_severity([*self.findings, *findings]))
+
     def text(self) -> str:
         """The rig, its coverage and the findings as plain text for a terminal."""
-        return report_text(self.name, self.rig, self.report)
+        return _text(self)
 
     def to_json(self) -> str:
         """The findings and the coverage as one JSON object, the content of findings.json."""
         findings = [asdict(finding) for finding in self.findings]
-        content = {"findings": findings, "coverage": _coverage_to_json(self.report.coverage), **self.further}
+        content = {"findings": findings, "coverage": _coverage_to_json(self.coverage), **self.further}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -86,10 +97,35 @@ class CalibrationCheck:
         write_whole(folder / "findings.json", f"{self.to_json()}\n".encode(), parents=True)
         if not self.rig.cameras:
             return [folder / "findings.json"]
-        drawings.write_camera_sheet(folder / "cameras.png", self.rig, self.report, self.images)
-        drawings.write_coverage_map(folder / "coverage.png", self.rig, self.report.coverage)
-        drawings.write_rig_recording(folder / "recording.rrd", self.rig, self.report, self.images)
+        drawings.write_camera_sheet(folder / "cameras.png", self.rig, self.findings, self.coverage, self.images)
+        drawings.write_coverage_map(folder / "coverage.png", self.rig, self.coverage)
+        drawings.write_rig_recording(
+            folder / "recording.rrd", self.rig, self.findings, self.coverage, self.measures, self.images
+        )
         return [folder / name for name in ("cameras.png", "coverage.png", "recording.rrd", "findings.json")]
+
+
+def check_rig(
+    rig: CameraRig,
+    found_before: Sequence[Finding] = (),
+    name: str = "",
+    images: Mapping[str, NDArray[np.uint8]] = MappingProxyType({}),
+) -> CalibrationCheck:
+    """Run all checks of a rig. found_before: findings from reading the file.
+
+    Coverage and the comparison with nuScenes are reported only where there is no error.
+    """
+    findings, coverage = rig_findings(rig, found_before), coverage_of(rig)
+    measures: tuple[Measure, ...] = ()
+    if rig.cameras and not errors_of(findings):
+        measures = measures_of(rig.cameras, coverage)
+        findings += [*check_coverage(coverage, rig.ego_from_bev), *check_measures(measures)]
+    return CalibrationCheck(name, rig, _by_severity(findings), coverage, measures, images)
+
+
+def _by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Errors, then warnings, then infos; findings of one severity keep their order."""
+    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 def check_calibration(
@@ -128,7 +164,7 @@ def check_calibration(
     if folder is not None and draft.rig.cameras:
         of_drive, images = _read_folder(folder, draft.rig, frame, options)
     name = os.path.basename(os.path.realpath(folder or (path if path.is_dir() else path.with_suffix(""))))
-    return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), of_drive), images)
+    return check_rig(draft.rig, draft.findings, name, images).with_findings(of_drive)
 
 
 def _is_other_drive(path: Path) -> bool:
@@ -154,8 +190,7 @@ def _check_other_sequence(
 ) -> CalibrationCheck:
     sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
-    report = with_findings(check_rig(shown.rig, found_before), _missing_images(shown))
-    return CalibrationCheck(sequence.name, shown.rig, report, _pixels(shown))
+    return check_rig(shown.rig, found_before, sequence.name, _pixels(shown)).with_findings(_missing_images(shown))
 
 
 def _read_folder(
@@ -242,3 +277,55 @@ def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | No
         message, expected = "its images deviate from the frame timestamps", f"within {OFFSET_WARNING_S * 1e3:g} ms"
         return Finding("time-offset", "warning", name, message, found, expected, advice)
     return None
+
+
+def _text(check: CalibrationCheck) -> str:
+    """The check as plain text, wrapped at 100 columns."""
+    rig, coverage = check.rig, check.coverage
+    once = 1 - coverage.unseen - coverage.overlap
+    seen = f"{coverage.unseen:.1%} of the cells seen by no camera, {once:.1%} by one, {coverage.overlap:.1%} by more"
+    parts = [
+        f"{check.name}: {counted(len(rig.cameras), 'cameras')}",
+        "",
+        _cameras(rig, coverage),
+        "",
+        f"BEV grid: {seen}",
+    ]
+    parts += ["", *_finding_lines(check.findings)]
+    if check.measures:
+        rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
+        rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in check.measures]
+        parts += ["", aligned(rows, left=(0, 3))]
+    return "\n".join(parts)
+
+
+def _cameras(rig: CameraRig, coverage: Coverage) -> str:
+    header = ("camera", "image", "FOV", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
+    rows = []
+    for camera in rig.cameras:
+        mounting = mounting_of(camera.ego_from_camera)
+        size, fov = f"{camera.width}x{camera.height}", f"{seen_fov_deg(camera)[0]:.0f}°"
+        angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
+        lens = camera.distortion.model if camera.distortion else "pinhole"
+        seen = f"{coverage.shares[camera.name]:.0%}"
+        position = (f"{mounting.x:.2f}", f"{mounting.y:.2f}", f"{mounting.height:.2f} m")
+        rows.append((camera.name, size, fov, *angles, *position, lens, seen))
+    return aligned([header, *rows], left=(0, 9))
+
+
+def _finding_lines(findings: Sequence[Finding]) -> list[str]:
+    if not findings:
+        return ["No findings: the rig is plausible."]
+    counts = {severity: sum(f.severity == severity for f in findings) for severity in SEVERITIES}
+    total = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items() if count)
+    lines = [f"Findings: {total}"]
+    for finding in findings:
+        camera = f"{finding.camera}: " if finding.camera else ""
+        head = f"{finding.severity:<9} {camera}{finding.message}  [{finding.code}]"
+        lines.append("")
+        lines += textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False, break_on_hyphens=False)
+        for word, value in (("found", finding.found), ("expected", finding.expected), ("do", finding.advice)):
+            if value:
+                text = f"{word + ':':<9} {value}"
+                lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT * 2)
+    return lines

@@ -29,8 +29,8 @@ from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.components import log
 from bevcli.recording.entities import GROUND_GRID_COLOR, HORIZON_COLOR, PILLAR_COLOR, colormap
+from bevcli.rig.coverage import Coverage, Measure, pixels_in_image
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
-from bevcli.rig.rig_report import Coverage, RigReport, pixels_in_image
 from bevcli.viewer.drawing import FONT, Canvas, draw_lines
 from bevcli.writing import whole_file
 
@@ -156,7 +156,9 @@ LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fon
 CAR_LENGTH_M, CAR_WIDTH_M, AXLE_TO_TAIL_M = 4.6, 1.8, 1.0
 
 
-def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Canvas]) -> None:
+def write_camera_sheet(
+    path: Path, rig: CameraRig, findings: Sequence[Finding], coverage: Coverage, images: Mapping[str, Canvas]
+) -> None:
     """Write the PNG. images: by camera, (H, W, 3) BGR; others are drawn on a dark background. Raises OutputError."""
     front, left, right, back = _cameras_by_side(rig)
     columns = max(len(front), len(back), 3)
@@ -168,17 +170,17 @@ def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Ma
     for row, top in ((front, tops[0]), (back, tops[2])):
         start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
         for column_index, camera in enumerate(row):
-            _draw_camera(sheet, (start + column_index * (SLOT + GAP), top), camera, rig, report, images)
+            _draw_camera(sheet, (start + column_index * (SLOT + GAP), top), camera, rig, findings, images)
     for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
         top = tops[1]
         for camera in column:
-            _draw_camera(sheet, (start, top), camera, rig, report, images)
+            _draw_camera(sheet, (start, top), camera, rig, findings, images)
             top += _camera_height(camera)
     size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
-    draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, report.coverage)
+    draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, coverage)
     if footer:
         top, size = sheet.height - GAP - footer, footer
-    _write_findings(sheet.axes(GAP, top, SLOT, size), size, report.findings)
+    _write_findings(sheet.axes(GAP, top, SLOT, size), size, findings)
     _write_legend(sheet.axes(sheet.width - SLOT - GAP, top, SLOT, size))
     save(sheet.figure, path)
 
@@ -220,7 +222,7 @@ def _draw_camera(
     corner: tuple[float, float],
     camera: Camera,
     rig: CameraRig,
-    report: RigReport,
+    findings: Sequence[Finding],
     images: Mapping[str, Canvas],
 ) -> None:
     """Draw a camera's image with title, angles and its first finding. corner: left and top, inches."""
@@ -232,7 +234,7 @@ def _draw_camera(
     axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, IMAGE_WIDTH))
     axes.set(xticks=[], yticks=[])
     mounting = mounting_of(camera.ego_from_camera)
-    mine = [finding for finding in report.findings if finding.camera == camera.name]
+    mine = [finding for finding in findings if finding.camera == camera.name]
     color = SEVERITY_COLORS[mine[0].severity] if mine else FAINT
     axes.spines[:].set(color=color, linewidth=2.5 if mine else 0.8)
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
@@ -365,30 +367,37 @@ JPEG_QUALITY = 90
 OVERLAYS = ("pillars", "ground_grid", "pillar_lines", "horizon")
 
 
-def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Canvas]) -> None:
+def write_rig_recording(
+    path: Path,
+    rig: CameraRig,
+    findings: Sequence[Finding],
+    coverage: Coverage,
+    measures: Sequence[Measure],
+    images: Mapping[str, Canvas],
+) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
     with _layout(rig).saved_to(path, "bevcli-project-debug") as stream:
         log_static.log_scene(stream, rig, {})
-        _log_coverage(stream, rig, report.coverage)
+        _log_coverage(stream, rig, coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))
         stream.set_time(entities.FRAME_TIMELINE, sequence=0)  # `bevcli viz` expects this timeline
-        stream.log(FINDINGS, rr.TextDocument(_findings_markdown(report), media_type="text/markdown"))
+        stream.log(FINDINGS, rr.TextDocument(_findings_markdown(findings, measures), media_type="text/markdown"))
 
 
-def _findings_markdown(report: RigReport) -> str:
+def _findings_markdown(findings: Sequence[Finding], measures: Sequence[Measure]) -> str:
     lines = ["## Findings", ""]
-    for finding in report.findings:
+    for finding in findings:
         camera = f"`{finding.camera}` " if finding.camera else ""
         lines.append(f"- **{finding.severity}** {camera}{finding.message}.")
         texts = (("found", finding.found), ("expected", finding.expected))
         numbers = [f"{word} {value}" for word, value in texts if value]
         lines += [f"    - {text}" for text in (", ".join(numbers), finding.advice) if text]
-    if not report.findings:
+    if not findings:
         lines.append("None: the rig is plausible.")
-    if report.measures:
+    if measures:
         lines += ["", "## Comparison with nuScenes", "", "| | this rig | nuScenes |", "|---|---|---|"]
-        lines += [f"| {m.name} | {m.value} | {m.reference} |" for m in report.measures]
+        lines += [f"| {m.name} | {m.value} | {m.reference} |" for m in measures]
     return "\n".join(lines)
 
 

@@ -7,9 +7,9 @@ import pytest
 from healthy_rigs import camera, copy_of, rig
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.rig.coverage import coverage_of
 from bevcli.rig.drawings import horizon
 from bevcli.rig.rig_checks import mounting_of, seen_fov_deg
-from bevcli.rig.rig_report import coverage_of
 from bevcli.sequences.files.calibration_file import read_calibration
 
 

@@ -22,8 +22,8 @@ from mistakes import (
 from scipy.spatial.transform import Rotation
 
 from bevcli.findings import errors_of
-from bevcli.rig import rig_report
-from bevcli.rig.rig_report import check_rig
+from bevcli.rig import check_calibration
+from bevcli.rig.check_calibration import check_rig
 from bevcli.sequences.files.calibration_file import draft_calibration
 
 ALL = tuple(SIX["cameras"])
@@ -40,7 +40,7 @@ def report_of(document, folder):
 def errors_in(document, folder):
     """The errors of a rig with a mistake. Beside errors its coverage is not reported, and is not computed here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rig_report, "coverage_of", lambda rig: None)
+        patch.setattr(check_calibration, "coverage_of", lambda rig: None)
         return errors_of(report_of(document, folder).findings)
 
 

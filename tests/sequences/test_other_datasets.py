@@ -27,7 +27,7 @@ from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.registry import load
-from bevcli.rig.rig_report import check_rig
+from bevcli.rig.check_calibration import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.labels import with_track_velocities

@@ -20,8 +20,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import load_model
 from bevcli.model.config import ModelConfig
 from bevcli.printing import aligned, counted
-from bevcli.rig.check_calibration import CalibrationCheck, check_calibration
-from bevcli.rig.rig_report import WIDTH
+from bevcli.rig.check_calibration import WIDTH, CalibrationCheck, check_calibration
 from bevcli.workshop.scores.compare import Difference
 from bevcli.workshop.scores.evaluate import finite
 from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering

@@ -16,8 +16,8 @@ from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.inference.preprocess import image_for_rig, network_scale
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
+from bevcli.rig.coverage import coverage_of, measures_of
 from bevcli.rig.rig_checks import Mounting, mounting_of, seen_fov_deg, side_of, turn_deg
-from bevcli.rig.rig_report import coverage_of, measures_of
 from bevcli.workshop.synth.rig import EGO_AXES_FROM_CAMERA, nuscenes_like_rig
 
 Kind = Literal["pitch", "roll", "height", "field of view", "blind sector", "count", "overlap", "size", "rate", "light"]

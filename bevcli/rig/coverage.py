@@ -1,22 +1,16 @@
-"""The report on a rig: findings, the BEV cells that the cameras see, and the rig next to nuScenes'.
+"""The BEV cells that the cameras of a rig see, and the rig next to nuScenes': published weights know no other one."""
 
-Published weights know no rig but nuScenes'.
-"""
-
-import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.findings import SEVERITIES, Finding, errors_of
+from bevcli.findings import Finding
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
-from bevcli.printing import aligned, counted
-from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, side_of
-from bevcli.rig.sequence_checks import rig_findings
+from bevcli.rig.rig_checks import mounting_of, seen_fov_deg, side_of
 
 COVERAGE_GRID = BevGrid(rows=100, columns=100)
 UNSEEN_WARNING = 0.02
@@ -147,92 +141,3 @@ def _range_text(low: float, high: float, unit: str) -> str:
     first, last = (f"{round(value, digits) + 0.0:.{digits}f}" for value in (low, high))  # + 0.0: zero has no sign
     gap = " " if unit == "m" else ""
     return f"{first}{gap}{unit}" if first == last else f"{first} to {last}{gap}{unit}"
-
-
-WIDTH = 100
-INDENT = " " * 10
-
-
-@dataclass(frozen=True)
-class RigReport:
-    """The results of the checks of a rig.
-
-    Attributes:
-        findings: errors first, then warnings, then infos.
-        coverage: how many cameras see each cell of the BEV grid.
-        measures: the rig next to nuScenes'; empty where errors make the comparison meaningless.
-    """
-
-    findings: tuple[Finding, ...]
-    coverage: Coverage
-    measures: tuple[Measure, ...]
-
-
-def check_rig(rig: CameraRig, found_before: Sequence[Finding] = ()) -> RigReport:
-    """Run all checks of a rig. found_before: findings from reading the file.
-
-    Coverage and the comparison with nuScenes are reported only where there is no error.
-    """
-    findings = rig_findings(rig, found_before)
-    coverage = coverage_of(rig)
-    measures: tuple[Measure, ...] = ()
-    if rig.cameras and not errors_of(findings):
-        measures = measures_of(rig.cameras, coverage)
-        findings += [*check_coverage(coverage, rig.ego_from_bev), *check_measures(measures)]
-    return RigReport(_by_severity(findings), coverage, measures)
-
-
-def with_findings(report: RigReport, findings: Sequence[Finding]) -> RigReport:
-    """The report with more findings, such as those about a sequence."""
-    return replace(report, findings=_by_severity([*report.findings, *findings]))
-
-
-def _by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Errors, then warnings, then infos; findings of one severity keep their order."""
-    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
-
-
-def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
-    """The report as plain text, wrapped at 100 columns."""
-    coverage = report.coverage
-    once = 1 - coverage.unseen - coverage.overlap
-    seen = f"{coverage.unseen:.1%} of the cells seen by no camera, {once:.1%} by one, {coverage.overlap:.1%} by more"
-    parts = [f"{name}: {counted(len(rig.cameras), 'cameras')}", "", _cameras(rig, coverage), "", f"BEV grid: {seen}"]
-    parts += ["", *_finding_lines(report.findings)]
-    if report.measures:
-        rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
-        rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
-        parts += ["", aligned(rows, left=(0, 3))]
-    return "\n".join(parts)
-
-
-def _cameras(rig: CameraRig, coverage: Coverage) -> str:
-    header = ("camera", "image", "FOV", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
-    rows = []
-    for camera in rig.cameras:
-        mounting = mounting_of(camera.ego_from_camera)
-        size, fov = f"{camera.width}x{camera.height}", f"{seen_fov_deg(camera)[0]:.0f}°"
-        angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
-        lens = camera.distortion.model if camera.distortion else "pinhole"
-        seen = f"{coverage.shares[camera.name]:.0%}"
-        position = (f"{mounting.x:.2f}", f"{mounting.y:.2f}", f"{mounting.height:.2f} m")
-        rows.append((camera.name, size, fov, *angles, *position, lens, seen))
-    return aligned([header, *rows], left=(0, 9))
-
-
-def _finding_lines(findings: Sequence[Finding]) -> list[str]:
-    if not findings:
-        return ["No findings: the rig is plausible."]
-    counts = {severity: sum(f.severity == severity for f in findings) for severity in SEVERITIES}
-    total = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items() if count)
-    lines = [f"Findings: {total}"]
-    for finding in findings:
-        camera = f"{finding.camera}: " if finding.camera else ""
-        head = f"{finding.severity:<9} {camera}{finding.message}  [{finding.code}]"
-        lines.append("")
-        lines += textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False, break_on_hyphens=False)
-        for word, value in (("found", finding.found), ("expected", finding.expected), ("do", finding.advice)):
-            if value:
-                text = f"{word + ':':<9} {value}"
-                lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT * 2)
-    return lines
