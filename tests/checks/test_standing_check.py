@@ -108,6 +108,6 @@ def test_a_run_advises_no_history(static, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     run = ("run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "4:10", "--no-track")
     said = command(tmp_path, *run, *static).stderr
-    warning = "the images move as if the vehicle drove, but --static says that it stands"
-    advice = "pass --odometry in its place, which measures the motion, or --no-temporal"
+    warning = 'the images move as if the vehicle drove, but `ego_motion="static"` (`--static`) says that it stands'
+    advice = "pass `odometry=True` (`--odometry`) in its place, which measures the motion, or `temporal=False`"
     assert (warning in said and advice in said) == (static == ("--static",))
