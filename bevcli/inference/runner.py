@@ -175,7 +175,8 @@ class Runner:
         with torch.inference_mode():
             last_layers, is_finite = begun.read()
             if is_finite:
-                after, fields = begun.after, {"bev": last_layers.bev[0], **self._decoded(last_layers, begun)}
+                after, fields = begun.after, self._decoded(last_layers, begun)
+                fields["bev"] = last_layers.bev[0] if last_layers.bev.shape[1] else None
                 fields["attention"] = None if probe is None else attention_view(probe, prepared, self.config)
                 fields["stage_seconds"] = self.clock.read()
             else:

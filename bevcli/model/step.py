@@ -116,7 +116,7 @@ class ModelOutputs:
     Attributes:
         stay_on_device: names of the fields that are decoded on the model's device. The last layers of all others are
             copied to the CPU first.
-        bev: (B, Y·X, C), the BEV map.
+        bev: (B, Y·X, C), the BEV map; (B, 0, C) of a model without one.
         class_logits: (L, B, Q, classes) of the L decoder layers.
         box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
         segmentation: outputs of the segmentation head, None without one.

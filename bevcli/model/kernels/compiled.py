@@ -26,6 +26,14 @@ SAMPLES_PER_RANGE = 1 << 15
 TILE_BYTES = 8 << 20
 
 
+@cache
+def _loops() -> Any:
+    """The module of the loops. Its import loads the compiler, which not every run needs."""
+    from bevcli.model.kernels import loops
+
+    return loops
+
+
 class CompiledSampling(GridSampling):
     """A `GridSampling` on the CPU, with gradients."""
 
@@ -41,14 +49,12 @@ class CompiledSampling(GridSampling):
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
             learned = values.float(), locations.float(), weights.float()
             return _WeightedSums.apply(*learned, level_shapes, queries_per_map)
-        from bevcli.model.kernels.loops import sample_maps  # loads the compiler, which not every run needs
-
         map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
         out = torch.empty(len(locations), *values.shape[2:])
         shapes = np.asarray(level_shapes, dtype=np.int64)
         arrays = (as_array(values), shapes, as_array(locations.float()), as_array(weights.float()), map_of_query)
         smallest = max(64, SAMPLES_PER_RANGE // max(math.prod(weights.shape[1:]), 1))
-        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), smallest)
+        in_threads(partial(_loops().sample_maps, *arrays, out.numpy()), len(locations), smallest)
         return out.flatten(1)
 
 
@@ -62,14 +68,12 @@ def sample_hits(values: Tensor, level_shapes: LevelShapes, hits: Hits, offsets: 
         offsets: (B·Q, heads, maps, L, P, 2) float32, in cells of a level, from the reference points.
         logits: (B·Q, heads, maps, L, P), of the weights.
     """
-    from bevcli.model.kernels.loops import sample_hits as compiled  # loads the compiler
-
     map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_map)
     out = torch.empty(len(hits.query), *values.shape[2:])
     read = (as_array(values), np.asarray(level_shapes, dtype=np.int64))
     of_hits = (*map(as_array, (hits.reference_points, offsets, logits)), hits.query.numpy(), hits.prediction.numpy())
     smallest = max(64, SAMPLES_PER_RANGE // max(logits.shape[1] * math.prod(logits.shape[3:]), 1))
-    in_threads(partial(compiled, *read, *of_hits, map_of_hit, out.numpy()), len(out), smallest)
+    in_threads(partial(_loops().sample_hits, *read, *of_hits, map_of_hit, out.numpy()), len(out), smallest)
     return out.flatten(1)
 
 
@@ -126,7 +130,6 @@ class CompiledDeformableConvolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, O, H', W'), channels last."""
         from bevcli.model.deformable_convolution import split_offsets_and_mask
-        from bevcli.model.kernels.loops import sample_taps  # loads the compiler, which not every run needs
 
         offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
         batch, channels = x.shape[:2]
@@ -143,7 +146,7 @@ class CompiledDeformableConvolution(nn.Module):
         out = x.new_empty(rows, self.out_channels)
         for first in range(0, rows, tile):
             count = min(tile, rows - first)
-            in_threads(partial(sample_taps, *arrays, self.stride, first, as_array(taps)), count)
+            in_threads(partial(_loops().sample_taps, *arrays, self.stride, first, as_array(taps)), count)
             out[first : first + count] = self.product(taps[:count].flatten(1).to(x.dtype))
         return out.view(batch, height, width, -1).permute(0, 3, 1, 2)
 
@@ -163,13 +166,11 @@ class CompiledPool(nn.MaxPool2d):
         """x: (B, C, H, W) -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
         if not self.loaded.is_set():
             return super().forward(x)
-        from bevcli.model.kernels.loops import max_of_windows
-
         x = x.permute(0, 2, 3, 1).contiguous()  # (B, H, W, C)
         bits = torch.int32 if x.dtype == torch.float32 else torch.int16
         batch, height, width, channels = x.shape
         out = x.new_empty(batch, -(-height // 2), -(-width // 2), channels)
-        in_threads(partial(max_of_windows, x.view(bits).numpy(), out.view(bits).numpy()), batch * out.shape[1])
+        in_threads(partial(_loops().max_of_windows, x.view(bits).numpy(), out.view(bits).numpy()), batch * out.shape[1])
         return out.permute(0, 3, 1, 2)
 
 

@@ -6,8 +6,7 @@ Nothing waits for the GPU. A graph is one launch of the device part of a step by
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,6 +21,7 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton, in_place_of
 from bevcli.model.kernels.compiled import in_threads
+from bevcli.model.kernels.rounding import rounded_products
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel
@@ -225,7 +225,6 @@ class KeptPaddedPillars(LastCall, PaddedPillars):
 
 KEPT_GRAPHS = 8  # of one function: for other numbers and sizes of images, with and without history
 Function = Callable[..., Any]
-_SETTING = threading.RLock()  # the precision of products is a setting of the process
 
 
 class CudaGraph:
@@ -301,7 +300,7 @@ class Captured:
                     graph = self._graph_for(arguments)
                     if graph is not None:
                         return graph.replay(arguments)
-            with rounded_products(self._rounds):
+            with rounded_products("cuda", enabled=self._rounds):
                 return self._function(*arguments)
 
     def _graph_for(self, arguments: tuple[Any, ...]) -> CudaGraph | None:
@@ -323,7 +322,7 @@ class Captured:
         try:
             if self._pool is None:
                 self._pool = torch.cuda.graph_pool_handle()
-            with rounded_products(self._rounds):
+            with rounded_products("cuda", enabled=self._rounds):
                 return CudaGraph(self._function, arguments, self._device, self._pool)
         except Exception as error:  # whatever a driver, a library or a kernel raises: the model runs without a graph
             self.failure = error
@@ -334,20 +333,3 @@ class Captured:
 
     def _is_observed(self) -> bool:
         return any(self._no_hooks) or sum(map(len, self._own)) != self._own_hooks
-
-
-@contextmanager
-def rounded_products(enabled: bool) -> Iterator[None]:
-    """With `enabled`, products of float32 matrices on a CUDA GPU round their factors to TF32, of 10 bits, inside."""
-    if not enabled:
-        yield
-        return
-    setting = torch.backends.cuda.matmul
-    name, value = ("fp32_precision", "tf32") if hasattr(setting, "fp32_precision") else ("allow_tf32", True)
-    with _SETTING:
-        before = getattr(setting, name)
-        setattr(setting, name, value)
-        try:
-            yield
-        finally:
-            setattr(setting, name, before)

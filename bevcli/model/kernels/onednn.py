@@ -5,8 +5,7 @@ for memory. The operators are those that PyTorch's compiler uses; where a build 
 own layers.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -16,6 +15,7 @@ from bevcli.model.backbone import Stage
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.encoder import FeedForward
+from bevcli.model.kernels.rounding import rounded_products
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
 Activation = Literal["none", "relu", "relu6"]
@@ -48,18 +48,6 @@ def has_matrix_unit() -> bool:
     return can_round and torch.cpu._is_amx_tile_supported()
 
 
-@contextlib.contextmanager
-def rounded_products() -> Iterator[None]:
-    """Inside, the products of float32 matrices round their operands to bfloat16; sums and results stay in float32."""
-    setting = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
-    before = setting.fp32_precision
-    setting.fp32_precision = "bf16"
-    try:
-        yield
-    finally:
-        setting.fp32_precision = before
-
-
 class PackedLinear(nn.Module):
     """A linear layer with its weight in oneDNN's own layout, and an activation in the same pass."""
 
@@ -68,14 +56,14 @@ class PackedLinear(nn.Module):
     ) -> None:
         """rounds: compute in `rounded_products`."""
         super().__init__()
-        self.product = rounded_products if rounds else contextlib.nullcontext
+        self.rounds = rounds
         self.weight, self.bias = layer.weight, layer.bias
         self.packed = torch.ops.mkldnn._reorder_linear_weight(layer.weight)
         self.activation: tuple[str, list[float], str] = (activation, [], "none" if activation == "gelu" else "")
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., in) -> (..., out)."""
-        with self.product():
+        with rounded_products("cpu", enabled=self.rounds):
             return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, *self.activation)
 
 

@@ -22,6 +22,7 @@ from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.kernels.gpu import find_hits_on_cpu
+from bevcli.model.kernels.rounding import rounded_products
 from bevcli.model.network import Network
 from bevcli.parsing.pth import read_pth
 from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
@@ -53,17 +54,6 @@ def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerCon
     # On a GPU, fused: one kernel instead of hundreds.
     fused = next(trained.parameters()).device.type == "cuda" or None
     return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=fused)
-
-
-@contextlib.contextmanager
-def rounded_products(rounds: bool) -> Iterator[None]:
-    """Inside, a CUDA GPU rounds the factors of float32 products to TF32 if it is to: several times as fast."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if rounds else before)
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
@@ -162,7 +152,7 @@ class Trainer:
         remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
         turns = product(remaining, range(config.clips.in_turn))
         loaded = loaded_batches(self.maker, turns, job.loaders, pin=gpu)
-        with contextlib.closing(loaded) as batches, rounded_products(gpu):
+        with contextlib.closing(loaded) as batches, rounded_products("cuda", enabled=gpu):
             stopped = False
             while self.done < config.steps and not stopped:
                 row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
