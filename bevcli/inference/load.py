@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes
 from bevcli.model.config import ModelConfig
-from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.precision import AnyPrecision
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
 from bevcli.published import NamedWeights, all_weights, hub_model, named_weights, weights_folder
@@ -64,7 +65,7 @@ class Model:
 
     network: TemporalModel
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    precision: Precision | Literal["int8"] = "fp32"
+    precision: AnyPrecision = "fp32"
     weights: Path | None = None
     bundled: bool = False
     left_out: str = ""
@@ -372,7 +373,7 @@ def tracker_of_table(contents: dict[str, Any], config: ModelConfig, file: str) -
         raise ConfigError(f"{file}: [{TRACKING}]: {error}") from None
 
 
-def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torch.device, Precision | Literal["int8"]]:
+def choose_engine(options: ModelOptions, config: ModelConfig) -> tuple[str, torch.device, AnyPrecision]:
     """The engine, device and precision that the options ask for; by default PyTorch, or for INT8 one that has it.
 
     The default precision of PyTorch is fp32 on the CPU and bf16 on a GPU.

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
+from bevcli.model.precision import AnyPrecision
 from bevcli.options import option, options
 from bevcli.registry import entries, known_models
 
@@ -59,7 +59,7 @@ class ModelOptions:
         metavar="torch|NAME",
         complete=lambda incomplete: [TORCH, *entries("bevcli.engines")],
     )
-    precision: Literal["fp32", "bf16", "fp16", "int8"] | None = option(
+    precision: AnyPrecision | None = option(
         default=None,
         help="Precision of the image features. int8 is for a CPU, and needs an engine. Default: fp32 on a CPU, bf16 on "
         "a GPU.",

@@ -8,7 +8,7 @@ import atexit
 import copy
 import threading
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,10 +24,10 @@ from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
+from bevcli.model.precision import Precision
 from bevcli.model.resnet import ResNet
 from bevcli.model.temporal_model import TemporalModel
 
-Precision = Literal["fp32", "bf16", "fp16"]
 TOKENS_OF_A_BLOCK = 1024  # the sums of a block stay in the cache
 LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}

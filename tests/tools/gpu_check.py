@@ -39,7 +39,8 @@ from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.model.network import Network
-from bevcli.model.prepare import Precision, methods_on_device, prepare_for_inference
+from bevcli.model.precision import Precision
+from bevcli.model.prepare import methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say

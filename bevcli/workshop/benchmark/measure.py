@@ -24,7 +24,8 @@ from bevcli.inference.runner import RunnerState
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.prepare import DTYPES, Precision
+from bevcli.model.precision import Precision
+from bevcli.model.prepare import DTYPES
 from bevcli.recording.writer import Recording
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.versions import WARM_UP_FRAMES, Comparison, Version, compare_with_plain, wait_for

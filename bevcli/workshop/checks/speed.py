@@ -6,7 +6,8 @@ from statistics import median
 
 from bevcli.config import load_config
 from bevcli.inference.load import choose_device
-from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.precision import Precision
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.printing import counted
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.measure import measure_limits

@@ -33,6 +33,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
+from bevcli.model.precision import AnyPrecision
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence
@@ -76,7 +77,7 @@ class Engine(LoadedFile):
 
     packages: ClassVar[tuple[str, ...]] = ()
     extra: ClassVar[str] = "onnx"
-    precisions: ClassVar[tuple[str, ...]] = ("fp32", "int8")
+    precisions: ClassVar[tuple[AnyPrecision, ...]] = ("fp32", "int8")
     rank: ClassVar[int] = 2
     deformable_convolution: ClassVar[DeformableConvolution] = "operator"
 

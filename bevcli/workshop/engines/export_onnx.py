@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.frame import Drive
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
+from bevcli.model.precision import AnyPrecision
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
@@ -207,7 +208,7 @@ class ExportedFile:
     cameras_per_cell: int
     untrained: bool
     bundled: bool
-    precision: Literal["fp32", "int8"]
+    precision: AnyPrecision
 
 
 def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
@@ -222,7 +223,7 @@ def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
         raise WeightsError(
             f"{file}: its metadata config or cameras_per_cell is wrong (expected a table and an integer)"
         )
-    precision: Literal["fp32", "int8"] = "int8" if metadata["precision"] == "int8" else "fp32"
+    precision: AnyPrecision = "int8" if metadata["precision"] == "int8" else "fp32"
     config = config_of_table(contents, str(file))
     # The file's images have one size, for every rig.
     config = replace(config, image=replace(config.image, focal_px=None, max_pixels=None))
