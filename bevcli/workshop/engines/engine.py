@@ -34,12 +34,12 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.precision import AnyPrecision
+from bevcli.model.temporal_model import model_class
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.view import select_range
 from bevcli.workshop.engines import OnnxOptions
-from bevcli.workshop.engines.export_form import export_form
 from bevcli.workshop.engines.export_onnx import (
     EXPORTERS,
     QUANTIZERS,
@@ -150,7 +150,7 @@ class Engine(LoadedFile):
             )
         cls.in_precision(options.precision or "fp32").require_packages()
         require(*EXPORTERS, *(QUANTIZERS if options.precision == "int8" else ()))
-        export_form(config, len(config.cameras))
+        model_class(config).export_form(config, len(config.cameras))
 
     @classmethod
     def export(cls, model: Model, rig: CameraRig, drive: Drive | None, report: Callable[[str], None]) -> Model:

@@ -80,12 +80,6 @@ class ExportForm:
         raise NotImplementedError
 
 
-def export_form(config: ModelConfig, cameras: int) -> ExportForm:
-    """The form in which a model is exported for a number of cameras. Raises BevcliError for a model that has none."""
-    form: ExportForm = model_class(config).export_form(config, cameras)
-    return form
-
-
 def camera_ports(
     config: ModelConfig, lead: tuple[int, ...], axes: str = "1, N", bev_frame: str = "the bev frame"
 ) -> tuple[Port, ...]:

@@ -27,12 +27,12 @@ from bevcli.frame import Drive
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.precision import AnyPrecision
-from bevcli.model.temporal_model import TemporalModel
+from bevcli.model.temporal_model import TemporalModel, model_class
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json
 from bevcli.printing import counted
 from bevcli.workshop.engines import OnnxOptions
-from bevcli.workshop.engines.export_form import ExportForm, Port, export_form
+from bevcli.workshop.engines.export_form import ExportForm, Port
 from bevcli.writing import check_output, whole_file
 
 EXPORTERS = ("onnx", "onnxscript")  # packages that write the file
@@ -94,7 +94,8 @@ def export_onnx(
             f"{chosen.deformable_convolution}`)"
         )
     config = network.config
-    form = export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
+    cameras = len(config.cameras) if chosen.cameras is None else chosen.cameras
+    form: ExportForm = model_class(config).export_form(config, cameras)
     slots = min(chosen.cameras_per_cell, form.cameras)
     inputs, outputs = form.inputs, form.outputs(decode=chosen.decode)
     step = form.step(network, chosen.deformable_convolution, slots, decode=chosen.decode).eval()

@@ -24,7 +24,7 @@ from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.printing import counted, reason_of
 from bevcli.registry import load
-from bevcli.workshop.engines.export_form import export_form, pixels_of
+from bevcli.workshop.engines.export_form import ExportForm, pixels_of
 from bevcli.workshop.engines.export_onnx import read_metadata
 
 Arrays = Mapping[str, np.ndarray]
@@ -68,7 +68,7 @@ class ExportedModel(TemporalModel):
         self.file, self.engine, self.metadata = file, engine, metadata
         self._require(("images",), engine.input_shapes, "input")
         self.kind = model_class(self.config)
-        self.form = export_form(self.config, self.cameras)
+        self.form: ExportForm = self.kind.export_form(self.config, self.cameras)
         self._require((port.name for port in self.form.outputs(decode=False)), engine.outputs, "output")
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
