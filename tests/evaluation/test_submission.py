@@ -43,6 +43,12 @@ def many_boxes(count: int, seed: int = 0) -> Boxes3D:
     )
 
 
+def assert_numbers(box: dict[str, Any]) -> None:
+    for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
+        assert len(box[key]) == length
+        assert all(type(number) is float and math.isfinite(number) for number in box[key])
+
+
 def assert_valid(submission: dict[str, Any], tokens: set[str]) -> None:
     assert set(submission) == {"meta", "results"}
     flags = {"use_camera", "use_lidar", "use_radar", "use_map", "use_external"}
@@ -53,9 +59,7 @@ def assert_valid(submission: dict[str, Any], tokens: set[str]) -> None:
         assert len(boxes) <= 500
         for box in boxes:
             assert box["sample_token"] == token
-            for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
-                assert len(box[key]) == length
-                assert all(type(number) is float and math.isfinite(number) for number in box[key])
+            assert_numbers(box)
             assert box["detection_name"] in NUSCENES_CLASSES
             assert type(box["detection_score"]) is float
             allowed = ALLOWED_ATTRIBUTES.get(box["detection_name"], VEHICLE_ATTRIBUTES)
@@ -190,9 +194,7 @@ def test_a_tracking_submission_keeps_the_devkits_rules(tmp_path: Path) -> None:
         assert type(box["tracking_id"]) is str
         assert type(box["tracking_score"]) is float
         assert box["tracking_name"] in {"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"}
-        for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
-            assert len(box[key]) == length
-            assert all(type(number) is float and math.isfinite(number) for number in box[key])
+        assert_numbers(box)
     scores = [box["tracking_score"] for box in written]
     assert scores == sorted(scores, reverse=True)
     assert len({box["tracking_id"] for box in written}) == 500

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from bevcli.recording.components import any_values, components, packed, rgb_format, ui_points
+from bevcli.recording.components import any_values, components, line_strips, packed, rgb_format, ui_points
 
 RANDOM = np.random.default_rng(0)
 POINTS_2D, POINTS_3D = RANDOM.normal(size=(5, 2)), RANDOM.normal(size=(5, 3))
@@ -91,3 +91,14 @@ def test_any_values_equal_those_of_rerun():
     for descriptor, array in any_values(**values).items():
         assert array.type == expected[descriptor].type
         assert array.equals(expected[descriptor])
+
+
+@pytest.mark.parametrize("lengths", [[], [2], [5, 2, 3, 1], [2, 2]])
+def test_strips_equal_those_of_rerun(lengths):
+    random = np.random.default_rng(0)
+    flat, solid = ([random.normal(size=(length, size)) for length in lengths] for size in (2, 3))
+    of_flat = line_strips(np.concatenate([np.zeros((0, 2)), *flat]), lengths)
+    of_solid = line_strips(np.concatenate([np.zeros((0, 3)), *solid]), lengths)
+    assert of_flat.equals(rr.components.LineStrip2DBatch(flat).as_arrow_array())
+    assert of_solid.equals(rr.components.LineStrip3DBatch(solid).as_arrow_array())
+    assert rr.LineStrips2D(of_flat).strips.as_arrow_array().equals(of_flat)
