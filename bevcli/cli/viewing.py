@@ -9,7 +9,6 @@ from bevcli.cli.bridge import FormatValues
 from bevcli.cli.progress import Progress, odometry_bar
 from bevcli.cli.run import input_warnings
 from bevcli.errors import InputError
-from bevcli.frame import Frame
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.open import open_sequence
@@ -42,7 +41,7 @@ def record_drive(
     path: Path, options: ViewOptions, recording: RecordingOptions, source: InputOptions, format_options: FormatValues
 ) -> None:
     """Record a drive and boxes, and show the recording."""
-    from bevcli.workshop.scores.record import names_of, record
+    from bevcli.workshop.scores.record import names_of, record_steps
 
     check_is_drive(path)
     if options.out is not None and options.out.suffix.lower() != ".rrd":
@@ -56,21 +55,13 @@ def record_drive(
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         file = options.out or Path(folder) / RECORDING
         with Progress(len(drive.stamps), "frames", drive.notes) as progress:
-
-            def warn(frame: Frame) -> None:
-                for warning in input_warnings(frame):
+            for step in record_steps(drive, boxes, file, recording.score, source.class_map):
+                if isinstance(step, str):
+                    progress.message(step)
+                    continue
+                for warning in input_warnings(step):
                     progress.message(f"warning: {warning}")
                 progress.advance()
-
-            record(
-                drive,
-                boxes,
-                file,
-                score=recording.score,
-                class_map=source.class_map,
-                report=progress.message,
-                on_frame=warn,
-            )
         if options.out is not None:
             say(f"{file}: {counted(len(drive.stamps), 'frames')}; next: bevcli viz {shlex.quote(str(file))}")
         if options.out is None or options.summary or options.screenshot or options.video:

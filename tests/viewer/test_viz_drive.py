@@ -16,7 +16,7 @@ from recorded_drive import screenshot_or_skip
 from typer.testing import CliRunner
 
 import bevcli
-from bevcli.cli import commands
+from bevcli.cli import viewing
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.recording import entities
@@ -56,7 +56,7 @@ def opened(monkeypatch):
         assert recording.stat().st_size > 100_000
         shown.append((recording, options.frame))
 
-    monkeypatch.setattr(commands, "_open_viewer", open_viewer)
+    monkeypatch.setattr(viewing, "_open_viewer", open_viewer)
     return shown
 
 

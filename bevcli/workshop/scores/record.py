@@ -1,7 +1,7 @@
 """`record`: writes a drive with its labels, and boxes of one or two models against them, into a recording."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,24 +58,43 @@ def record(
         OutputError: the recording cannot be written.
     """
     drive = open_sequence(drive, class_map=class_map or {}) if isinstance(drive, str | Path) else drive
-    given = dict(boxes) if isinstance(boxes, Mapping) else {} if boxes is None else {_name_of(boxes): boxes}
-    if len(given) > MOST:
+    for step in record_steps(drive, boxes, path, score, class_map):
+        if isinstance(step, Frame):
+            on_frame(step)
+        else:
+            report(step)
+    return Path(path)
+
+
+def record_steps(
+    drive: Drive,
+    boxes: GivenBoxes | Mapping[str, GivenBoxes] | None,
+    path: str | Path,
+    score: float | None = None,
+    class_map: Mapping[str, str] | None = None,
+) -> Iterator[Frame | str]:
+    """As `record`, step by step: each frame after it was written, and each line for the user."""
+    sources = dict(boxes) if isinstance(boxes, Mapping) else {} if boxes is None else {_name_of(boxes): boxes}
+    if len(sources) > MOST:
         raise InputError(
-            f"`boxes` (`--boxes`): found those of {len(given)} models (expected at most {MOST}): leave some out"
+            f"`boxes` (`--boxes`): found those of {len(sources)} models (expected at most {MOST}): leave some out"
         )
-    inputs = {name: _open(each, name, drive, class_map) for name, each in given.items()}
-    of_frames = [_by_frame(drive, name, each, report) for name, each in inputs.items()]
+    inputs = {name: _open(source, name, drive, class_map) for name, source in sources.items()}
+    of_frames = []
+    for name, source in inputs.items():
+        by_frame, notes = _by_frame(drive, name, source)
+        of_frames.append(by_frame)
+        yield from notes
     options = RecordingOptions(level="minimal") if score is None else RecordingOptions(level="minimal", score=score)
     labelled = 0
     with Recording(path, drive, _recorded(drive, inputs), options) as recording:
         for index in range(len(drive.stamps)):
             frame = drive.load(index)
-            recording.log(frame, [boxes[index] for boxes in of_frames])
+            recording.log(frame, [by_frame[index] for by_frame in of_frames])
             labelled += frame.ground_truth is not None
-            on_frame(frame)
+            yield frame
     if labelled < len(drive.stamps):
-        report(f"{drive.name}: no labels in {len(drive.stamps) - labelled} of {counted(len(drive.stamps), 'frames')}")
-    return Path(path)
+        yield f"{drive.name}: no labels in {len(drive.stamps) - labelled} of {counted(len(drive.stamps), 'frames')}"
 
 
 def names_of(paths: Iterable[Path]) -> dict[str, Path]:
@@ -122,8 +141,8 @@ def _open(boxes: GivenBoxes, name: str, drive: Drive, class_map: Mapping[str, st
     return ScoredInput(BoxesFile("world" if drive.has_ego_motion else "ego", frames), Path(name))
 
 
-def _by_frame(drive: Drive, name: str, source: ScoredInput, report: Callable[[str], object]) -> list[Boxes3D | None]:
-    """The boxes of one model for each frame of the drive. Raises InputError, which names the model."""
+def _by_frame(drive: Drive, name: str, source: ScoredInput) -> tuple[list[Boxes3D | None], list[str]]:
+    """The boxes of one model for each frame of the drive, and lines for the user. Raises InputError with its name."""
     try:
         of_frames, pairs = boxes_of_drive(source.boxes, drive)
     except InputError as error:
@@ -132,12 +151,12 @@ def _by_frame(drive: Drive, name: str, source: ScoredInput, report: Callable[[st
     rest = len(source.boxes.frames) - matched
     more = f"; not in the drive: {counted(rest, 'further frames')}" if rest else ""
     key = pairs.matched_by if pairs.matched_by in RELIABLE else f"{pairs.matched_by}, as scenes or times differ"
-    report(f"{name}: has boxes of {matched} of {counted(len(of_frames), 'frames')}, matched by {key}{more}")
+    notes = [f"{name}: has boxes of {matched} of {counted(len(of_frames), 'frames')}, matched by {key}{more}"]
     sides = zip(pairs.predictions, pairs.ego_xy, strict=True)
     away = np.concatenate([np.linalg.norm(frame.boxes.centers[:, :2] - ego, axis=1) for frame, ego in sides])
     if len(away) and away.min() > FAR_M:
-        report(f"warning: {name}: the nearest box is {away.min():.0f} m from the vehicle: is it of this drive?")
-    return of_frames
+        notes.append(f"warning: {name}: the nearest box is {away.min():.0f} m from the vehicle: is it of this drive?")
+    return of_frames, notes
 
 
 def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
