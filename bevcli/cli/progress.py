@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 import typer
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model
     from bevcli.published import NamedWeights
     from bevcli.weights.fetch import FetchedWeights
+
+T = TypeVar("T")
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
@@ -77,6 +79,12 @@ class Progress:
         """Adds units of work up to this number of them."""
         if done > self.done:
             self.advance(done - self.done)
+
+    def each(self, items: Iterable[T]) -> Iterator[T]:
+        """The items, each a unit of work that is done when the next one is asked for."""
+        for item in items:
+            yield item
+            self.advance()
 
     def skip(self, count: int) -> None:
         """Adds units of work that were done before: they do not count for the rate."""

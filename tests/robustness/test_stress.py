@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
 from bevcli.workshop.robustness.conditions import choose_conditions
-from bevcli.workshop.robustness.stress import StressOptions, stress
+from bevcli.workshop.robustness.stress import StressOptions, StressTest, stress
 from bevcli.workshop.training.validation import drives_table, validate
 
 FRAMES = 3
@@ -88,40 +89,22 @@ def test_the_clean_scores_are_those_of_validate(whole, model, drives):
 
 
 def test_an_interrupted_test_resumed_gives_the_same_bytes(whole, model, drives, tmp_path):
-    out, frames, runs = tmp_path / "out", 0, 0
-
-    def count() -> None:
-        nonlocal frames
-        frames += 1
-
-    while runs < 50:
-        began, runs = frames, runs + 1
-        results = stress(
-            model, drives, CONDITIONS, out, resume=True, after_frame=count,
-            should_stop=lambda began=began: frames - began >= 8,
-        )  # fmt: skip
-        if results.is_complete:
-            break
-        assert content(out)["complete"] is False
+    out, runs, is_complete = tmp_path / "out", 0, False
+    while runs < 50 and not is_complete:
+        test, runs = StressTest(model, drives, CONDITIONS, out, resume=True), runs + 1
+        list(islice(test.run(), 9))  # as an early end of the loop
+        is_complete = test.results.is_complete
+        assert content(out)["complete"] is is_complete
     assert runs > 3
     assert (out / "stress.json").read_bytes() == (whole / "stress.json").read_bytes()
 
 
 def test_finished_scenes_are_not_run_again(model, drives, tmp_path):
-    frames = []
-    stress(
-        model,
-        drives,
-        CONDITIONS[:2],
-        tmp_path,
-        after_frame=lambda: frames.append(1),
-        should_stop=lambda: len(frames) == FRAMES + 2,
-    )
-    known, again = [], []
-    stress(
-        model, drives, CONDITIONS[:2], tmp_path, resume=True, resumed=known.append, after_frame=lambda: again.append(1)
-    )
-    assert known == [FRAMES]  # the first drive of the clean condition
+    for done in StressTest(model, drives, CONDITIONS[:2], tmp_path).run():
+        if done == FRAMES + 2:
+            break
+    known, *again = StressTest(model, drives, CONDITIONS[:2], tmp_path, resume=True).run()
+    assert known == FRAMES  # the first drive of the clean condition
     assert len(again) == 2 * 2 * FRAMES - FRAMES
 
 

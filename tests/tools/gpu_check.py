@@ -402,29 +402,22 @@ def measure_whole_run(
     return {"run / model": time_runs(version, drive, first, RUN_FRAMES, RUNS_S)[1]}
 
 
-class Enough(Exception):
-    """The training took long enough."""
-
-
 def train(model: str, device: torch.device, seconds: float) -> dict[str, Any]:
     """Speed of the updates of so many seconds, at least one, on the sample drive."""
     losses: list[float] = []
     ends: list[float] = []
-
-    def after_update(loss: float) -> None:
-        losses.append(loss)
-        ends.append(time.perf_counter())
-        if ends[-1] - began > seconds:
-            raise Enough
-
     with tempfile.TemporaryDirectory(prefix="bevcli-gpu-check-") as folder:
         large = device.type == "cuda" and torch.cuda.get_device_properties(device).total_memory >= TRAINED_BYTES
         changes = {"clips.batch": str(TRAINED_CLIPS)} if large else {}
         options = TrainOptions(out=Path(folder) / "train", held_out=0, changes=changes)
         trainer = Trainer(prepare_training(model, device, DriveOptions(data=(ROOT / TRAINED_ON,)), options))
         began = time.perf_counter()
-        with contextlib.suppress(Enough):
-            trainer.run(after_update=after_update)
+        for progress in trainer.run():
+            if progress.loss is not None:
+                losses.append(progress.loss)
+                ends.append(time.perf_counter())
+                if ends[-1] - began > seconds:
+                    break
     a_second = 1 / (sum(later - end for end, later in pairwise(ends)) / max(len(ends) - 1, 1) or math.inf)
     return {
         "updates": len(losses),

@@ -25,8 +25,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
-from bevcli.workshop.training.options import ValidationOptions
-from bevcli.workshop.training.train import score_drives
+from bevcli.workshop.training.validation import validate
 
 SHORTEST_WAY_M = 5.0  # of a drive whose end is stated in per cent
 SHORTEST_STEP_M = 0.5  # of a step whose length is stated in per cent
@@ -190,7 +189,7 @@ class OpenDrives:
 def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iterator[str]:
     """A line each for a model's scores with the right and with the measured motion, and their ratio."""
     loaded = load_model(model)
-    options, chosen = InputOptions(every=1, classes=loaded.config.classes), ValidationOptions(each=True)
+    options, runner = InputOptions(every=1, classes=loaded.config.classes), loaded.runner(track=False, temporal=True)
     right = [open_sequence(path, options) for path in paths]
     measured_drives = [
         DriveView(drive, motions=dict.fromkeys((stamp.scene for stamp in drive.stamps), motion.ego_motion))
@@ -199,7 +198,7 @@ def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iter
     found = []
     for name, drives in (("right", right), ("measured", measured_drives)):
         opened = OpenDrives(list(drives))
-        found.append(score_drives(loaded, opened, chosen, temporal=True, after_frame=lambda: None))
+        found.append(validate(runner, opened, each_drive=True))
         yield f"{name} motion: {found[-1]}"
         yield "  " + ", ".join(f"{each.name} {each.nd_score:.3f}" for each in found[-1].drives)
     ratio = found[1].summary()["NDS"] / found[0].summary()["NDS"]

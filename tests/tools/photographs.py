@@ -144,26 +144,29 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
     job = replace(job, config=replace(job.config, optimizer=optimizer))
     with job.lock:
         trainer = Trainer(job)
-        updates, saves = [0], save_times(end_s - asked.train_s)
-        due = [next(saves)]
+        updates, saves = 0, save_times(end_s - asked.train_s)
+        due = next(saves)
+        for progress in trainer.run():
+            if progress.loss is not None:
+                updates += 1
+                if updates in (1, 2, 3) or updates % 100 == 0:
+                    waited = f"waited {trainer.waited_s:.1f} s, {left(end_s):.0f} s left"
+                    say(f"update {updates}, loss {progress.loss:.4g}, {waited}")
+                continue
+            if time.perf_counter() > due[1]:
+                save(asked.out / f"weights_{due[0]:.0f}.safetensors", trainer)
+                due = next(saves)
+            if left(end_s) < 0:
+                trainer.save_checkpoint()
+                break
+        save(asked.out / "weights.safetensors", trainer)
+    frames = updates * job.config.clips.batch
+    say(f"{updates} updates, {frames} frames, {frames / (time.perf_counter() - optimizer.begun_s[0]):.0f} a second")
 
-        def save(name: str) -> None:
-            save_weights(asked.out / name, trainer.averaged_model(), torch.float16)
 
-        def after_update(loss: float) -> None:
-            updates[0] += 1
-            if updates[0] in (1, 2, 3) or updates[0] % 100 == 0:
-                say(f"update {updates[0]}, loss {loss:.4g}, waited {trainer.waited_s:.1f} s, {left(end_s):.0f} s left")
-
-        def after_step() -> None:
-            if time.perf_counter() > due[0][1]:
-                save(f"weights_{due[0][0]:.0f}.safetensors")
-                due[0] = next(saves)
-
-        trainer.run(after_step, stop=lambda: left(end_s) < 0, after_update=after_update)
-        save("weights.safetensors")
-    frames = updates[0] * job.config.clips.batch
-    say(f"{updates[0]} updates, {frames} frames, {frames / (time.perf_counter() - optimizer.begun_s[0]):.0f} a second")
+def save(path: Path, trainer: Trainer) -> None:
+    """Write the averaged weights."""
+    save_weights(path, trainer.averaged_model(), torch.float16)
 
 
 def left(end_s: float) -> float:

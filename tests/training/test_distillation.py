@@ -81,7 +81,7 @@ def learned(loss: DistillationLossConfig, augmentation: AugmentationConfig, out:
     settings = replace(settings, optimizer=replace(settings.optimizer, learning_rate=1e-3, warm_up_steps=1))
     torch.manual_seed(1)
     drives = PaintedDrives(2, all_labelled=True)
-    Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, out, torch.device("cpu"))).run()
+    list(Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, out, torch.device("cpu"))).run())
     with (out / "loss.csv").open() as file:
         return [float(row[name]) for row in csv.DictReader(file)]
 

@@ -50,7 +50,7 @@ def train(group: ProcessGroup, folder: Path) -> None:
     torch.manual_seed(0)
     drives = PaintedDrives(2)
     trainer = Trainer(TrainingJob(BEVFormer(CONFIG), SHORT, drives, drives, folder, torch.device("cpu"), 0, group))
-    trainer.run()
+    list(trainer.run())
     torch.save(trainer.job.model.state_dict(), folder / f"{group.rank}-of-{group.size}.pt")
 
 

@@ -23,7 +23,6 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, scored_drives, training_drives
 from bevcli.workshop.synth.options import DriveOptions, parse_seeds
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
-from bevcli.workshop.training.commands import _run
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.workshop.training.losses import DenseLossConfig
@@ -65,19 +64,14 @@ def assert_same_weights(one: Trainer, other: Trainer, *, same: bool = True) -> N
 
 
 def run_and_kill(killed: Trainer, *, after: int) -> None:
-    def kill() -> None:
-        if killed.done == after:
-            raise Killed
-
-    with pytest.raises(Killed):
-        killed.run(kill)
+    next(progress for progress in killed.run() if progress.loss is None and progress.done == after)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     """An uninterrupted training."""
     whole = trainer(tmp_path_factory.mktemp("training"))
-    whole.run()
+    list(whole.run())
     return whole
 
 
@@ -85,7 +79,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
 def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     """An uninterrupted training of two steps with one loader."""
     one = trainer(tmp_path_factory.mktemp("two-steps"), settings=TWO_STEPS)
-    one.run()
+    list(one.run())
     return one
 
 
@@ -93,7 +87,7 @@ def test_a_killed_and_resumed_training_equals_an_uninterrupted(whole: Trainer, t
     run_and_kill(trainer(tmp_path / "killed"), after=3)  # a step after the last checkpoint
     resumed = trainer(tmp_path / "killed", resume=True)
     assert resumed.done == 2
-    resumed.run()
+    list(resumed.run())
     assert_same_weights(whole, resumed)
     for file in ("loss.csv", "validation.csv"):
         assert (whole.job.out / file).read_text() == (tmp_path / "killed" / file).read_text()
@@ -102,11 +96,11 @@ def test_a_killed_and_resumed_training_equals_an_uninterrupted(whole: Trainer, t
 
 def test_a_stopped_training_leaves_a_checkpoint_to_resume_from(whole: Trainer, tmp_path: Path) -> None:
     stopped = trainer(tmp_path / "part")
-    stopped.run(stop=lambda: stopped.done == 1)  # the next regular checkpoint is after step 2
-    assert stopped.done == 1
+    run_and_kill(stopped, after=1)
+    stopped.save_checkpoint()  # the next regular one is after step 2
     resumed = trainer(tmp_path / "part", resume=True)
     assert resumed.done == 1
-    resumed.run()
+    list(resumed.run())
     assert_same_weights(whole, resumed)
 
 
@@ -123,8 +117,8 @@ def test_a_signal_requests_a_stop(number: int, exit_code: int) -> None:
 
 def test_a_seed_reproduces_and_another_one_differs(two_steps: Trainer, tmp_path: Path) -> None:
     again, other = (trainer(tmp_path / str(seed), seed, settings=TWO_STEPS) for seed in (0, 1))
-    again.run()
-    other.run()
+    list(again.run())
+    list(other.run())
     assert_same_weights(two_steps, again)
     assert_same_weights(two_steps, other, same=False)
 
@@ -132,7 +126,7 @@ def test_a_seed_reproduces_and_another_one_differs(two_steps: Trainer, tmp_path:
 def test_the_number_of_loaders_changes_nothing(two_steps: Trainer, tmp_path: Path) -> None:
     assert TWO_STEPS.loaders != 3
     three = trainer(tmp_path, settings=replace(TWO_STEPS, loaders=3))
-    three.run()
+    list(three.run())
     assert_same_weights(two_steps, three)
 
 
@@ -159,7 +153,7 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
 
     whole = with_all_options(tmp_path / "whole")
     assert [len(whole.maker(0, place).inputs) for place in range(2)] == [2, 2]
-    whole.run()
+    list(whole.run())
     assert parameters_without_gradient(whole) == []
     # These keys are part of the checkpoint format.
     keys = torch.load(tmp_path / "whole" / "checkpoint.pt", weights_only=True)["model"]
@@ -172,7 +166,7 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
     run_and_kill(with_all_options(tmp_path / "killed"), after=1)
     resumed = with_all_options(tmp_path / "killed", resume=True)
     assert resumed.done == 1
-    resumed.run()
+    list(resumed.run())
     again = load_file(tmp_path / "killed" / "weights.safetensors")
     assert all(torch.equal(again[name], exported[name]) for name in exported)
     assert_same_weights(whole, resumed)
@@ -192,7 +186,7 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(two_steps: Trainer
 def test_frozen_stages_keep_weights_and_statistics(tmp_path: Path) -> None:
     trained = trainer(tmp_path, settings=replace(SHORT, frozen_stages=1))
     before = {name: value.clone() for name, value in trained.job.model.backbone.state_dict().items()}
-    trained.run()
+    list(trained.run())
     changed = {name for name, value in trained.job.model.backbone.state_dict().items() if not value.equal(before[name])}
     assert not [name for name in changed if name.startswith(("conv1", "bn1", "stages.0."))]
     assert {"stages.1.0.conv1.weight", "stages.1.0.bn1.running_mean"} <= changed
@@ -202,7 +196,7 @@ def test_randomised_images_are_drawn_anew_but_by_the_seed(two_steps: Trainer, tm
     augmentation = AugmentationConfig(randomisation=RandomisationConfig(convolution=0.5, noise=0.5))
     runs = [trainer(tmp_path / str(run), settings=replace(TWO_STEPS, augmentation=augmentation)) for run in range(2)]
     for one in runs:
-        one.run()
+        list(one.run())
     assert_same_weights(*runs)
     assert_same_weights(runs[0], two_steps, same=False)
 
@@ -210,26 +204,24 @@ def test_randomised_images_are_drawn_anew_but_by_the_seed(two_steps: Trainer, tm
 def test_training_and_validation_leave_no_hooks_on_the_model(tmp_path: Path) -> None:
     settings = replace(SHORT, steps=2, evaluate_every=1, perspective_loss=PerspectiveLossConfig(1.0))
     one = trainer(tmp_path, settings=settings)
-    hooks_after_validation = []
-
-    def count_hooks(step: int, scores: object) -> None:
-        modules = list(one.job.model.modules())
-        hooks_after_validation.append(sum(len(m._forward_hooks) + len(m._forward_pre_hooks) for m in modules))
-
-    one.run(after_validation=count_hooks)
-    assert hooks_after_validation == [0, 0]
+    hooks = [
+        sum(len(m._forward_hooks) + len(m._forward_pre_hooks) for m in one.job.model.modules())
+        for progress in one.run()
+        if progress.scores is not None
+    ]
+    assert hooks == [0, 0]
 
 
 def test_training_does_not_touch_the_random_state_of_the_process(tmp_path: Path) -> None:
     one = trainer(tmp_path, settings=replace(SHORT, steps=1))
     before = torch.get_rng_state()
-    one.run()
+    list(one.run())
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_the_weights_of_a_training_can_be_loaded(tmp_path: Path) -> None:
     one = trainer(tmp_path, settings=replace(SHORT, steps=1, weights_dtype="float16"))
-    one.run()
+    list(one.run())
     model = BEVFormer(NOISY)
     load_weights(tmp_path / "weights.safetensors", model)
     expected = one.job.model.backbone.conv1.weight
@@ -339,7 +331,7 @@ def test_a_resumed_training_names_other_settings(two_steps: Trainer, tmp_path: P
 def test_a_training_beyond_its_steps_says_so(two_steps: Trainer, tmp_path: Path) -> None:
     shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
     with pytest.raises(InputError, match=r"has done 2 steps already \(expected at most `steps=1`\)"):
-        _run(trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1)))
+        trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1))
 
 
 def test_a_nan_loss_stops_the_training(tmp_path: Path) -> None:
@@ -347,7 +339,7 @@ def test_a_nan_loss_stops_the_training(tmp_path: Path) -> None:
     with torch.no_grad():
         one.job.model.detection_head.box_branches[0][0].weight.fill_(float("nan"))
     with pytest.raises(BevcliError, match="step 1: the loss is nan"):
-        one.run()
+        list(one.run())
 
 
 def test_the_learning_rate_warms_up_and_decays_by_a_cosine() -> None:
@@ -443,7 +435,7 @@ def test_four_clips_can_be_overfitted(tmp_path: Path) -> None:
     )
     drives = PaintedDrives(4)
     torch.manual_seed(0)
-    Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, tmp_path, torch.device("cpu"))).run()
+    list(Trainer(TrainingJob(BEVFormer(CONFIG), settings, drives, drives, tmp_path, torch.device("cpu"))).run())
     header, last = (tmp_path / "validation.csv").read_text().splitlines()
     scores = dict(zip(header.split(","), map(float, last.split(",")), strict=True))
     assert scores["mAP"] > 0.9

@@ -37,11 +37,6 @@ ALL_PARTS = replace(
 def losses(settings: TrainingConfig, out: Path, device: torch.device, waits: list[str]) -> list[tuple[float, Any]]:
     """Of all updates; and the operations of each for which the CPU waited. It ends with a validation."""
     found: list[tuple[float, Any]] = []
-
-    def after_update(loss: float) -> None:
-        found.append((loss, tuple(waits)))
-        waits.clear()
-
     torch.manual_seed(0)
     model, drives = BEVFormer(CONFIG), PaintedDrives(2, all_labelled=True)
     save_weights(out / "teacher.safetensors", model, torch.float32)
@@ -50,7 +45,10 @@ def losses(settings: TrainingConfig, out: Path, device: torch.device, waits: lis
         settings = replace(settings, distillation_loss=taught)
     trainer = Trainer(TrainingJob(model, settings, drives, drives, out, device, seed=0))
     waits.clear()
-    trainer.run(after_update=after_update)
+    for progress in trainer.run():
+        if progress.loss is not None:
+            found.append((progress.loss, tuple(waits)))
+            waits.clear()
     assert len(found) == 2
     assert (out / "weights.safetensors").exists()
     return found

@@ -30,8 +30,22 @@ PREFIX, LAST = "detection_head.class_branches", "6"  # the linear layer with a r
 RIG = make_rig({"front": 5.0, "left": 100.0, "rear": -178.0})
 
 
-def no_rig() -> CameraRig:
-    raise AssertionError("the names of the cameras suffice")
+class OneRig:
+    """A drive, and the drives of it alone. Without a rig: the names of the cameras suffice."""
+
+    def __init__(self, rig: CameraRig | None) -> None:
+        self._rig = rig
+
+    def open(self, index: int) -> OneRig:
+        return self
+
+    @property
+    def rig(self) -> CameraRig:
+        assert self._rig is not None
+        return self._rig
+
+
+NO_RIG = OneRig(None)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +69,7 @@ def tensors(path: Path) -> dict[str, torch.Tensor]:
 
 def test_rows_of_classes_go_by_name_and_by_like(source: Path) -> None:
     model, before, given = own_model(), own_model().state_dict(), tensors(source)
-    start = warm_start(source, model, "own.toml", no_rig)
+    start = warm_start(source, model, "own.toml", NO_RIG)
     for layer in range(2):
         for kind in ("weight", "bias"):
             key = f"{PREFIX}.{layer}.{LAST}.{kind}"
@@ -71,7 +85,7 @@ def test_rows_of_classes_go_by_name_and_by_like(source: Path) -> None:
 
 def test_every_other_tensor_is_that_of_the_file(source: Path) -> None:
     model, given = own_model(), tensors(source)
-    start = warm_start(source, model, "own.toml", no_rig)
+    start = warm_start(source, model, "own.toml", NO_RIG)
     same = [key for key, tensor in model.state_dict().items() if not key.startswith(PREFIX)]
     assert all(torch.equal(model.state_dict()[key], given[key]) for key in same)
     row = 2 * (32 + 1)  # of a class: weights and a bias of each of two layers
@@ -81,7 +95,7 @@ def test_every_other_tensor_is_that_of_the_file(source: Path) -> None:
 
 def test_cameras_of_other_names_take_the_nearest_view(source: Path) -> None:
     model, given = own_model(cameras=("rear", "front", "CAM_BACK", "roof")), tensors(source)
-    start = warm_start(source, model, "own.toml", lambda: RIG)
+    start = warm_start(source, model, "own.toml", OneRig(RIG))
     front, back = given["image_tokens.camera_embedding"]
     embedding = model.image_tokens.camera_embedding
     torch.testing.assert_close(embedding.data, torch.stack([back, front, back, (front + back) / 2]))
@@ -93,21 +107,21 @@ def test_views_of_unknown_heading_take_the_mean(tmp_path: Path) -> None:
     path = tmp_path / "source.safetensors"
     save_weights(path, small_model(1), torch.float32)  # its cameras are FRONT and BACK
     model = own_model(cameras=("left",))
-    warm_start(path, model, "own.toml", lambda: RIG)
+    warm_start(path, model, "own.toml", OneRig(RIG))
     mean = tensors(path)["image_tokens.camera_embedding"].mean(0)
     torch.testing.assert_close(model.image_tokens.camera_embedding.data[0], mean)
 
 
 def test_parts_that_only_one_model_has_are_listed(source: Path) -> None:
     decoder = replace(small_config().decoder, layers=1, queries=15)
-    start = warm_start(source, own_model(decoder=decoder), "own.toml", no_rig)
+    start = warm_start(source, own_model(decoder=decoder), "own.toml", NO_RIG)
     assert "another shape in the file (decoder.query_embedding: 12 × 64 and 15 × 64)" in start.table()
     assert "not in the model (decoder.layers.1." in start.table()
 
 
 def test_fewer_object_queries_are_the_first_of_the_file(source: Path) -> None:
     model = own_model(decoder=replace(small_config().decoder, queries=9))
-    start = warm_start(source, model, "own.toml", no_rig)
+    start = warm_start(source, model, "own.toml", NO_RIG)
     assert torch.equal(model.decoder.query_embedding, tensors(source)["decoder.query_embedding"][:9])
     assert "the first queries of the file" in start.table()
 
@@ -116,7 +130,7 @@ def test_weights_of_another_network_are_refused(source: Path) -> None:
     model = own_model(channels=64)
     before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
     with pytest.raises(WeightsError, match=r"source\.safetensors: holds \d+% .* of own\.toml .*of model source"):
-        warm_start(source, model, "own.toml", no_rig)
+        warm_start(source, model, "own.toml", NO_RIG)
     assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
 
 
@@ -125,17 +139,17 @@ def test_a_file_without_names_keeps_the_order_of_its_rows(tmp_path: Path) -> Non
     given = small_model(1).state_dict()
     safetensors.torch.save_file(given, path)
     model = small_model(2)
-    assert "rows in the file's order" in warm_start(path, model, "small", no_rig).table()
+    assert "rows in the file's order" in warm_start(path, model, "small", NO_RIG).table()
     assert all(torch.equal(tensor, given[key]) for key, tensor in model.state_dict().items())
     other = own_model()
-    assert "another shape in the file (detection_head.class_branches" in warm_start(path, other, "x", no_rig).table()
+    assert "another shape in the file (detection_head.class_branches" in warm_start(path, other, "x", NO_RIG).table()
 
 
 @pytest.mark.parametrize("stated", ["no JSON", "3", "[1, 2]", '["car"]', "[]"])
 def test_wrong_names_in_the_metadata_are_no_traceback(stated: str, tmp_path: Path) -> None:
     path = tmp_path / "odd.safetensors"
     safetensors.torch.save_file(small_model(1).state_dict(), path, {"classes": stated, "cameras": stated})
-    assert isinstance(warm_start(path, own_model(), "own.toml", lambda: RIG), WarmStart)
+    assert isinstance(warm_start(path, own_model(), "own.toml", OneRig(RIG)), WarmStart)
 
 
 def test_saved_weights_name_their_classes_and_cameras(source: Path) -> None:

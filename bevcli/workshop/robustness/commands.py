@@ -1,5 +1,6 @@
 """`bevcli stress`: how a model copes with corrupted images, calibration, times and ego-motion."""
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -55,19 +56,19 @@ def stress(
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(chosen_conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [note for drive in drives for note in drive.notes]
-    with Progress(total, "frames", notes) as progress, StopSignals("frame") as signals:
-        results = work.stress(
-            loaded,
-            drives,
-            chosen_conditions,
-            out,
-            options,
-            force=output.force,
-            resume=output.resume,
-            after_frame=progress.advance,
-            resumed=progress.skip,
-            should_stop=signals.received,
-        )
+    test = work.StressTest(loaded, drives, chosen_conditions, out, options, force=output.force, resume=output.resume)
+    with (
+        Progress(total, "frames", notes) as progress,
+        StopSignals("frame") as signals,
+        contextlib.closing(test.run()) as frames,
+    ):
+        if earlier := next(frames):
+            progress.skip(earlier)
+        for done in frames:
+            progress.reach(done)
+            if signals.received():
+                break
+    results = test.results
     if as_json:
         say(json.dumps(results.to_dict(other), indent=1))
     else:

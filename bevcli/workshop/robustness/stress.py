@@ -1,9 +1,8 @@
 """`stress`: runs a model over the same drives under each condition and scores each; stress.json and its table."""
 
-import contextlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -143,12 +142,8 @@ def read_results(path: Path) -> StressResults:
 class StressState:
     """A test after a number of finished conditions, for `resume`."""
 
-    facts: dict[str, str]  # what the results depend on, see `run_facts`
+    facts: dict[str, str]  # see `run_facts`
     scores: tuple[ConditionScores, ...] = ()  # of the finished conditions
-
-
-class _Stopped(Exception):
-    """The caller has asked to stop."""
 
 
 def rendered_drives(options: DriveOptions, config: ModelConfig, source: InputOptions) -> list[Drive]:
@@ -168,151 +163,165 @@ def stress(
     *,
     force: bool = False,
     resume: bool = False,
-    after_frame: Callable[[], None] = lambda: None,
-    resumed: Callable[[int], None] = lambda frames: None,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> StressResults:
-    """Scores a model on the same drives under each condition.
+    """Score a model on the same drives under each condition: see `StressTest`, which gives the loop."""
+    test = StressTest(model, drives, conditions, out, options, force=force, resume=resume)
+    for _ in test.run():
+        pass
+    return test.results
+
+
+class StressTest:
+    """A model, its drives, and the folder in which finished scenes of the current condition are kept.
 
     The results are written after each condition, those of a scene at its end: an interrupted test can go on. The same
     drives, model, options and conditions give the same stress.json, byte by byte, also if the test was interrupted.
 
-    Args:
-        model: of `load_model`.
-        drives: of `open_sequence`, with ground truth.
-        conditions: of `choose_conditions`. Results of an earlier, resumed test are kept.
-        out: the folder for stress.json; made where it is missing.
-        options: see `StressOptions`.
-        force: remove the files that an earlier test wrote into `out`.
-        resume: go on with an interrupted test; it may get further conditions.
-        after_frame: called after each frame.
-        resumed: called once with the number of frames that need not be run again.
-        should_stop: asked after each frame; True ends the test. The results are then not complete.
-
-    Raises:
-        InputError: a frame cannot be read, or a drive has no ground truth.
-        OutputError: the folder holds something already, is in use, or cannot be written; or the test to resume was
-            another one.
+    Attributes:
+        results: the scores so far.
     """
-    if force and resume:
-        raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
-    model = model.in_engine(drives[0].rig, drives[0])
-    memory, parts = FrameMemory(KEPT_BYTES), [part for drive in drives for part in split_scenes(drive)]
-    scenes = [KeptFrames(part, memory, index) for index, part in enumerate(parts)]
-    against = None if options.against is None else read_results(options.against)
-    facts = _facts(model, drives, replace(options, against=None))
-    with RunFolder(out, force=force, resume=resume) as folder:
-        state = saved_state(folder, facts, StressState) if resume else None
-        if state is None:
-            folder.remove_written()
-            state = StressState(facts)
-            save_state(folder.state_path, state)
-        run = _StressRun(model, scenes, options, folder, after_frame, should_stop)
-        finished = {(scores.corruption, scores.severity) for scores in state.scores}
-        left = [condition for condition in conditions if (condition.name, condition.severity) not in finished]
-        done = run.kept_frames(left) + (len(conditions) - len(left)) * sum(len(scene.stamps) for scene in scenes)
-        if done:
-            resumed(done)
-        results = StressResults(run.header(), state.scores, is_complete=False)
-        with contextlib.suppress(_Stopped):
-            for condition in left:
-                scores = (*results.scores, run.scores(condition))
-                results = replace(results, scores=tuple(sorted(scores, key=_order)))
-                save_state(folder.state_path, StressState(facts, results.scores))
-                _write_results(folder, results, against)
-                run.remove_boxes(condition)
-            results = replace(results, is_complete=True)
-        _write_results(folder, results, against)
-    return results
 
+    def __init__(
+        self,
+        model: Model,
+        drives: Sequence[Drive],
+        conditions: Sequence[Condition],
+        out: Path,
+        options: StressOptions = StressOptions(),
+        *,
+        force: bool = False,
+        resume: bool = False,
+    ) -> None:
+        """Read what is to be compared with. Raises InputError where a drive has no frames.
 
-@dataclass
-class _StressRun:
-    """One model, its scenes, and the folder in which finished scenes of the current condition are kept."""
+        Args:
+            model: of `load_model`.
+            drives: of `open_sequence`, with ground truth.
+            conditions: of `choose_conditions`. Results of an earlier, resumed test are kept.
+            out: the folder for stress.json; made where it is missing.
+            options: see `StressOptions`.
+            force: remove the files that an earlier test wrote into `out`.
+            resume: go on with an interrupted test; it may get further conditions.
+        """
+        if force and resume:
+            raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
+        self._model = model.in_engine(drives[0].rig, drives[0])
+        self._options, self._conditions, self._resume = options, conditions, resume
+        memory, scenes = FrameMemory(KEPT_BYTES), [scene for drive in drives for scene in split_scenes(drive)]
+        self._scenes = [KeptFrames(scene, memory, index) for index, scene in enumerate(scenes)]
+        self._against = None if options.against is None else read_results(options.against)
+        self._facts = _facts(self._model, drives, replace(options, against=None))
+        self._folder = RunFolder(out, force=force, resume=resume)
+        self._range_m = options.max_range_m or self._model.config.bev_grid.nearest_side_m
+        self._metrics = DetectionConfig.of(self._model.config.object_classes).cut_at(self._range_m)
+        self.results = StressResults(self._header(), (), is_complete=False)
 
-    model: Model
-    scenes: Sequence[Drive]
-    options: StressOptions
-    folder: RunFolder
-    after_frame: Callable[[], None]
-    should_stop: Callable[[], bool]
-    runner: Runner | None = None
+    def run(self) -> Generator[int]:
+        """Run the test; yield the number of finished frames: first of an earlier, resumed test, then after each frame.
 
-    def __post_init__(self) -> None:
-        self.range_m = self.options.max_range_m or self.model.config.bev_grid.nearest_side_m
-        self.metrics = DetectionConfig.of(self.model.config.object_classes).cut_at(self.range_m)
+        Leave the loop to end the test early.
 
-    def header(self) -> dict[str, Any]:
+        Raises:
+            InputError: a frame cannot be read, or a drive has no ground truth.
+            OutputError: the folder holds something already, is in use, or cannot be written; or the test to resume was
+                another one.
+        """
+        with self._folder as folder:
+            state = saved_state(folder, self._facts, StressState) if self._resume else None
+            if state is None:
+                folder.remove_written()
+                state = StressState(self._facts)
+                save_state(folder.state_path, state)
+            self.results = replace(self.results, scores=state.scores)
+            finished = {(scores.corruption, scores.severity) for scores in state.scores}
+            left = [condition for condition in self._conditions if (condition.name, condition.severity) not in finished]
+            done = self._kept_frames(left) + (len(self._conditions) - len(left)) * sum(map(_length, self._scenes))
+            yield done
+            runner = self._model.runner(track=False, temporal=self._options.temporal)
+            try:
+                for condition in left:
+                    for index in range(len(self._scenes)):
+                        for _ in self._run_scene(runner, condition, index):
+                            done += 1
+                            yield done
+                    scores = (*self.results.scores, self._scores(condition))
+                    self.results = replace(self.results, scores=tuple(sorted(scores, key=_order)))
+                    save_state(folder.state_path, StressState(self._facts, self.results.scores))
+                    self._write_results()
+                    for index in range(len(self._scenes)):
+                        self._boxes_path(condition, index).unlink(missing_ok=True)
+            except GeneratorExit:
+                self._write_results()
+                raise
+            self.results = replace(self.results, is_complete=True)
+            self._write_results()
+
+    def _header(self) -> dict[str, Any]:
         """A description of the test for stress.json. It names no folders, so that the file is the same everywhere."""
-        weights = self.model.weights
+        weights = self._model.weights
         return {
-            "model": self.model.name,
-            "weights": {"file": weights.name if weights else "random", "hash": self.model.weights_hash[:DIGITS]},
-            "precision": self.model.precision,
-            "temporal": self.options.temporal,
-            "seed": self.options.seed,
-            "lost_images": self.options.lost_images,
-            "max_range_m": self.range_m,
-            "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self.scenes],
+            "model": self._model.name,
+            "weights": {"file": weights.name if weights else "random", "hash": self._model.weights_hash[:DIGITS]},
+            "precision": self._model.precision,
+            "temporal": self._options.temporal,
+            "seed": self._options.seed,
+            "lost_images": self._options.lost_images,
+            "max_range_m": self._range_m,
+            "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self._scenes],
         }
 
-    def kept_frames(self, left: Sequence[Condition]) -> int:
+    def _kept_frames(self, left: Sequence[Condition]) -> int:
         """The number of frames of the first condition that is left whose boxes are stored."""
-        scenes = [scene for n, scene in enumerate(self.scenes) if left and self._boxes_path(left[0], n).exists()]
-        return sum(len(scene.stamps) for scene in scenes)
-
-    def scores(self, condition: Condition) -> ConditionScores:
-        """Raises _Stopped."""
-        frames = [frame for index in range(len(self.scenes)) for frame in self._scene_boxes(condition, index)]
-        predictions, truths = zip(*frames, strict=True)
-        table = evaluate_detections(predictions, truths, self.metrics).overall.of_classes_with_ground_truth()
-        aps = {name: scores.mean_ap for name, scores in table.classes.items()}
-        return ConditionScores(condition.name, condition.severity, table.nd_score, table.mean_ap, table.errors, aps)
-
-    def remove_boxes(self, condition: Condition) -> None:
-        for index in range(len(self.scenes)):
-            self._boxes_path(condition, index).unlink(missing_ok=True)
+        kept = [scene for n, scene in enumerate(self._scenes) if left and self._boxes_path(left[0], n).exists()]
+        return sum(map(_length, kept))
 
     def _boxes_path(self, condition: Condition, index: int) -> Path:
         name = "-".join(("boxes", condition.name, condition.severity or "0", str(index)))
-        return self.folder.state_path.with_name(f"{name}.safetensors")
+        return self._folder.state_path.with_name(f"{name}.safetensors")
 
-    def _scene_boxes(self, condition: Condition, index: int) -> SceneBoxes:
-        """The boxes of a scene: read if they are there already, else computed and stored."""
-        path = self._boxes_path(condition, index)
+    def _run_scene(self, runner: Runner, condition: Condition, index: int) -> Iterator[None]:
+        """Compute the boxes of a scene, unless they are there already; yield after each frame."""
+        path, scene, options = self._boxes_path(condition, index), self._scenes[index], self._options
         if path.exists():
-            return load_state(path, SceneBoxes)
-        scene = self.scenes[index]
-        boxes: SceneBoxes = ()
-        for part in condition.sequences(scene, self.options.seed, self.options.lost_images):
-            boxes += tuple(self._run_sequence(_calibrated(part) if self.options.calibrate else part))
+            return
+        boxes: list[tuple[Boxes3D, Boxes3D]] = []
+        for changed in condition.sequences(scene, options.seed, options.lost_images):
+            drive = _calibrated(changed) if options.calibrate else changed
+            for frame, prediction, _ in runner.run(drive, range(len(drive.stamps)), runner.preprocessor()):
+                if frame.ground_truth is not None:
+                    predicted = prediction.boxes_ego  # the model has no attributes: they follow from the speed
+                    predicted = replace(predicted, attributes=attributes_by_speed(predicted, self._metrics.classes))
+                    boxes.append((predicted, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))))
+                yield
         if not boxes:
             raise InputError(f"{scene.name}: has no ground truth (expected boxes to score against)")
-        self.folder.add(path)
-        save_state(path, boxes)
-        return boxes
+        self._folder.add(path)
+        save_state(path, tuple(boxes))
 
-    def _run_sequence(self, sequence: Drive) -> Iterator[tuple[Boxes3D, Boxes3D]]:
-        model = self.model
-        if self.runner is None:
-            self.runner = model.runner(track=False, temporal=self.options.temporal)
-        steps = self.runner.run(sequence, range(len(sequence.stamps)), self.runner.preprocessor())
-        for frame, prediction, _ in steps:
-            if frame.ground_truth is not None:
-                predicted = prediction.boxes_ego  # the model has no attributes: they follow from the speed
-                predicted = replace(predicted, attributes=attributes_by_speed(predicted, self.metrics.classes))
-                yield predicted, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))
-            self.after_frame()
-            if self.should_stop():
-                raise _Stopped
+    def _scores(self, condition: Condition) -> ConditionScores:
+        """The scores of a condition of which all scenes were run."""
+        paths = [self._boxes_path(condition, index) for index in range(len(self._scenes))]
+        predictions, truths = zip(*(boxes for path in paths for boxes in load_state(path, SceneBoxes)), strict=True)
+        table = evaluate_detections(predictions, truths, self._metrics).overall.of_classes_with_ground_truth()
+        aps = {name: scores.mean_ap for name, scores in table.classes.items()}
+        return ConditionScores(condition.name, condition.severity, table.nd_score, table.mean_ap, table.errors, aps)
+
+    def _write_results(self) -> None:
+        path = self._folder.path / RESULTS
+        self._folder.add(path)
+        write_whole(path, (json.dumps(self.results.to_dict(self._against), indent=1) + "\n").encode())
 
 
-def _calibrated(sequence: Drive) -> Drive:
-    """The sequence with the rig that it shows; itself where it shows none."""
+def _length(scene: Drive) -> int:
+    return len(scene.stamps)
+
+
+def _calibrated(drive: Drive) -> Drive:
+    """The drive with the rig that it shows; itself where it shows none."""
     try:
-        return DriveView(sequence, rig=calibrate(sequence).rig)
+        return DriveView(drive, rig=calibrate(drive).rig)
     except InputError:
-        return sequence
+        return drive
 
 
 def split_scenes(drive: Drive) -> list[Drive]:
@@ -335,12 +344,6 @@ def _facts(model: Model, drives: Sequence[Drive], options: StressOptions) -> dic
     if len(of_drives) > 1:
         facts |= {name: digest(tuple(of_drive[name] for of_drive in of_drives))[:12] for name in _INPUT_FACTS}
     return facts | {"drives": ", ".join(drive.name for drive in drives)}
-
-
-def _write_results(folder: RunFolder, results: StressResults, against: StressResults | None) -> None:
-    path = folder.path / RESULTS
-    folder.add(path)
-    write_whole(path, (json.dumps(results.to_dict(against), indent=1) + "\n").encode())
 
 
 def stress_table(results: StressResults, against: StressResults | None = None) -> str:

@@ -1,5 +1,6 @@
 """`bevcli train` trains a model; `bevcli validate` runs one on several drives and scores them together."""
 
+import contextlib
 import json
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,55 +49,49 @@ def train(
 
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
     """
-    from bevcli.inference.load import choose_device
-    from bevcli.workshop.training import model_file, train as work, trainer as loop
+    from bevcli.workshop.training import model_file, train as work
 
     if file_options.init is not None:
         if model or options != TrainOptions():
             raise InputError("--init trains nothing: remove the model and the options of a training")
-        device = choose_device(model_options.device)
+        device = work.choose_device(model_options.device)
         say(*model_file.write_model_file(file_options.init, drives, file_options.preset or "quick", device))
         return
     if file_options.preset is not None:
         raise InputError("--preset is for --init: remove it")
     if not model:
         raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
-    job = work.seeded_job(model, model_options.device, drives, options)
-    with job.lock:
-        trainer = loop.Trainer(job, resume=options.resume)
-        if job.group.leads:
-            work.check_steps_left(trainer)
-            _run(trainer)
-        else:
-            with StopSignals("step") as signals:
-                trainer.run(stop=signals.received)
-    job.group.leave()
+    with work.training(model, drives, options, model_options.device) as trainer:
+        _run(trainer)
 
 
 def _run(trainer: "Trainer") -> None:
-    """Train in the process that prints. Raises typer.Exit after a stop."""
+    """Train; the leader of several processes prints. Raises typer.Exit in it after a stop."""
     job, first = trainer.job, trainer.done
     updates, steps = job.config.clips.updates, job.config.steps - first
-
-    def after_update(loss: float) -> None:
-        progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
-        progress.advance()
-
-    counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
-    say(f"{job.config.clips}; {counted(steps, 'steps')}; drives: {counts}; output: {job.out}", err=True)
-    for note in (*job.notes, *job.changed_settings()):
-        print_note(note)
-    for start in job.warm_starts:
-        say(start.table())
-    with Progress(steps * updates, "updates") as progress:
-        with StopSignals("step") as signals:
-            trainer.run(
-                lambda: progress.reach((trainer.done - first) * updates),  # after a step of fewer updates
-                lambda step, scores: progress.message(f"step {step}: {scores}"),
-                signals.received,
-                after_update,
-            )
-        if trainer.done < job.config.steps:
+    with contextlib.ExitStack() as stack:
+        progress = None
+        if job.group.leads:
+            counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
+            say(f"{job.config.clips}; {counted(steps, 'steps')}; drives: {counts}; output: {job.out}", err=True)
+            for note in (*job.notes, *job.changed_settings()):
+                print_note(note)
+            for start in job.warm_starts:
+                say(start.table())
+            progress = stack.enter_context(Progress(steps * updates, "updates"))
+        signals = stack.enter_context(StopSignals("step"))
+        for event in trainer.run():
+            if progress is not None and event.loss is not None:
+                progress.detail = f"step {event.done + 1}, loss {event.loss:.4g}"
+                progress.advance()
+            elif progress is not None:
+                progress.reach((event.done - first) * updates)  # after a step of fewer updates
+                if event.scores is not None:
+                    progress.message(f"step {event.done}: {event.scores}")
+            if event.loss is None and signals.received():
+                trainer.save_checkpoint()
+                break
+        if progress is not None and trainer.done < job.config.steps:
             progress.message(f"stopped after step {trainer.done}: continue with --resume --out {job.out}")
             raise typer.Exit(signals.exit_code)
 
@@ -119,21 +114,22 @@ def validate(
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
     """
-    from bevcli.workshop.synth.drives import count_frames
-    from bevcli.workshop.training.train import drives_to_score, has_ground_truth, score_drives
+    from bevcli.workshop.training import train as work, validation
 
     loaded = bevcli.load_model(model, options=model_options)
     with odometry_bar() as show_steps:
         name = model or loaded.name
-        drives, notes, loaded = drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
-        frames = count_frames(drives)
-    if not has_ground_truth(drives):
+        drives, notes, loaded = work.drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
+        total = work.count_frames(drives)
+    if not work.has_ground_truth(drives):
         _estimate(loaded, drives, options, as_json=as_json, temporal=run_options.temporal)
         return
     if options.reference is not None:
         raise InputError("--reference is for drives without ground truth: remove it")
-    with Progress(frames, "frames", notes) as progress:
-        scores = score_drives(loaded, drives, options, temporal=run_options.temporal, after_frame=progress.advance)
+    with Progress(total, "frames", notes) as progress:
+        runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
+        frames = progress.each(validation.run_drives(runner, drives))
+        scores = validation.score_frames(frames, runner, drives, options.max_range, each_drive=options.each)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
 
 

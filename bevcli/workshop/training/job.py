@@ -274,7 +274,7 @@ def prepare_training(
 ) -> TrainingJob:
     """A training job, ready for `Trainer`. Joins the other processes if torchrun started several.
 
-    Initial weights are drawn from PyTorch's global generator: call torch.manual_seed before to reproduce them.
+    Seeds PyTorch's global generator, from which initial weights are drawn.
     data: the drives; rendered ones are kept in the output folder.
 
     Raises BevcliError where a file, the choice of drives, or the output folder is wrong; nothing is written then.
@@ -301,9 +301,10 @@ def prepare_training(
             "the model starts from random weights, but its file keeps the statistics of batch norms: pass "
             '`weights` (`--weights`) or `changes={"freeze_batch_norm": "false"}` (`--set freeze_batch_norm=false`)',
         )
+    torch.manual_seed(options.seed)
     model, started = build_network(model_config), []
     if options.weights is not None and not options.resume:
-        started += [warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)]
+        started += [warm_start(weights_file(options.weights), model, model_name_or_file, drives)]
     if options.backbone_weights is not None and not options.resume:
         backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
         started, notes = [*started, backbone], (*notes, *about)

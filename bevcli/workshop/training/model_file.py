@@ -1,6 +1,5 @@
 """A new model file for a data set: from a preset and the facts about the data, with what its training costs here."""
 
-import contextlib
 import copy
 import math
 import re
@@ -332,10 +331,6 @@ def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
         yield f"Maps reach {facts.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
 
 
-class _EnoughMeasured(Exception):
-    """Ends the training that is measured."""
-
-
 @dataclass(frozen=True)
 class Cost:
     """The cost of a training.
@@ -375,13 +370,6 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
 
     Raises BevcliError as the training would.
     """
-    times = [time.perf_counter()]
-
-    def after_update(loss: float) -> None:
-        times.append(time.perf_counter())
-        if times[-1] - times[0] >= longest_s:
-            raise _EnoughMeasured
-
     # Images are not kept: they would count as memory of the training, and be read sooner than in a longer one.
     config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6, kept_share=0.0)
     config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
@@ -389,8 +377,12 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)
         machine = torch.cuda.get_device_name(job.device)
-    with contextlib.suppress(_EnoughMeasured):
-        Trainer(replace(job, config=config)).run(after_update=after_update)
+    times = [time.perf_counter()]
+    for progress in Trainer(replace(job, config=config)).run():
+        if progress.loss is not None:
+            times.append(time.perf_counter())
+            if times[-1] - times[0] >= longest_s:
+                break
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0) if job.loaders == 1 else 0.0  # processes take seconds to start

@@ -6,9 +6,7 @@ first batch. A clip from a process comes through a file in memory or, where that
 files.
 """
 
-import mmap
 import os
-import pickle
 import shutil
 import signal
 import sys
@@ -19,7 +17,6 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from io import BytesIO
 from itertools import zip_longest
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
@@ -38,7 +35,7 @@ from bevcli.inference.pipeline import read_ahead
 from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
-from bevcli.model.upload import pinned, upload
+from bevcli.model.upload import pinned, tensors_in, upload
 from bevcli.printing import counted
 from bevcli.sequences.view import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
@@ -57,7 +54,6 @@ _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
 
 MEMORY_FOLDER = Path("/dev/shm")  # files in memory, on Linux
 FREE_CLIPS = 64  # for so many, that folder has to have space
-ALIGNMENT = 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -375,8 +371,8 @@ def loaded_batches(
 
     def load(turn: tuple[int, int]) -> Batch:
         try:
-            packed = [pool.submit(_make_packed, (*turn, index)) for index in range(count)]
-            clips = [clip.result().unpack() for clip in packed]
+            files = [pool.submit(_make_file, (*turn, index)) for index in range(count)]
+            clips = [_read_file(file.result()) for file in files]
         except BrokenProcessPool:
             raise OutputError(
                 "a process that makes batches ended early (out of memory?): use fewer `loaders`"
@@ -416,67 +412,26 @@ def _start_loader(maker: BatchMaker, line: Connection, folders: tuple[Path, ...]
         os._exit(0)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+    torch.serialization.set_crc32_options(False)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
 
-@dataclass(frozen=True)
-class _Packed:
-    """A clip in a file.
-
-    Attributes:
-        path: of the file, which holds the contents of all arrays.
-        ends: where each begins and ends in the file.
-        rest: the clip without them, pickled.
-    """
-
-    path: Path
-    ends: tuple[tuple[int, int], ...]
-    rest: bytes
-
-    def unpack(self) -> Batch:
-        """The clip; its tensors are views of the file, which loses its name."""
-        with open(self.path, "r+b") as file:
-            # Windows keeps the name of a file that is mapped.
-            whole = bytearray(file.read()) if sys.platform == "win32" else mmap.mmap(file.fileno(), 0)
-            contents = memoryview(whole)
-        self.path.unlink()
-        batch: Batch = pickle.loads(self.rest, buffers=[contents[start:end] for start, end in self.ends])
-        return batch
-
-
-def _make_packed(clip: tuple[int, int, int]) -> _Packed:
-    """clip: step, turn, and index in the batch."""
+def _make_file(clip: tuple[int, int, int]) -> Path:
+    """Write a clip (step, turn, and index in the batch) to a file. For its checksums there is no use."""
     maker, folders = _loader
-    arrays: list[pickle.PickleBuffer] = []
-    rest = BytesIO()
-    _Pickler(rest, protocol=5, buffer_callback=arrays.append).dump(maker.clip(*clip))
-    needed = FREE_CLIPS * sum(array.raw().nbytes for array in arrays)
-    roomy = (folder for folder in folders if shutil.disk_usage(folder).free >= needed)
-    path, ends = next(roomy, folders[-1]) / "-".join(map(str, clip)), []
-    with open(path, "wb") as file:
-        for array in arrays:
-            start = file.tell()
-            file.write(array.raw())
-            ends.append((start, file.tell()))
-            file.write(bytes(-file.tell() % ALIGNMENT))
-        file.write(bytes(ALIGNMENT))  # an empty file cannot be mapped
-    return _Packed(path, tuple(ends), rest.getvalue())
+    made, name = maker.clip(*clip), "-".join(map(str, clip))
+    needed = FREE_CLIPS * sum(tensor.nbytes for _, tensor in tensors_in(made))
+    path = next((folder for folder in folders if shutil.disk_usage(folder).free >= needed), folders[-1]) / name
+    torch.save(made, path)
+    return path
 
 
-class _Pickler(pickle.Pickler):
-    """Pickles a tensor as an array, whose contents can be kept apart."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, Tensor):
-            strides = value.stride()
-            order = sorted(range(value.ndim), key=lambda axis: -strides[axis])  # as it lies in memory
-            return _from_array, (value.permute(order).contiguous().numpy(), order)
-        return NotImplemented
-
-
-def _from_array(array: NDArray[Any], order: list[int]) -> Tensor:
-    return torch.from_numpy(array).permute(np.argsort(order).tolist())
+def _read_file(path: Path) -> Batch:
+    """The clip in a file, which loses its name. Its tensors are views of it, but for Windows, which keeps names."""
+    clip: Batch = torch.load(path, mmap=sys.platform != "win32", weights_only=False)
+    path.unlink()
+    return clip
 
 
 @contextmanager

@@ -1,18 +1,16 @@
 """`train` and `validate` as functions with the options of the commands as keywords."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from bevcli.errors import InputError
 from bevcli.inference.load import Model, choose_device, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import refuse, spread
-from bevcli.workshop.synth.drives import Drives, scored_drives
+from bevcli.workshop.synth.drives import Drives, count_frames as count_frames, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.job import TrainingJob, prepare_training, rig_for_drives
+from bevcli.workshop.training.job import prepare_training, rig_for_drives
 from bevcli.workshop.training.options import TrainOptions, ValidationOptions
 from bevcli.workshop.training.trainer import WEIGHTS, Trainer
 from bevcli.workshop.training.validation import Validation, check_scored_drives, validate as validate_runner
@@ -20,28 +18,18 @@ from bevcli.workshop.training.validation import Validation, check_scored_drives,
 Report = Callable[[str], None]
 
 
-def train(
-    model: str | Path,
-    *,
-    device: str = "auto",
-    report: Report = lambda note: None,
-    after_step: Callable[[], None] = lambda: None,
-    after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
-    should_stop: Callable[[], bool] = lambda: False,
-    **options: Any,
-) -> Path:
+def train(model: str | Path, *, device: str = "auto", report: Report = lambda note: None, **options: Any) -> Path:
     """Train a model as `bevcli train` does; return the file of its weights.
 
         weights = bevcli.train("my.toml", data=["drives/a", "drives/b"], out="runs/mine", steps=2000)
         model = bevcli.load_model("my.toml", weights=weights)
 
+    `training` gives the loop, to follow it or to end it early.
+
     Args:
         model: a model name or a FILE.toml, whose training table holds the settings.
         device: "auto", "cpu", "cuda" and so on.
         report: called with notes on the drives, and with what is loaded of earlier weights.
-        after_step: called after each step.
-        after_validation: called with the number of steps done and the scores.
-        should_stop: asked after each step; True writes a checkpoint and ends the training, which `resume` continues.
         options: those of `TrainOptions` (`out`, `steps`, `weights`, `resume`, …) and of `DriveOptions` (`data`,
             `rendered`, `split`, `class_map`).
 
@@ -52,32 +40,31 @@ def train(
     """
     chosen, drives, left = spread(options, TrainOptions, DriveOptions)
     refuse(left, "train", TrainOptions, DriveOptions)
-    job = seeded_job(str(model), device, drives, chosen)
-    with job.lock:
-        trainer = Trainer(job, resume=chosen.resume)
-        check_steps_left(trainer)
+    with training(str(model), drives, chosen, device) as trainer:
+        job = trainer.job
         for note in (*job.notes, *job.changed_settings(), *(start.table() for start in job.warm_starts)):
             report(note)
-        trainer.run(after_step, after_validation, should_stop)
-    job.group.leave()
+        for _ in trainer.run():
+            pass
     return job.out / WEIGHTS
 
 
-def seeded_job(model: str, device: str, drives: DriveOptions, options: TrainOptions) -> TrainingJob:
-    """The job of a training, whose first weights are those of its seed. Raises as `train`."""
-    torch.manual_seed(options.seed)
-    return prepare_training(model, choose_device(device), drives, options)
+@contextlib.contextmanager
+def training(
+    model: str, drives: DriveOptions, options: TrainOptions = TrainOptions(), device: str = "auto"
+) -> Iterator[Trainer]:
+    """A training that is ready to run, with its output folder locked.
 
+        with training("my.toml", DriveOptions(data=(Path("drives/a"),))) as trainer:
+            for progress in trainer.run():
+                print(progress)
 
-def check_steps_left(trainer: Trainer) -> None:
-    """Raise InputError where a resumed training has done more steps than it is to do."""
-    job = trainer.job
-    if trainer.done > job.config.steps:
-        found = (
-            f"has done {trainer.done} steps already (expected at most `steps={job.config.steps}` (`--steps "
-            f"{job.config.steps}`))"
-        )
-        raise InputError(f"{job.out}: {found}")
+    Raises BevcliError as `train`.
+    """
+    job = prepare_training(model, choose_device(device), drives, options)
+    with job.lock:
+        yield Trainer(job, resume=options.resume)
+    job.group.leave()
 
 
 def validate(
@@ -85,7 +72,6 @@ def validate(
     *,
     temporal: bool = True,
     report: Report = lambda note: None,
-    after_frame: Callable[[], None] = lambda: None,
     **options: Any,
 ) -> Validation:
     """Score a model on drives with ground truth, all drives together, as `bevcli validate` does.
@@ -97,7 +83,6 @@ def validate(
         model: a `Model`, or what `load_model` takes.
         temporal: use the frames before (and after).
         report: called with notes on the drives.
-        after_frame: called after each frame.
         options: those of `DriveOptions` (`data`, `rendered`, …) and `ValidationOptions` (`rig`, `max_range`,
             `tracking`, `each`); and of `ModelOptions` (`weights`, `device`, `engine`, …), where `model` is no `Model`.
 
@@ -108,10 +93,11 @@ def validate(
     refuse(left, "validate", DriveOptions, ValidationOptions, *of_model)
     loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
     name = loaded.name if model is None or isinstance(model, Model) else str(model)
-    found, notes, loaded = drives_to_score(loaded, name, drives, chosen, report)
+    scored, notes, loaded = drives_to_score(loaded, name, drives, chosen, report)
     for note in notes:
         report(note)
-    return score_drives(loaded, found, chosen, temporal=temporal, after_frame=after_frame)
+    runner = loaded.runner(track=chosen.tracking, temporal=temporal)
+    return validate_runner(runner, scored, chosen.max_range, each_drive=chosen.each)
 
 
 def drives_to_score(
@@ -138,18 +124,10 @@ def drives_to_score(
     return drives, notes, model
 
 
-def score_drives(
-    model: Model, drives: Drives, options: ValidationOptions, *, temporal: bool, after_frame: Callable[[], None]
-) -> Validation:
-    """Run a model over drives and score them."""
-    runner = model.runner(track=options.tracking, temporal=temporal)
-    return validate_runner(runner, drives, options.max_range, after_frame=after_frame, each_drive=options.each)
-
-
 def has_ground_truth(drives: Drives) -> bool:
-    """Whether a frame of one of the drives has ground truth."""
+    """True if a frame of one of the drives has ground truth."""
     return any(
-        drive.ground_truth_frame(place).ground_truth is not None
+        drive.ground_truth_frame(index).ground_truth is not None
         for drive in map(drives.open, range(len(drives)))
-        for place in range(len(drive.stamps))
+        for index in range(len(drive.stamps))
     )

@@ -5,8 +5,8 @@ import copy
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice, product, repeat
 from pathlib import Path
 from typing import TypeVar
@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from bevcli.errors import BevcliError, WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
@@ -87,6 +87,21 @@ def _numbers_on_their_way(numbers: Mapping[str, Tensor]) -> Callable[[], dict[st
     return read
 
 
+@dataclass(frozen=True)
+class Progress:
+    """An update of the weights, or the end of a step.
+
+    Attributes:
+        done: number of steps done.
+        loss: of an update; None at the end of a step.
+        scores: of a validation at the end of the step.
+    """
+
+    done: int
+    loss: float | None = None
+    scores: Validation | None = None
+
+
 class Trainer:
     """A training that can be interrupted at any time and resumed from its last checkpoint.
 
@@ -102,7 +117,8 @@ class Trainer:
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
-        """Prepares model and optimizer. Raises WeightsError if the checkpoint to resume from is missing or wrong."""
+        """Prepares model and optimizer. Raises WeightsError if the checkpoint to resume from is missing or wrong,
+        and InputError if it has more steps than the training."""
         self.job = job
         job.model.backbone.freeze(job.config.frozen_stages)
         self._losses = FrameLosses(job.model, job.config)
@@ -114,6 +130,10 @@ class Trainer:
         self.done, self.waited_s = 0, 0.0
         if resume:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
+            if self.done > job.config.steps:
+                limit = f"at most `steps={job.config.steps}` (`--steps {job.config.steps}`)"
+                stated = f"has done {self.done} steps already (expected {limit})"
+                raise InputError(f"{job.out}: {stated}")
         choose_kernels(job.model, job.device, gradients=True)
         find_hits_on_cpu(job.model, job.device)
         taught = job.config.distillation_loss
@@ -133,44 +153,48 @@ class Trainer:
             self._loss_curve = LearningCurve(job.out / "loss.csv", self.done, "training", events)
             self._validation_curve = LearningCurve(job.out / "validation.csv", self.done, "validation", events)
 
-    def run(
-        self,
-        after_step: Callable[[], None] = lambda: None,
-        after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
-        stop: Callable[[], bool] = lambda: False,
-        after_update: Callable[[float], None] = lambda loss: None,
-    ) -> None:
-        """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
+    def run(self) -> Iterator[Progress]:
+        """Run the remaining steps: yield after each update of the weights, and once more at the end of each step.
 
-        Args:
-            after_step: called by the leader after each step.
-            after_validation: called by the leader with the number of steps done and the scores.
-            stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
-            after_update: called after each update of the weights, with the loss.
+        Leaves the model in evaluation mode. To end early, leave the loop at the end of a step, after `save_checkpoint`.
+        Raises BevcliError if a loss is not finite.
         """
         job, config = self.job, self.job.config
         remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
         turns = product(remaining, range(config.clips.in_turn))
         loaded = loaded_batches(self.maker, turns, job.loaders, pin=gpu)
         with contextlib.closing(loaded) as batches, rounded_products("cuda", enabled=gpu):
-            stopped = False
-            while self.done < config.steps and not stopped:
-                row = self._step(islice(self._timed(batches), config.clips.in_turn), after_update)
+            for _ in remaining:
+                rows = []
+                for row in self._step(islice(self._timed(batches), config.clips.in_turn)):
+                    rows.append(row)
+                    yield Progress(self.done, row["loss"])
+                job.group.average_statistics(self.trained)
                 trim_memory()
                 self.done += 1
-                last, stopped = self.done == config.steps, stop()
-                if job.group.leads:
-                    self._loss_curve.add(self.done, row)
-                    if self.done % config.evaluate_every == 0 or last:
-                        after_validation(self.done, self._validate())
-                    if self.done % config.checkpoint_every == 0 or last or stopped:
-                        self._save_checkpoint()
-                    after_step()
+                yield Progress(self.done, scores=self._end_of_step(rows))
         job.model.eval()
 
-    def _save_checkpoint(self) -> None:
-        path = self.job.out / CHECKPOINT
-        save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
+    def _end_of_step(self, rows: Sequence[Mapping[str, float]]) -> Validation | None:
+        """Write what belongs to the end of a step. rows: the numbers of its updates. Returns scores if it is time."""
+        job, config = self.job, self.job.config
+        last, scores = self.done == config.steps, None
+        if job.group.leads:
+            means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+            norm = means.pop("gradient norm")
+            rate = config.optimizer.learning_rate_at(self.done - 1, config.steps)
+            self._loss_curve.add(self.done, means | {"learning rate": rate, "gradient norm": norm})
+            if self.done % config.evaluate_every == 0 or last:
+                scores = self._validate()
+            if self.done % config.checkpoint_every == 0 or last:
+                self.save_checkpoint()
+        return scores
+
+    def save_checkpoint(self) -> None:
+        """Write the state after the steps done, in the leader."""
+        if self.job.group.leads:
+            path = self.job.out / CHECKPOINT
+            save_checkpoint(path, self.done, self.trained, self.optimizer, self._average)
 
     def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
         """The same batches, with the time spent waiting for them added to `waited_s`."""
@@ -182,32 +206,25 @@ class Trainer:
                 return
             yield batch
 
-    def _step(self, batches: Iterable[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
-        """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
+    def _step(self, batches: Iterable[Batch]) -> Iterator[dict[str, float]]:
+        """One step, with an update of the weights for each frame trained on. Yields the numbers of each."""
         job, config = self.job, self.job.config
-        rate = config.optimizer.learning_rate_at(self.done, config.steps)
-        set_learning_rate(self.optimizer, rate)
+        set_learning_rate(self.optimizer, config.optimizer.learning_rate_at(self.done, config.steps))
         gpus = [job.device] if job.device.type == "cuda" else []
         frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
             seeds = np.random.SeedSequence([job.seed, self.done, job.group.rank])
             torch.manual_seed(int(seeds.generate_state(1)[0]))  # for dropout
-            rows = []
             uploaded = (batch.to(job.device).normalised(job.model.config.image) for batch in batches)
             learned = alternated(map(self._clip_losses, uploaded))
             for read_numbers in delayed(map(self._update, learned), 1 if gpus else 0):
-                rows.append(read_numbers())
-                loss = rows[-1]["loss"]
-                if not math.isfinite(loss):
+                row = read_numbers()
+                if not math.isfinite(row["loss"]):
                     raise BevcliError(
-                        f"step {self.done + 1}: the loss is {loss}; lower the learning rate, and `resume` (`--resume`) "
-                        f"from the last checkpoint in {job.out}"
+                        f"step {self.done + 1}: the loss is {row['loss']}; lower the learning rate, and `resume` "
+                        f"(`--resume`) from the last checkpoint in {job.out}"
                     )
-                after_update(loss)
-        job.group.average_statistics(self.trained)
-        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
-        norm = means.pop("gradient norm")
-        return means | {"learning rate": rate, "gradient norm": norm}
+                yield row
 
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""

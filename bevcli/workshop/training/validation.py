@@ -9,7 +9,7 @@ import importlib.util
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -191,19 +191,36 @@ class Validation(FrameScores):
         return f"{scores}\n\n{drives_table(self.drives)}" if self.drives else scores
 
 
+ScoredFrame = tuple[int, Frame, Prediction]  # index of the drive, the frame, and what the model predicts
+
+
+def run_drives(runner: Runner, drives: Drives) -> Iterator[ScoredFrame]:
+    """Run every frame of the drives."""
+    for index in range(len(drives)):
+        drive = drives.open(index)
+        for frame, prediction, _ in runner.run(drive, range(len(drive.stamps)), runner.preprocessor()):
+            yield index, frame, prediction
+
+
 def validate(
+    runner: Runner, drives: Drives, max_range_m: float | None = None, *, each_drive: bool = False
+) -> Validation:
+    """Run every frame of the drives and score them: see `score_frames`."""
+    return score_frames(run_drives(runner, drives), runner, drives, max_range_m, each_drive=each_drive)
+
+
+def score_frames(
+    frames: Iterable[ScoredFrame],
     runner: Runner,
     drives: Drives,
     max_range_m: float | None = None,
-    after_frame: Callable[[], None] = lambda: None,
     *,
     each_drive: bool = False,
 ) -> Validation:
-    """Runs every frame of the drives and scores the frames that have ground truth.
-
-    Tracks are scored where the runner has a tracker.
+    """The scores over the frames that have ground truth. Tracks are scored where the runner has a tracker.
 
     Args:
+        frames: of `run_drives`; none is kept.
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
         each_drive: score each drive alone too.
     """
@@ -211,38 +228,37 @@ def validate(
     classes = runner.config.object_classes
     config = DetectionConfig.of(classes).cut_at(range_m)
     tracked = runner.options.tracker is not None
-    predictions: list[Boxes3D] = []
-    truths: list[Boxes3D] = []
+    boxes: list[list[tuple[Boxes3D, Boxes3D]]] = [[] for _ in range(len(drives))]
     maps = []
     tracks: list[tuple[FrameBoxes, FrameBoxes]] = []
-    of_drives: list[DriveScores] = []
-    for index in range(len(drives)):
-        sequence, first = drives.open(index), len(truths)
-        indices, preprocessor = range(len(sequence.stamps)), runner.preprocessor()
-        for frame, prediction, _ in runner.run(sequence, indices, preprocessor):
-            if frame.ground_truth is not None:
-                if tracked:
-                    # Scenes of different drives may share a name.
-                    stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
-                    sides = (prediction.boxes_world, frame.ground_truth)
-                    predicted_frame, true_frame = (FrameBoxes(stamp, frame.world_from_ego, boxes) for boxes in sides)
-                    tracks.append((predicted_frame, true_frame))
-                predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
-                predictions.append(predicted)
-                truths.append(truth)
-            if prediction.segmentation is not None and frame.ground_truth_map is not None:
-                maps.append((prediction.segmentation, frame.ground_truth_map))
-            after_frame()
-        if each_drive:
-            table = evaluate_detections(predictions[first:], truths[first:], config).overall
-            table = table.of_classes_with_ground_truth()
-            of_drives.append(DriveScores(sequence.name, len(sequence.rig.cameras), table.mean_ap, table.nd_score))
+    for index, frame, prediction in frames:
+        if frame.ground_truth is not None:
+            if tracked:
+                # Scenes of different drives may share a name.
+                stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
+                sides = (prediction.boxes_world, frame.ground_truth)
+                predicted, true = (FrameBoxes(stamp, frame.world_from_ego, side) for side in sides)
+                tracks.append((predicted, true))
+            boxes[index].append(boxes_ego(frame, frame.ground_truth, prediction, classes))
+        if prediction.segmentation is not None and frame.ground_truth_map is not None:
+            maps.append((prediction.segmentation, frame.ground_truth_map))
     return Validation(
-        evaluate_detections(predictions, truths, config),
+        evaluate_detections(*_sides([pair for of_drive in boxes for pair in of_drive]), config),
         evaluate_segmentation(maps) if maps else None,
         score_tracks(Compared(_pairs(tracks), classes, range_m)) if tracked else None,
-        drives=tuple(of_drives),
+        drives=tuple(_drive_scores(drives.open(index), boxes[index], config) for index in range(len(boxes)))
+        if each_drive
+        else (),
     )
+
+
+def _sides(pairs: list[tuple[Boxes3D, Boxes3D]]) -> tuple[list[Boxes3D], list[Boxes3D]]:
+    return [predicted for predicted, _ in pairs], [true for _, true in pairs]
+
+
+def _drive_scores(drive: Drive, boxes: list[tuple[Boxes3D, Boxes3D]], config: DetectionConfig) -> DriveScores:
+    table = evaluate_detections(*_sides(boxes), config).overall.of_classes_with_ground_truth()
+    return DriveScores(drive.name, len(drive.rig.cameras), table.mean_ap, table.nd_score)
 
 
 def drives_table(drives: Sequence[DriveScores]) -> str:

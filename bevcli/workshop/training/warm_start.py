@@ -15,11 +15,11 @@ from torch import Tensor
 from bevcli.checkpoints import INTEGER_KEY, Checkpoint, read_checkpoint
 from bevcli.config import load_config
 from bevcli.errors import InputError, WeightsError
-from bevcli.geometry.cameras import CameraRig
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import CAMERA_EMBEDDING, Network
 from bevcli.model.step import assign_cameras
+from bevcli.workshop.synth.drives import Drives
 
 LEAST_SHARE = 0.5  # of the model's numbers, that a file must hold
 State = Literal["loaded", "new", "unused"]
@@ -119,7 +119,7 @@ class NamedRows:
         return ", ".join(texts) + (self.remark if renamed else "")
 
 
-def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], CameraRig]) -> WarmStart:
+def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> WarmStart:
     """Load, in place, every tensor of a weights file that fits a model; the others keep the model's initial values.
 
     `named_rows` says which rows of classes and cameras are taken. BEV queries of another number of cells over the same
@@ -129,13 +129,16 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
         file: an official .pth or a .safetensors of any model.
         model: unchanged where the file holds too little of it.
         model_file: name or TOML file of the model, for the messages.
-        rig: gives the cameras of a drive to train on; called where names of cameras differ.
+        drives: to train on, whose first gives the cameras where their names differ.
 
     Raises WeightsError for a file that cannot be read, or with less than `LEAST_SHARE` of the model's numbers.
     """
     checkpoint = read_checkpoint(file)
     start = WarmStart(file, checkpoint.facts.get("model") or " or ".join(checkpoint.models), model_file)
-    resampled, rows = model.bev_queries.resampled(checkpoint.state, "bev_queries."), named_rows(checkpoint, model, rig)
+    resampled, rows = (
+        model.bev_queries.resampled(checkpoint.state, "bev_queries."),
+        named_rows(checkpoint, model, drives),
+    )
     state = model.decoder.first_queries(resampled, "decoder.")
     reasons = dict.fromkeys(rows, "rows in the file's order")
     reasons |= {key: "interpolated from another grid" for key in state if resampled[key] is not checkpoint.state[key]}
@@ -176,20 +179,20 @@ def _part(key: str) -> str:
     return key.partition(".")[0]
 
 
-def named_rows(checkpoint: Checkpoint, model: Network, rig: Callable[[], CameraRig]) -> dict[str, NamedRows]:
+def named_rows(checkpoint: Checkpoint, model: Network, drives: Drives) -> dict[str, NamedRows]:
     """The tensors of a model that have a row for each class or each camera, by key.
 
     Rows of classes start from the class of the same name, else from that which `like` states. Camera embeddings start
     from the camera of the same name, else from the nearest view by heading, else, where no heading is known, from the
     mean of all.
 
-    rig: gives the cameras of a drive to train on; called where names of cameras differ.
+    drives: to train on, whose first gives the cameras where their names differ.
     """
     config = model.config
     classes, cameras = _names(checkpoint, config, "classes"), _names(checkpoint, config, "cameras")
     rows = dict.fromkeys(_class_keys(model), NamedRows("class rows", classes, _likes(config, classes)))
     if model.image_tokens.camera_embedding is not None:
-        starts, remark = _views(config.cameras, cameras, rig), "; by heading where it is known; all are trained"
+        starts, remark = _views(config.cameras, cameras, drives), "; by heading where it is known; all are trained"
         rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
     return rows
 
@@ -223,11 +226,11 @@ def _likes(config: ModelConfig, source: tuple[str, ...]) -> Starts:
     return {name: next(((label,) for label in (name, like) if label in source), ()) for name, like in likes.items()}
 
 
-def _views(cameras: tuple[str, ...], source: tuple[str, ...], rig: Callable[[], CameraRig]) -> Starts:
+def _views(cameras: tuple[str, ...], source: tuple[str, ...], drives: Drives) -> Starts:
     views: dict[str, str] = {}
     if source and not set(cameras) <= set(source):
         try:
-            assigned = assign_cameras(rig(), source)
+            assigned = assign_cameras(drives.open(0).rig, source)
             views = dict(zip(assigned.cameras, assigned.embeddings, strict=True))
         except InputError:  # no heading is known for the file's cameras
             views = {}
