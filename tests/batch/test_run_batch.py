@@ -20,8 +20,8 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
+from bevcli.workshop.batch.batch import Batch
 from bevcli.workshop.batch.job import find_drives
-from bevcli.workshop.batch.run_batch import run_batch
 from bevcli.workshop.batch.worker import Worker
 from bevcli.workshop.formats import BagOptions
 from bevcli.workshop.scores.evaluate import evaluate
@@ -49,10 +49,15 @@ def model(fleet):
 def batch(fleet, model, tmp_path):
     """Runs the fleet, or other drives, into tmp_path/out."""
 
-    def run(texts=None, out=None, options=None, **arguments):
+    def run(texts=None, out=None, options=None, should_stop=lambda: False, ran=None, **arguments):
         job = make_job(tmp_path / "out" if out is None else out, fleet / "mini.toml", **(options or {}))
         drives, _ = find_drives(texts or [str(fleet / "drives/*")])
-        return run_batch(job, model, drives, **arguments)
+        started = Batch(job, model, drives, **arguments)
+        skipped, *records = started.run(should_stop)
+        assert started.summary.skipped == skipped
+        if ran is not None:
+            ran.extend(records)
+        return started.summary
 
     return run
 
@@ -94,7 +99,7 @@ def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
     batch()
     before = times(tmp_path / "out")
     ran = []
-    summary = batch(resume=True, after_drive=ran.append)
+    summary = batch(resume=True, ran=ran)
     assert (summary.skipped, summary.failed, ran) == (4, 1, [])
     assert times(tmp_path / "out") == before
 
@@ -105,7 +110,7 @@ def test_failed_drives_run_again_on_request_or_once_mended(batch, tmp_path):
     (drives / "bad").mkdir()
     assert batch([str(drives / "*")]).failed == 1
     ran = []
-    batch([str(drives / "*")], resume=True, retry_failed=True, after_drive=ran.append)
+    batch([str(drives / "*")], resume=True, retry_failed=True, ran=ran)
     assert [row["drive"] for row in ran] == ["bad"]
     write_drive(drives / "bad", 2)
     summary = batch([str(drives / "*")], resume=True)
@@ -139,7 +144,7 @@ def test_an_option_that_no_drive_has_is_refused_by_name(fleet, tmp_path):
     job = make_job(tmp_path / "out", fleet / "mini.toml")
     drives, _ = find_drives([str(fleet / "drives/*")])
     with pytest.raises(InputError, match="the drives of the batch: `topics` is for a ROS bag: remove it"):
-        run_batch(replace(job, own=(BagOptions(topics={"CAM": "/image"}),)), job.load_model(), drives)
+        Batch(replace(job, own=(BagOptions(topics={"CAM": "/image"}),)), job.load_model(), drives)
     (tmp_path / "one.mcap").touch()
     mixed, _ = find_drives([str(fleet / "drives/d000"), str(tmp_path / "one.mcap")])
     replace(job, own=(BagOptions(topics={"CAM": "/image"}), NuScenesOptions())).check_options(mixed)
@@ -150,7 +155,7 @@ def test_a_wrong_mesh_of_a_class_ends_a_batch_before_it_starts(fleet, tmp_path):
     job = make_job(tmp_path / "out", tmp_path / "meshed.toml")
     drives, _ = find_drives([str(fleet / "drives/*")])
     with pytest.raises(InputError, match=f'^mesh of class "car": {tmp_path}/car.glb: the file is missing$'):
-        run_batch(job, job.load_model(), drives)
+        Batch(job, job.load_model(), drives)
     assert not (tmp_path / "out").exists()
 
 

@@ -1,20 +1,26 @@
-"""`batch` as a function with the options of the command as keywords."""
+"""`batch`: a model over many drives. Skip those that are done, hand the others to workers, write tables and report."""
 
-from collections.abc import Callable, Iterable
+import contextlib
+import json
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.inference.load import Model, choose_device, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import spread
+from bevcli.recording.meshes import read_class_meshes
 from bevcli.recording.options import RecordingOptions
+from bevcli.runs.folder import folder_lock
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.batch import BatchOptions, Workers
+from bevcli.workshop.batch import BatchOptions, Workers, storage
 from bevcli.workshop.batch.job import (
     BatchDrive,
     Job,
@@ -22,31 +28,14 @@ from bevcli.workshop.batch.job import (
     all_own_options,
     find_drives,
     read_list,
+    read_record,
     with_absolute_paths,
 )
-from bevcli.workshop.batch.run_batch import BatchSummary, run_batch
-from bevcli.workshop.batch.storage import is_url
-from bevcli.workshop.batch.worker import use_threads
+from bevcli.workshop.batch.report import METRICS as METRICS, write_results
+from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray, use_threads
 
-Load = Callable[[ModelOptions], Model]
+DESCRIPTION = "batch.json"  # says that a folder is a batch
 OF_EXPORT = "the first drive of each number of cameras and image size exports the model, and waits for it"
-
-
-@dataclass(frozen=True)
-class PreparedBatch:
-    """A batch before its first drive.
-
-    Attributes:
-        job: the model and the options.
-        model: of the job.
-        drives: of the batch.
-        notes: for the user.
-    """
-
-    job: Job
-    model: Model
-    drives: list[BatchDrive]
-    notes: tuple[str, ...]
 
 
 def batch(
@@ -54,27 +43,24 @@ def batch(
     out: str | Path,
     *,
     report: Callable[[str], None] = lambda note: None,
-    after_drive: Callable[[Record], None] = lambda record: None,
-    should_stop: Callable[[], bool] = lambda: False,
     **options: Any,
-) -> BatchSummary:
+) -> "BatchSummary":
     """Run a model on many drives, each as `run_into_folder` does, here or on Ray, as `bevcli batch` does.
 
         summary = bevcli.batch(["fleet/*"], "runs/fleet", model="tiny", evaluate=True, count=1)
         print(summary.table(), summary.failed)
 
     A drive that fails after all retries has its error in `summary.records`, and the others go on.
+    `Batch` gives the loop.
 
     Args:
         drives: sequence folders, nuScenes roots, folders of drives, patterns or URLs.
         out: folder or URL of the batch.
         report: called with notes.
-        after_drive: called with the record of each drive that is done or has failed.
-        should_stop: asked after each frame in this process; True ends the batch, which `resume` continues.
         options: those of `BatchOptions` (`resume`, `evaluate`, …), `Workers` (`count`, `gpus`, …), `ModelOptions`,
             `RunOptions`, `RecordingOptions` and `InputOptions`, and those of the formats.
 
-    Raises BevcliError: see `run_batch`.
+    Raises BevcliError: see `Batch`.
     """
     kinds = (BatchOptions, Workers, ModelOptions, RunOptions, RecordingOptions, InputOptions)
     chosen, workers, model, run_options, recording, source, own = spread(options | {"out": str(out)}, *kinds)
@@ -86,53 +72,27 @@ def batch(
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
     if "recording" not in options:
         run_options = replace(run_options, recording=recording)
-    prepared = prepare_batch(list(map(str, texts)), chosen, workers, model, run_options, source, own)
+    job = job_of(chosen, workers, model, run_options)
+    loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
+    prepared = prepare_batch(job, loaded, list(map(str, texts)), chosen, workers, source, own)
     for note in prepared.notes:
         report(note)
-    return run_batch(
-        prepared.job,
-        prepared.model,
-        prepared.drives,
-        None if workers.in_this_process else workers,
-        resume=chosen.resume,
-        retry_failed=chosen.retry_failed,
-        after_drive=after_drive,
-        should_stop=should_stop,
-    )
+    for _ in prepared.run():
+        pass
+    return prepared.summary
 
 
-def prepare_batch(
-    texts: list[str],
-    options: BatchOptions,
-    workers: Workers,
-    model: ModelOptions,
-    run_options: RunOptions,
-    source: InputOptions,
-    own: dict[str, Any],
-    load: Load = lambda options: load_model(options=options),
-) -> PreparedBatch:
-    """The job, model and drives of a batch. own: options of formats by name. load: loads the model."""
-    texts = [*texts, *(read_list(options.listed) if options.listed else ())]
-    job = Job(
-        options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
-        with_absolute_paths(model),
-        run=run_options,
-        evaluate=options.evaluate,
-        retries=workers.retries,
-    )
-    loaded = model_for_batch(job, workers, load, fetch=model.fetch)
-    others = {name: value for name, value in own.items() if name != "split"}
-    drives, notes = find_drives(texts, NuScenesOptions(own.get("version"), own.get("split")))
-    if loaded.needs_export:
-        notes = (*notes, OF_EXPORT)
-    source = source.for_model(loaded.config, temporal=run_options.temporal)
-    return PreparedBatch(replace(job, source=source, own=all_own_options(others)), loaded, drives, notes)
+def job_of(options: BatchOptions, workers: Workers, model: ModelOptions, run_options: RunOptions) -> Job:
+    """The job of a batch, as far as it does not depend on the model."""
+    out = options.out if storage.is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute())
+    return Job(out, with_absolute_paths(model), run=run_options, evaluate=options.evaluate, retries=workers.retries)
 
 
-def model_for_batch(job: Job, workers: Workers, load: Load, *, fetch: bool = False) -> Model:
-    """The model, loaded before the batch, so that a mistake in it ends the batch at once. Raises BevcliError.
+def options_to_load(job: Job, workers: Workers, *, fetch: bool = False) -> ModelOptions:
+    """Options with which the model is loaded before the batch, so that a mistake in it ends the batch at once.
 
-    The batch needs its hash; only a worker in this process runs it. fetch: download weights that are missing.
+    The batch needs the hash of the model; only a worker in this process runs it. fetch: download weights that are
+    missing. Raises BevcliError where a device is not there.
     """
     alone, device = workers.in_this_process, job.model.device
     if alone and workers.threads is not None:
@@ -141,4 +101,187 @@ def model_for_batch(job: Job, workers: Workers, load: Load, *, fetch: bool = Fal
         device = "cpu"
     if workers.address is None:
         choose_device(device)
-    return load(replace(job.model, device=device if alone else "cpu", fetch=fetch))
+    return replace(job.model, device=device if alone else "cpu", fetch=fetch)
+
+
+def prepare_batch(
+    job: Job,
+    model: Model,
+    texts: list[str],
+    options: BatchOptions,
+    workers: Workers,
+    source: InputOptions,
+    own: dict[str, Any],
+) -> "Batch":
+    """The batch of a job with its drives. own: options of formats by name. Raises InputError."""
+    texts = [*texts, *(read_list(options.listed) if options.listed else ())]
+    others = {name: value for name, value in own.items() if name != "split"}
+    drives, notes = find_drives(texts, NuScenesOptions(own.get("version"), own.get("split")))
+    if model.needs_export:
+        notes = (*notes, OF_EXPORT)
+    source = source.for_model(model.config, temporal=job.run.temporal)
+    job = replace(job, source=source, own=all_own_options(others))
+    return Batch(job, model, drives, workers, notes, resume=options.resume, retry_failed=options.retry_failed)
+
+
+@dataclass(frozen=True)
+class BatchSummary:
+    """Summary of a batch.
+
+    Attributes:
+        records: of all drives that are done or have failed, in the order of the drives.
+        drives: number of drives of the batch.
+        skipped: number of drives that were done or had failed before.
+        stopped: before its end.
+        files: paths or URLs of the files of the batch.
+    """
+
+    records: tuple[Record, ...]
+    drives: int
+    skipped: int
+    stopped: bool
+    files: tuple[str, ...]
+
+    @property
+    def failed(self) -> int:
+        """Number of drives that have failed."""
+        return sum(bool(record.get("error")) for record in self.records)
+
+    def table(self) -> str:
+        """The summary as a few aligned lines."""
+        done = [record for record in self.records if not record.get("error")]
+        classes: Counter[str] = Counter()
+        for record in done:
+            classes.update(record["boxes_by_class"])
+        boxes = ", ".join(f"{count} {name}" for name, count in classes.most_common(4))
+        before = f"; {self.skipped} were done or had failed before" if self.skipped else ""
+        rows = [
+            ("drives", f"{len(done)} of {self.drives} done, {self.failed} failed{before}"),
+            ("frames", str(sum(record["frames"] for record in done))),
+            ("boxes", f"{sum(classes.values())}" + (f" ({boxes})" if boxes else "")),
+            *(("written", path) for path in self.files),
+        ]
+        return "\n".join(f"{name:<8} {text}" for name, text in rows)
+
+
+class Batch:
+    """A model and many drives, each run as `run_into_folder` does.
+
+    The folder gets drives/NAME-HASH/ with the files of `bevcli run` for each drive, failed/NAME-HASH.json for each
+    drive that failed, batch.parquet, batch.csv, report.html and, if drives were scored, metrics.json. The hash is that
+    of a drive's input, the model, the weights and the options.
+
+    Attributes:
+        drives: of `find_drives`.
+        workers: their number, and the resources of each.
+        notes: for the user.
+        summary: of the batch, once it was run.
+    """
+
+    summary: BatchSummary
+
+    def __init__(
+        self,
+        job: Job,
+        model: Model,
+        drives: Sequence[BatchDrive],
+        workers: Workers = Workers(count=1),
+        notes: tuple[str, ...] = (),
+        *,
+        resume: bool = False,
+        retry_failed: bool = False,
+    ) -> None:
+        """Check what all drives need. Raises InputError: no drive has the format of an option, or a mesh is wrong.
+
+        Args:
+            job: the model and the options.
+            model: of `job.load_model`; where workers on Ray run the drives, on any device.
+            drives: of `find_drives`.
+            workers: one drive after another in this process, or on Ray.
+            notes: for the user.
+            resume: skip drives that are done or have failed, and go on with the others.
+            retry_failed: run drives again that have failed.
+        """
+        job.check_options(drives)
+        read_class_meshes(model.config.object_classes)  # each drive's recording needs them
+        self._job, self._model, self.drives, self.workers, self.notes = job, model, drives, workers, notes
+        self._resume, self._retry_failed = resume, retry_failed
+
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> Generator[Record | int]:
+        """Run the drives; yield first the number of those that are skipped, then the record of each other one.
+
+        should_stop: asked after each frame in this process; True ends the batch. KeyboardInterrupt ends it too.
+
+        Raises:
+            OutputError: the folder has a batch already, is in use by another one, or cannot be written.
+            BevcliError: see `Worker` and `run_on_ray`.
+        """
+        out, job_hash = storage.open_storage(self._job.out), self._job.hash(self._model)
+        with folder_lock(out.path) if isinstance(out, storage.LocalFolder) else contextlib.nullcontext():
+            _check_folder(out, self._resume)
+            out.write(DESCRIPTION, json.dumps({"format": "bevcli-batch/1", "model": self._model.name}).encode())
+            known = _known_records(out, self.drives, job_hash, self._retry_failed)
+            yield len(known)
+            for left in [name for name in out.names(storage.ATTEMPTS) if name.endswith(".run")]:  # of dead workers
+                out.remove(f"{storage.ATTEMPTS}/{left}")
+            pending = [drive for drive in self.drives if drive.result(job_hash) not in known]
+            if self._retry_failed:
+                for drive in pending:
+                    out.remove(f"{storage.ATTEMPTS}/{drive.result(job_hash)}.json")
+            records, stopped = dict(known), False
+            try:
+                with contextlib.closing(self._run(job_hash, pending, should_stop)) as running:
+                    for record in running:
+                        records[record["result"]] = record
+                        yield record
+            except (KeyboardInterrupt, StoppedError):
+                stopped = True
+                for name in out.names(storage.ATTEMPTS):  # an attempt that the user ended does not count
+                    out.remove(f"{storage.ATTEMPTS}/{name}")
+            results = [drive.result(job_hash) for drive in self.drives]
+            ordered = tuple(records[result] for result in results if result in records)
+            files = write_results(out, ordered, self._model)
+        self.summary = BatchSummary(ordered, len(self.drives), len(known), stopped, files)
+
+    def _run(self, job_hash: str, drives: Sequence[BatchDrive], should_stop: Callable[[], bool]) -> Generator[Record]:
+        if drives and not self.workers.in_this_process:
+            yield from run_on_ray(self._job, job_hash, drives, self.workers)
+        elif drives:
+            worker = Worker(self._job, job_hash, self._model)
+            for drive in drives:
+                yield worker.run(drive, should_stop)
+                if should_stop():
+                    raise StoppedError
+
+
+def _check_folder(out: storage.Storage, resume: bool) -> None:
+    """Raises OutputError unless the folder is new, or has a batch to go on with."""
+    is_batch = out.read(DESCRIPTION) is not None
+    others = out.names("") - {".bevcli"}
+    if others and not is_batch:
+        raise OutputError(f"{out.where}: is not a batch and not empty: pass `out` (`--out DIR`) for another folder")
+    if is_batch and not resume and (out.names(storage.RESULTS) or out.names(storage.FAILED)):
+        raise OutputError(
+            f"{out.where}: has a batch already: pass `resume=True` (`--resume`) to go on with it, or `out` (`--out "
+            "DIR`)"
+        )
+
+
+def _known_records(
+    out: storage.Storage, drives: Sequence[BatchDrive], job_hash: str, retry_failed: bool
+) -> dict[str, Record]:
+    """The records of drives that are done or have failed, by the name of their results."""
+    done, failed = out.names(storage.RESULTS), out.names(storage.FAILED)
+
+    def find(result: str) -> Record | None:
+        record = (
+            read_record(out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result) if result in done else None
+        )
+        if record is None and not retry_failed and f"{result}.json" in failed:
+            record = read_record(out.read(f"{storage.FAILED}/{result}.json"), result)
+        return record
+
+    results = [drive.result(job_hash) for drive in drives]
+    with ThreadPoolExecutor(storage.READING_THREADS) as pool:
+        found = zip(results, pool.map(find, results), strict=True)
+        return {result: record for result, record in found if record is not None}

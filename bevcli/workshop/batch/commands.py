@@ -15,6 +15,7 @@ from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError, WeightsError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
+from bevcli.published import NamedWeights, named_weights
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.nuscenes import NuScenesOptions
@@ -22,10 +23,7 @@ from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 
 if TYPE_CHECKING:
-    from bevcli.inference.load import Model
-    from bevcli.published import NamedWeights
-    from bevcli.workshop.batch.job import BatchDrive, Job
-    from bevcli.workshop.batch.run_batch import BatchSummary
+    from bevcli.workshop.batch.batch import Batch, BatchSummary
 
 
 PANEL = {"batch": "Run", "reproduce": "Score"}
@@ -59,68 +57,39 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.workshop.batch.batch import prepare_batch
+    from bevcli.workshop.batch import batch as work
 
     if options.retry_failed and not options.resume:
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
-    run_options = replace(run_options, recording=recording)
-    prepared = prepare_batch(drives or [], options, workers, model, run_options, source, format_options, load_with_bar)
-    summary = run_with_progress(
-        prepared.job,
-        prepared.model,
-        prepared.drives,
-        prepared.notes,
-        workers,
-        resume=options.resume,
-        retry_failed=options.retry_failed,
-    )
+    job = work.job_of(options, workers, model, replace(run_options, recording=recording))
+    loaded = load_with_bar(work.options_to_load(job, workers, fetch=model.fetch))
+    summary = _run(work.prepare_batch(job, loaded, drives or [], options, workers, source, format_options))
     say(summary.table())
     if summary.failed:
         say("some drives failed; `--resume --retry-failed` runs them again", err=True)
         raise typer.Exit(SOME_FAILED)
 
 
-def run_with_progress(
-    job: "Job",
-    model: "Model",
-    drives: "list[BatchDrive]",
-    notes: tuple[str, ...],
-    workers: Workers,
-    *,
-    resume: bool,
-    retry_failed: bool = False,
-) -> "BatchSummary":
+def _run(batch: "Batch") -> "BatchSummary":
     """Run a batch with its progress on stderr. A stopped one ends the command with the exit code of the signal."""
-    from bevcli.workshop.batch.run_batch import run_batch
-
-    alone = workers.in_this_process
-    if alone and workers.count is None:
+    alone, notes = batch.workers.in_this_process, batch.notes
+    if alone and batch.workers.count is None:
         notes = (*notes, "Ray is not installed: one worker (pip install 'bevcli[ray]' for several)")
-
-    def show(row: dict[str, Any]) -> None:
-        if row.get("error"):
-            progress.message(f"failed: {row['drive']}: {row['error']}")
-        if row.get("input_errors"):
-            progress.message(f"warning: {row['drive']}: {row['input_errors']}")
-        progress.advance()
-
-    with Progress(len(drives), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:
-        summary = run_batch(
-            job,
-            model,
-            drives,
-            None if alone else workers,
-            resume=resume,
-            retry_failed=retry_failed,
-            skipped=progress.skip,
-            after_drive=show,
-            should_stop=signals.received,
-        )
-    if summary.stopped:
-        say(summary.table())
+    with Progress(len(batch.drives), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:
+        for record in batch.run(signals.received):
+            if isinstance(record, int):
+                progress.skip(record)
+                continue
+            if record.get("error"):
+                progress.message(f"failed: {record['drive']}: {record['error']}")
+            if record.get("input_errors"):
+                progress.message(f"warning: {record['drive']}: {record['input_errors']}")
+            progress.advance()
+    if batch.summary.stopped:
+        say(batch.summary.table())
         say("stopped; `--resume` goes on with the drives that are left", err=True)
         raise typer.Exit(signals.exit_code)
-    return summary
+    return batch.summary
 
 
 VALIDATION_FRAMES = 6019  # of the nuScenes validation split
@@ -149,12 +118,11 @@ def reproduce(
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
     question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
-    from bevcli.published import named_weights
-    from bevcli.workshop.batch import batch as work, job as jobs, report
+    from bevcli.workshop.batch import batch as work
 
     named = named_weights(name, model.weights_dir)
     split = NuScenesOptions(options.version, options.split)
-    drives, notes = jobs.find_drives([str(options.data)], split)
+    drives, notes = work.find_drives([str(options.data)], split)
     if any(drive.scene is None for drive in drives):
         no_root = f"{options.data}: is not a nuScenes root (expected a folder with v1.0-*/scene.json)"
         raise InputError(drives[0].problem or no_root)
@@ -163,23 +131,22 @@ def reproduce(
     if model.weights is None:
         _get(named, model)
     out = options.out or Path("runs") / f"reproduce-{name}-{options.split}"
-    job = jobs.Job(
+    job = work.Job(
         str(out.absolute()),
-        jobs.with_absolute_paths(replace(model, model=name)),
-        own=jobs.all_own_options({"version": options.version}),
+        work.with_absolute_paths(replace(model, model=name)),
+        own=work.all_own_options({"version": options.version}),
         run=replace(run_options, track=False, recording=RecordingOptions(level="minimal")),
         evaluate=True,
         retries=workers.retries,
     )
-    loaded = work.model_for_batch(job, workers, load_with_bar)
+    loaded = load_with_bar(work.options_to_load(job, workers))
     job = replace(job, source=InputOptions().for_model(loaded.config, temporal=run_options.temporal))
-    summary = run_with_progress(job, loaded, drives, notes, workers, resume=options.resume, retry_failed=options.resume)
+    summary = _run(work.Batch(job, loaded, drives, workers, notes, resume=options.resume, retry_failed=options.resume))
     if not any(record.get("scores") for record in summary.records):
-        why = next(
-            (text for one in summary.records if (text := one.get("error") or one.get("not_scored"))), "no frames"
-        )
+        reasons = (record.get("error") or record.get("not_scored") for record in summary.records)
+        why = next(filter(None, reasons), "no frames")
         raise InputError(f"{options.data}: no scene could be scored: {why}")
-    metrics = json.loads((out / report.METRICS).read_text(encoding="utf-8"))
+    metrics = json.loads((out / work.METRICS).read_text(encoding="utf-8"))
     comparison = compare_with_published(metrics, named.source.published)
     say(json.dumps(comparison, indent=1) if as_json else table_of(comparison["scores"]))
     for note in comparison["notes"]:
@@ -189,7 +156,7 @@ def reproduce(
         raise typer.Exit(SOME_FAILED)
 
 
-def _get(named: "NamedWeights", model: ModelOptions) -> None:
+def _get(named: NamedWeights, model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
     if named.here is not None:
         return
