@@ -50,7 +50,7 @@ def test_a_batch_is_a_function_of_drives_and_options(folder: Path, tmp_path: Pat
     assert again.skipped == 2
     with pytest.raises(TypeError, match=r"batch\(\) has no option speed"):
         bevcli.batch(drives, tmp_path / "out", speed=3)
-    with pytest.raises(InputError, match="`retry_failed`: is for `resume=True`"):
+    with pytest.raises(InputError, match=r"`retry_failed` \(`--retry-failed`\): is for `resume=True`"):
         bevcli.batch(drives, tmp_path / "out", retry_failed=True, **options)
 
 

@@ -330,7 +330,7 @@ def test_a_resumed_training_names_other_settings(two_steps: Trainer, tmp_path: P
 
 def test_a_training_beyond_its_steps_says_so(two_steps: Trainer, tmp_path: Path) -> None:
     shutil.copy(two_steps.job.out / "checkpoint.pt", tmp_path)
-    with pytest.raises(InputError, match=r"has done 2 steps already \(expected at most `steps=1`\)"):
+    with pytest.raises(InputError, match=r"has done 2 steps already \(expected at most `steps=1` \(`--steps 1`\)\)"):
         trainer(tmp_path, resume=True, settings=replace(SHORT, steps=1))
 
 
@@ -368,7 +368,7 @@ def test_the_training_table_is_read_apart_from_the_model_config(tmp_path: Path) 
 
 def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
     for folders, seeds in (((), None), ((tmp_path,), (0, 1))):
-        with pytest.raises(InputError, match="give either `data=DIR`"):
+        with pytest.raises(InputError, match=r"give either `data` \(`--data DIR`\)"):
             scored_drives(DriveOptions(data=folders, rendered=seeds), CONFIG)
     assert len(scored_drives(DriveOptions(data=(tmp_path,)), CONFIG)) == 1
     assert len(scored_drives(DriveOptions(rendered=(3, 9)), CONFIG)) == 2
@@ -419,7 +419,7 @@ def test_seeds_reserved_for_evaluation_are_rejected(tmp_path: Path) -> None:
 def test_a_training_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.pt").write_bytes(b"")
     check_folder(tmp_path, resume=True)
-    with pytest.raises(OutputError, match="pass `resume=True` to continue it"):
+    with pytest.raises(OutputError, match=r"pass `resume=True` \(`--resume`\) to continue it"):
         check_folder(tmp_path, resume=False)
 
 
