@@ -143,7 +143,7 @@ def test_a_folder_with_a_batch_or_other_files_is_not_overwritten(batch, fleet, t
 def test_an_option_that_no_drive_has_is_refused_by_name(fleet, tmp_path):
     job = make_job(tmp_path / "out", fleet / "mini.toml")
     drives, _ = find_drives([str(fleet / "drives/*")])
-    with pytest.raises(InputError, match="the drives of the batch: `topics` .`--topic`. is for a ROS bag: remove it"):
+    with pytest.raises(InputError, match=r"drives of the batch: `topics` \(`--topic`\) is for a ROS bag: remove it"):
         Batch(replace(job, own=(BagOptions(topics={"CAM": "/image"}),)), job.load_model(), drives)
     (tmp_path / "one.mcap").touch()
     mixed, _ = find_drives([str(fleet / "drives/d000"), str(tmp_path / "one.mcap")])
