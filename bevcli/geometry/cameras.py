@@ -19,6 +19,8 @@ ANGLES = 20_000  # of the table that inverts a fisheye's projection
 REFINEMENTS = 15  # fixed-point steps that invert a lens distortion
 LARGEST_RAY_ERROR = 1e-5  # of a normalised coordinate
 OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
+BEV_ORIGIN_M = (0.94, 0.0, 1.84)  # of nuScenes' LIDAR_TOP in ego, metres
+BEV_ORIGIN = f"({BEV_ORIGIN_M[0]:g}, {BEV_ORIGIN_M[1]:g}, {BEV_ORIGIN_M[2]:g}) m"
 NOISE_M = 0.05  # standard deviation per level and axis of `camera_pose_noise`
 
 # Viewing directions of nuScenes' cameras in the ego frame, degrees counter-clockwise from straight ahead.
@@ -193,8 +195,8 @@ class CameraRig:
 
 
 def default_ego_from_bev() -> Array:
-    """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, origin at (0.94, 0, 1.84) m in ego."""
-    return rigid((0.94, 0.0, 1.84), [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, origin at BEV_ORIGIN_M in ego."""
+    return rigid(BEV_ORIGIN_M, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def level_rig(rig: CameraRig, height_m: float) -> CameraRig:

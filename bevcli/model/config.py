@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from bevcli.frame import MAP_CLASSES, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.geometry.object_classes import ClassSettings, ObjectClass, object_classes
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.deformable_attention import LevelShapes
@@ -112,7 +113,7 @@ class BevFrameConfig:
     """
 
     level: bool = False
-    height_m: float = 1.84
+    height_m: float = BEV_ORIGIN_M[2]
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MIB = 1 << 20
+JPEG_QUALITY = 90
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
 # Markers of a JPEG that state its size (start of frame): all from C0 to CF except DHT, JPG and DAC.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -155,6 +156,14 @@ def decode_image(encoded: bytes, flags: int, most_pixels: int) -> "NDArray | Non
         return cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
     except cv2.error:
         return None
+
+
+def encode_image(pixels: "NDArray", ending: str = ".jpg", quality: int = JPEG_QUALITY) -> bytes:
+    """The file of an image with blue, green and red channels, or one channel. quality: of a JPEG, 1 to 100."""
+    import cv2
+
+    settings = [] if ending == ".png" else [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(ending, pixels, settings)[1].tobytes()
 
 
 def size_of_image(encoded: bytes) -> tuple[int, int] | None:

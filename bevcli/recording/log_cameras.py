@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +12,7 @@ from bevcli.frame import CameraImage, CameraSamples
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
+from bevcli.parsing.files import encode_image
 from bevcli.recording import entities
 from bevcli.recording.components import Components, components, log, ui_points
 
@@ -233,8 +233,7 @@ class CameraImages:
         else:
             contents, media_type = image.encoded, image.media_type
             if contents is None or media_type is None:
-                _, jpeg = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-                contents, media_type = jpeg.tobytes(), "image/jpeg"
+                contents, media_type = encode_image(image.pixels_bgr, quality=JPEG_QUALITY), "image/jpeg"
             file = np.frombuffer(contents, np.uint8)
             log(self.stream, entity, components(rr.EncodedImage, blob=file, media_type=media_type))
 

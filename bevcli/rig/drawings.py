@@ -25,6 +25,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.parsing.files import encode_image
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.components import log
@@ -363,7 +364,6 @@ def _draw_field_of_view(axes: Axes, camera: Camera, rig: CameraRig) -> None:
 
 COVERAGE, COVERAGE_ON_GROUND, FINDINGS = "coverage", f"{entities.EGO}/coverage", "findings"
 PIXELS_PER_CELL = 6
-JPEG_QUALITY = 90
 OVERLAYS = ("pillars", "ground_grid", "pillar_lines", "horizon")
 
 
@@ -424,7 +424,7 @@ def _log_coverage(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage
 def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Canvas | None) -> None:
     log(stream, entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
     if pixels is not None:
-        encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        encoded = encode_image(pixels)
         image = rr.EncodedImage(contents=encoded, media_type="image/jpeg")
         stream.log(entities.image(camera.name), image, static=True)
     points, distances, colors = pillars_in(camera, ego_from_bev)

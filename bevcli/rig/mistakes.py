@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bevcli.findings import Finding
-from bevcli.geometry.cameras import Camera
+from bevcli.geometry.cameras import BEV_ORIGIN, Camera
 from bevcli.geometry.transforms import Array, inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from bevcli.rig import rig_checks
 
@@ -173,10 +173,10 @@ def bev_frame_error(ego_from_bev: Array) -> Finding:
     pose, plausible = ego_from_bev, rig_checks.is_plausible_bev_frame
     distance, height, (tilt, heading) = np.linalg.norm(pose[:3, 3]), pose[2, 3], rig_checks.bev_angles_deg(pose)
     found = f"tilt {tilt:.0f}°, y {heading:.0f}° from forward, height {height:.2f} m"
-    expected, unit = "x right, y forward, z up, z 1.84 m", units_per_metre(float(distance))
+    expected, unit = f"x right, y forward, z up, z {rig_checks.BEV_HEIGHT_M} m", units_per_metre(float(distance))
     if unit != 1:
         message = f'the translation of "ego_from_bev" is in {"millimetres" if unit == 1000 else "centimetres"}'
-        code, found, expected = "translation-unit", f"{distance:.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
+        code, found, expected = "translation-unit", f"{distance:.0f} m from the ego origin", f"about {BEV_ORIGIN}"
         advice = f"divide the translation by {unit:g}"
     # KITTI, Waymo and Argoverse have x forward: rotated to x right, such a frame is plausible.
     elif plausible(rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))):

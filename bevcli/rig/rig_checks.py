@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from bevcli.findings import Finding
-from bevcli.geometry.cameras import Camera, default_ego_from_bev
+from bevcli.geometry.cameras import BEV_ORIGIN_M, Camera
 from bevcli.geometry.transforms import Array
 
 _STEP_DEG = 0.1
@@ -345,7 +345,7 @@ def _matrix_error(camera: Camera) -> Finding | None:
     return Finding("principal-point", "error", camera.name, message, found, expected, advice)
 
 
-BEV_HEIGHT_M = float(default_ego_from_bev()[2, 3])
+BEV_HEIGHT_M = BEV_ORIGIN_M[2]
 HEIGHT_ERROR_M, HEIGHT_WARNING_M = 1.2, 0.4
 TILT_ERROR_DEG, TILT_WARNING_DEG = 15.0, 6.0
 TILT_INFO_DEG = 1.0  # the demo model's training drives are level; nuScenes' LIDAR_TOP is tilted by 1 to 3
@@ -371,7 +371,7 @@ def bev_warnings(ego_from_bev: Array) -> list[Finding]:
     findings, height, tilt = [], ego_from_bev[2, 3], bev_angles_deg(ego_from_bev)[0]
     if abs(height - BEV_HEIGHT_M) > HEIGHT_WARNING_M:
         message, found = '"ego_from_bev" is higher or lower than nuScenes\'', f"{height:.2f} m"
-        advice = "place it 1.84 m above the ground"
+        advice = f"place it {BEV_HEIGHT_M} m above the ground"
         findings.append(Finding("bev-height", "warning", None, message, found, f"about {BEV_HEIGHT_M} m", advice))
     message, found = '"ego_from_bev" is tilted', f"{tilt:.1f}°"
     if tilt > TILT_WARNING_DEG:

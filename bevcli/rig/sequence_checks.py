@@ -11,14 +11,14 @@ import numpy as np
 
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import DerivedDrive, Drive, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
 from bevcli.rig import rig_checks
 
 BEV_ASSUMED = Finding(
     "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
-    advice="the default is used: a level frame at (0.94, 0, 1.84) m, x right, y forward",
+    advice=f"the default is used: a level frame at {BEV_ORIGIN}, x right, y forward",
 )  # fmt: skip
 MERGED_FROM = 3  # cameras with the same mistake: from this many on it is one finding on the whole rig
 MAX_SPEED = 70.0  # m/s, 250 km/h

@@ -15,7 +15,7 @@ import numpy as np
 from bevcli.errors import InputError, result_within
 from bevcli.frame import CameraImage, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, decode_image, media_type_of, read_bytes, size_of_image
@@ -220,7 +220,7 @@ def bev_frame_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[s
     """Tells the user that the bev frame is the default, if it is. source: what does not state it."""
     if not rig.ego_from_bev_assumed:
         return ()
-    return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
+    return (f'{source} has no "ego_from_bev": the default is used, a level frame at {BEV_ORIGIN} in ego',)
 
 
 class ListedDrive(Drive):

@@ -19,6 +19,7 @@ import numpy as np
 import rerun_cli  # type: ignore[import-untyped]
 
 from bevcli.errors import InputError, OutputError, WaitError
+from bevcli.parsing.files import encode_image
 from bevcli.recording import entities
 from bevcli.writing import write_whole
 
@@ -32,7 +33,6 @@ Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
 WHOLE_TIMEOUT_S = 180.0
 ENDINGS = (".png", ".jpg", ".jpeg")
-JPEG_QUALITY = 90
 SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
 NO_DRIVER = (
     "the viewer cannot draw here: it needs a Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
@@ -184,5 +184,5 @@ def _write(image: Path, png: bytes) -> None:
     if image.suffix.lower() != ".png":
         pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None
-        png = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        png = encode_image(pixels)
     write_whole(image, png)

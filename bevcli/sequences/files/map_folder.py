@@ -11,7 +11,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.parsing.documents import read_json
-from bevcli.parsing.files import decode_image, read_bytes
+from bevcli.parsing.files import decode_image, encode_image, read_bytes
 from bevcli.writing import write_whole
 
 FORMAT = "bevcli-map/1"
@@ -94,7 +94,7 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
         write_whole(path, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
     elif (stated := read_json(path)) != legend:
         raise InputError(f"{path}: states {stated!r:.300}, but the new map has {legend}: write it to another folder")
-    write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes(), regular=True)
+    write_whole(map_path(folder, frame), encode_image(bev_map.cells, ".png"), regular=True)
 
 
 def map_path(folder: Path, frame: int) -> Path:

@@ -17,6 +17,7 @@ from bevcli.inference.load import Model, choose_engine, load_model
 from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network, build_network
+from bevcli.parsing.files import encode_image
 from bevcli.sequences.images import ImageReader, MessageSource
 from bevcli.workshop.engines.engine import CALIBRATION_FRAMES as CALIBRATION_FRAMES
 
@@ -108,8 +109,7 @@ def _jpeg(seed: int) -> bytes:
     random = np.random.default_rng(seed)
     layers = [random.normal(0, 60 / (i + 1), (9 * 2**i, 16 * 2**i, 3)).astype(np.float32) for i in range(5)]
     image = 110 + sum(cv2.resize(layer, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for layer in layers)
-    encoded = cv2.imencode(".jpg", np.clip(image, 0, 255).astype(np.uint8))[1]
-    return encoded.tobytes()
+    return encode_image(np.clip(image, 0, 255).astype(np.uint8), quality=95)
 
 
 def model_to_time(name: str, options: ModelOptions) -> Model:

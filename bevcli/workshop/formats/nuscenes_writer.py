@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
@@ -15,6 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.parsing.files import encode_image
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
@@ -81,7 +81,7 @@ class NuScenesWriter(FolderWriter):
     def _finish(self) -> None:
         if not self._messages:
             raise OutputError(f"{self.folder}: no frame was written (expected at least one)")
-        write_whole(self.folder / MAP_FILE, cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes(), parents=True)
+        write_whole(self.folder / MAP_FILE, encode_image(np.zeros((1, 1), np.uint8), ".png"), parents=True)
         for scene, messages in self._messages.items():
             write_whole(self.folder / f"can_bus/{scene}_pose.json", _json(messages), parents=True)
         self._tables.finish(MAP_FILE)

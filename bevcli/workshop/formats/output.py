@@ -10,7 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
@@ -20,6 +19,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of
+from bevcli.parsing.files import encode_image
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
@@ -116,7 +116,7 @@ def image_file(image: CameraImage) -> tuple[bytes, str]:
     """The file of an image as it was read, or else a PNG; and its format, "jpeg" or "png"."""
     form = FORMATS.get(image.media_type or "")
     if image.encoded is None or form is None:
-        return cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), "png"
+        return encode_image(image.pixels_bgr, ".png"), "png"
     return image.encoded, form
 
 

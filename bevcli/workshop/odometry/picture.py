@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.files import encode_image
 from bevcli.workshop.correspondence.road import sampled
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg
@@ -31,7 +32,7 @@ SIDE = round(2 * REACH_M / CELL_M)  # pixels
 BODY_M = (-1.2, 4.2, 1.1)  # of the vehicle: back and front, and half its width, from the origin of the ego frame
 MOST_PIXELS = 1600  # of a side of the stitched road
 SHOWN_WIDTH, MOST_SHOWN = 320, 100  # of images in the recording: pixels, and frames
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+JPEG_QUALITY = 80
 WAY, STATED, GUESSED = "#ff8c1a", "#2a7de1", "#d62728"
 
 
@@ -71,7 +72,7 @@ def _small(image: Pixels) -> bytes:
     """JPEG of an image, SHOWN_WIDTH wide."""
     height = round(SHOWN_WIDTH * image.shape[0] / image.shape[1])
     small = cv2.resize(image, (SHOWN_WIDTH, height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", small, JPEG)[1].tobytes()
+    return encode_image(small, quality=JPEG_QUALITY)
 
 
 class WatchedDrive(DerivedDrive):
@@ -96,7 +97,7 @@ class WatchedDrive(DerivedDrive):
         frame = super().load(index)
         if self.view is None or self.view.rig is not frame.rig:
             self.view = GroundView(frame.rig)
-        self.road[index] = cv2.imencode(".jpg", self.view.of(frame), JPEG)[1].tobytes()
+        self.road[index] = encode_image(self.view.of(frame), quality=JPEG_QUALITY)
         if index % self._every == 0:
             self.images[index] = {name: _small(image.pixels_bgr) for name, image in frame.images.items()}
         if self.has_ego_motion:

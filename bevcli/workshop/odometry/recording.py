@@ -3,17 +3,17 @@
 from collections.abc import Sequence as Items
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.files import encode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
 from bevcli.workshop.odometry.measure import MeasuredMotion
-from bevcli.workshop.odometry.picture import JPEG, SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
+from bevcli.workshop.odometry.picture import JPEG_QUALITY, SHOWN_WIDTH, SIDE, StitchedRoad, WatchedDrive
 from bevcli.workshop.odometry.report import speeds, yaw_rates_deg
 from bevcli.workshop.odometry.steps import SeenPoints
 
@@ -65,7 +65,7 @@ def _log_way(
     stream: rr.RecordingStream, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
 ) -> None:
     """The stitched road with the whole way."""
-    encoded = cv2.imencode(".jpg", road.image[..., ::-1], JPEG)[1].tobytes()
+    encoded = encode_image(road.image[..., ::-1], quality=JPEG_QUALITY)
     stream.log(f"{WAY}/road", rr.EncodedImage(contents=encoded, media_type="image/jpeg"), static=True)
     if stated is not None:
         moved = np.stack([inverse(stated[0]) @ pose for pose in stated])

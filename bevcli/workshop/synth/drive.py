@@ -10,7 +10,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.options import gather
+from bevcli.parsing.files import encode_image
 from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
@@ -340,7 +340,7 @@ def export_drive(
         for rendered in map(drive.frame, range(drive.frames)):
             images = {}
             for name, pixels in rendered.images.items():
-                encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+                encoded = encode_image(pixels, quality=quality)
                 images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
             frame = Frame(
                 rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
