@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from bevcli.writing import write_whole
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
-    from rerun.experimental._viewer_client import ViewerState
 
 LOOPBACK = "127.0.0.1"
 PORTS_TRIED = 20
@@ -151,13 +150,14 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
     return _wait(process, answer, NO_DRIVER)
 
 
-def _opened(client: ViewerClient) -> ViewerState | None:
+def _opened(client: ViewerClient) -> Any:
+    """The state of the viewer once it shows a recording; None before."""
     state = client.get_state()
     ready = state.recordings and state.recordings[0].timelines and state.views and not state.loading
     return state if ready else None
 
 
-def _go_to(recording: Path, client: ViewerClient, state: ViewerState, frame: int | None) -> None:
+def _go_to(recording: Path, client: ViewerClient, state: Any, frame: int | None) -> None:
     timeline = next((t for t in state.recordings[0].timelines if t.name == entities.FRAME_TIMELINE), None)
     if timeline is None or timeline.start is None or timeline.end is None or timeline.time_type != "sequence":
         raise InputError(f"{recording}: the recording has no frames (expected one of `bevcli run`)")

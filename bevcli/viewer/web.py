@@ -1,8 +1,9 @@
 """Serves the web viewer and a recording from one address.
 
-Rerun's own web server listens on all network interfaces and keeps a core busy. This server takes the files of the web
-viewer from the installed viewer once, and serves them and the recording from one origin. A content security policy
-lets the pages connect to that origin only; so the viewer in the browser cannot send telemetry.
+Rerun's own web server (0.41) answers pages of other names that lead here (DNS rebinding), links fonts of Google, needs
+two ports, and keeps a third of a core busy while nobody looks. This server takes the files of the web viewer from the
+installed viewer once, and serves them and the recording from one origin. A content security policy lets the pages
+connect to that origin only; so the viewer in the browser cannot send telemetry.
 """
 
 import ipaddress
@@ -36,7 +37,6 @@ STOP_TIMEOUT_S = 5.0
 CONNECTION_TIMEOUT_S = 60.0
 GROWTH_PERIOD_S = 0.05  # between two looks at a file that is still written
 BLOCK = 1 << 18  # bytes
-MOST_CONNECTIONS = 64
 FONT_LINKS = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # links to Google's fonts; removed
 
 
@@ -56,8 +56,8 @@ def web_viewer_assets() -> dict[str, bytes]:
 class WebViewer(ThreadingHTTPServer):
     """A web server for the viewer and a recording.
 
-    The file is opened once, here: whatever takes its place later is not served. Each connection has a thread,
-    MOST_CONNECTIONS at a time. A connection that breaks is no error.
+    The file is opened once, here: whatever takes its place later is not served. Each connection has a thread. A
+    connection that breaks is no error.
 
     Args:
         assets: the web viewer's files by path (`web_viewer_assets`).
@@ -89,7 +89,6 @@ class WebViewer(ThreadingHTTPServer):
         self.assets, self.file, self.ended = assets, open_regular(recording, error=OutputError), ended
         self.live_transfers: list[threading.Thread] = []
         self.last_block_s = 0.0
-        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.host, self.port = host, free_port(port, host)
         super().__init__((self.host, self.port), _Handler)
 
@@ -112,20 +111,6 @@ class WebViewer(ThreadingHTTPServer):
         for transfer in self.live_transfers:
             while transfer.is_alive() and time.monotonic() - self.last_block_s < STOP_TIMEOUT_S:
                 transfer.join(GROWTH_PERIOD_S)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Starts the thread of a connection; closes the connection if there are too many."""
-        if not self._free.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Runs in the thread of a connection."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Prints nothing if the browser has gone or is silent."""

@@ -107,21 +107,10 @@ def test_addresses_and_the_name_of_this_machine_are_served(viewer, host):
     assert get(viewer, Host=host.format(viewer.port)) == 200
 
 
-def test_connections_over_the_limit_close_and_silent_ones_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(web, "MOST_CONNECTIONS", 3)
-    monkeypatch.setattr(web._Handler, "timeout", 1.0)
-    (tmp_path / "recording.rrd").write_bytes(b"RRF2")
-    viewer = WebViewer(PAGE, tmp_path / "recording.rrd")
-    threading.Thread(target=viewer.serve, daemon=True).start()
-    silent = [socket.create_connection((viewer.host, viewer.port)) for _ in range(3)]
-    time.sleep(0.3)
-    with socket.create_connection((viewer.host, viewer.port), timeout=5) as refused:
-        assert refused.recv(1) == b""
-    for connection in silent:
-        connection.settimeout(5)
-        assert connection.recv(1) == b""
-    assert get(viewer) == 200
-    viewer.close()
+def test_silent_connections_end(viewer, monkeypatch):
+    monkeypatch.setattr(web._Handler, "timeout", 0.2)
+    with socket.create_connection((viewer.host, viewer.port), timeout=5) as silent:
+        assert silent.recv(1) == b""
 
 
 def test_a_reset_connection_prints_nothing(tmp_path, capfd):
