@@ -3,6 +3,8 @@
 Pipes, devices and sockets are refused: they may not end.
 """
 
+import hashlib
+import json
 import os
 import re
 import stat
@@ -89,6 +91,17 @@ def open_regular(
         os.close(descriptor)
         raise error(f"{path}: is not a regular file (expected no folder, pipe or device)")
     return os.fdopen(descriptor, "rb")
+
+
+def hash_of_file(path: Path) -> str:
+    """SHA-256 of the contents of a file, hexadecimal. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def hash_of_values(values: object) -> str:
+    """SHA-256, hexadecimal, of what a result depends on: values that JSON takes; the order of keys does not count."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager

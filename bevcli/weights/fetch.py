@@ -5,7 +5,6 @@ written.
 """
 
 import contextlib
-import hashlib
 import os
 import re
 import shutil
@@ -25,7 +24,7 @@ import msgspec
 from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
-from bevcli.parsing.files import read_bytes
+from bevcli.parsing.files import hash_of_file, read_bytes
 from bevcli.printing import counted, reason_of
 from bevcli.published import HASHES, Known, NamedWeights
 from bevcli.writing import lock, output_errors
@@ -119,8 +118,7 @@ def _check(weights: NamedWeights, path: Path) -> FetchedWeights:
     """The facts of a file that is the expected one. Raises WeightsError for another one."""
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found (the `source` of [{weights.name}])")
-    with path.open("rb") as file:
-        known = Known(hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
+    known = Known(hash_of_file(path), path.stat().st_size)
     source, before = weights.source, weights.known
     if source.bytes not in (None, known.bytes):
         raise WeightsError(f"{path}: has {known.bytes:,} bytes (expected {source.bytes:,})")

@@ -6,7 +6,6 @@ them, in $XDG_CACHE_HOME/bevcli/nuscenes-tables (default ~/.cache). Images are c
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -26,7 +25,7 @@ from bevcli.frame import Drive
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
-from bevcli.parsing.files import MIB, read_text
+from bevcli.parsing.files import MIB, hash_of_file, hash_of_values, read_text
 from bevcli.published import weights_folder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
@@ -129,7 +128,7 @@ def _scenes(root: BatchDrive, options: NuScenesOptions) -> Iterator[BatchDrive]:
 
 
 def _hash(name: str, scene: str | None, files: list[StoredFile]) -> str:
-    return hashlib.sha256(json.dumps([name, scene, files]).encode()).hexdigest()
+    return hash_of_values([name, scene, files])
 
 
 def _safe_name(source: str) -> str:
@@ -263,7 +262,7 @@ class Job:
             "run": {name: _fact(value) for name, value in vars(self.run).items()},
             "evaluate": self.evaluate,
         }
-        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+        return hash_of_values(facts)
 
 
 def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
@@ -284,7 +283,7 @@ def with_absolute_paths(model: ModelOptions) -> ModelOptions:
 def _fact(value: object) -> str:
     """A value as text; of a file, its contents count and not its name."""
     if isinstance(value, Path) and value.is_file():
-        return hashlib.sha256(value.read_bytes()).hexdigest()
+        return hash_of_file(value)
     return repr(value)
 
 

@@ -5,9 +5,7 @@ A model that is named is exported for a rig once. The files lie in $XDG_CACHE_HO
 Files that nobody has used for some months are removed.
 """
 
-import hashlib
 import importlib
-import json
 import os
 import sys
 import time
@@ -35,7 +33,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.precision import AnyPrecision
 from bevcli.model.temporal_model import model_class
-from bevcli.parsing.files import MIB, read_bytes
+from bevcli.parsing.files import MIB, hash_of_values, read_bytes
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.view import select_range
@@ -329,7 +327,7 @@ def _key(sized: Model, options: OnnxOptions, precision: str, frames: int = 0) ->
         "precision": precision,
         "calibration": (frames, None if other is None else str(other.resolve())),
     }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
+    return hash_of_values(facts)[:KEY_DIGITS]
 
 
 class FileFacts(msgspec.Struct, frozen=True):

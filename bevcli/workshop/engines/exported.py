@@ -1,7 +1,6 @@
 """An exported file in the place of a model, and its comparison with the model over a drive: `check_exported`."""
 
 import contextlib
-import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
+from bevcli.parsing.files import hash_of_file
 from bevcli.printing import counted, reason_of
 from bevcli.registry import load
 from bevcli.workshop.engines.export_form import ExportForm, pixels_of
@@ -70,8 +70,7 @@ class ExportedModel(TemporalModel):
         self.kind = model_class(self.config)
         self.form: ExportForm = self.kind.export_form(self.config, self.cameras)
         self._require((port.name for port in self.form.outputs(decode=False)), engine.outputs, "output")
-        with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").digest()
+        digest = bytes.fromhex(hash_of_file(file))
         # The only state of this module: it tells a resumed run whether the weights are the same.
         self.register_buffer("digest", torch.tensor(list(digest), dtype=torch.uint8))
 

@@ -17,7 +17,7 @@ from bevcli.options import gather
 from bevcli.published import Known
 from bevcli.weights.options import PackOptions
 from bevcli.workshop.hub.card import facts_of, model_card
-from bevcli.workshop.hub.folder import CARD, CONFIG, FORMAT, WEIGHTS, PackedConfig
+from bevcli.workshop.hub.download import CARD, CONFIG, FORMAT, WEIGHTS, PackedConfig
 from bevcli.writing import write_whole
 
 

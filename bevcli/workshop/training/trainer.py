@@ -66,6 +66,7 @@ def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
 def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
     """Moves a running average of a state dict towards it, in place; integers are copied."""
     moved = [key for key, value in state.items() if value.is_floating_point()]
+    # PyTorch's optimizers call it too; the public `lerp_`, one tensor at a time, starts a kernel for each of them.
     torch._foreach_lerp_([average[key] for key in moved], [state[key] for key in moved], 1 - decay)
     for key in state.keys() - set(moved):
         average[key].copy_(state[key])
@@ -305,6 +306,7 @@ def alternated(iterators: Iterable[Iterator[T]]) -> Iterator[T]:
 
 def computes_in_bfloat16(device: torch.device) -> bool:
     """True where the device has bfloat16 instructions, so that mixed precision is faster."""
+    # PyTorch 2.6, the lowest version, has no public name for it.
     return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
 
 
