@@ -180,7 +180,7 @@ def test_a_folder_of_ones_own_model_has_a_card(tmp_path):
     (tmp_path / "scores.json").write_text('{"mean_ap": 0.25, "nd_score": 0.5}')
     files = ["own/mini.toml", "own/packed", "--weights", "own/w.safetensors"]
     done = command(tmp_path, "weights", "pack", *files)
-    assert "own/packed/config.json: already exists; choose another folder, or pass --force" in done.stderr
+    assert "own/packed/config.json: already exists; choose another folder, or pass `force=True` (`--force`)" in done.stderr
     stated = [
         "--licence",
         "Our own terms",
@@ -214,9 +214,9 @@ def test_what_a_card_lacks_is_said(tmp_path):
     own = packed_mini(tmp_path / "own", 0).parent
     done = command(tmp_path, "weights", "pack", own / "mini.toml", "out", "--weights", own / "w.safetensors")
     assert done.stderr.splitlines() == [
-        "note: the model card states no licence: others may not use the weights: pass --licence NAME",
-        "note: the model card states no data of the training: pass --datasets NAME",
-        "note: the model card states no scores: pass --scores FILE.json",
+        "note: the model card states no licence: others may not use the weights: pass `licence` (`--licence NAME`)",
+        "note: the model card states no data of the training: pass `datasets` (`--datasets NAME`)",
+        "note: the model card states no scores: pass `scores` (`--scores FILE.json`)",
     ]
     assert "license" not in yaml.safe_load((tmp_path / "out/README.md").read_text().split("---\n")[1])
 
@@ -234,7 +234,7 @@ def test_the_hub_reads_the_front_matter(tmp_path):
 
 def test_mistakes_of_packing_are_one_line(tmp_path):
     packed_mini(tmp_path / "own", 0)
-    with pytest.raises(WeightsError, match="a model file holds no weights: pass `weights=FILE`"):
+    with pytest.raises(WeightsError, match="a model file holds no weights: pass `weights`"):
         pack_model(tmp_path / "own/mini.toml", tmp_path / "out")
     with pytest.raises(WeightsError, match="run `bevcli weights fetch tiny`"):
         pack_model("tiny", tmp_path / "out")
