@@ -180,7 +180,7 @@ def test_a_folder_of_ones_own_model_has_a_card(tmp_path):
     (tmp_path / "scores.json").write_text('{"mean_ap": 0.25, "nd_score": 0.5}')
     files = ["own/mini.toml", "own/packed", "--weights", "own/w.safetensors"]
     done = command(tmp_path, "weights", "pack", *files)
-    assert "own/packed/config.json: already exists; choose another folder, or pass `force=True` (`--force`)" in done.stderr
+    assert "own/packed/config.json: already exists; choose another folder, or pass `force=True`" in done.stderr
     stated = [
         "--licence",
         "Our own terms",
