@@ -49,7 +49,7 @@ def test_chunks_in_any_order_are_the_same_frames(recording, tmp_path, order):
 
 def test_a_cut_frame_never_has_boxes_or_poses_of_another(recording, tmp_path):
     content, ends = recording.read_bytes(), [recording_file.FILE_HEADER]
-    while content[ends[-1]] in recording_file.MESSAGE_KINDS:
+    while ends[-1] < len(content) and content[ends[-1]] in recording_file.MESSAGE_KINDS:
         _, length = recording_file.MESSAGE_HEADER.unpack_from(content, ends[-1])
         ends.append(ends[-1] + recording_file.MESSAGE_HEADER.size + length)
     whole = {frame.index: str(recorded_boxes(frame)) for frame in RecordingReader(recording).frames()}
