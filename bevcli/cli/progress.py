@@ -26,6 +26,7 @@ SLOW_S = 2.0  # work whose units take longer also gets a line after the first on
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
 STOPPED = 130  # exit code of a download that Ctrl-C ends
 MB = 1_000_000
+Part = TypeVar("Part")
 
 
 class Progress:
@@ -74,6 +75,12 @@ class Progress:
         if is_slow_first or is_next or now - self._printed >= LONGEST_SILENCE_S:
             print(self.state(), file=self.stream, flush=True)
             self._printed = time.perf_counter()
+
+    def over(self, parts: Iterable[Part]) -> Iterator[Part]:
+        """The parts of some work, each of which adds a unit."""
+        for part in parts:
+            self.advance()
+            yield part
 
     def reach(self, done: int) -> None:
         """Adds units of work up to this number of them."""

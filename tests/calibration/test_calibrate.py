@@ -19,10 +19,11 @@ from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 from bevcli.sequences.view import DriveView
-from bevcli.workshop.calibration import calibrate as calibrating, in_turn
+from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibrating, in_turn
 from bevcli.workshop.calibration.calibrate import findings_of
 from bevcli.workshop.calibration.estimates import Verdict, common_delay_text, either_text
 from bevcli.workshop.calibration.views import match_points
+from bevcli.workshop.odometry.measure import MeasuredStep
 
 STREET = Path(__file__).parents[2] / "samples/street"
 TURNED, LOW = "CAM_FRONT", "CAM_BACK"
@@ -243,21 +244,21 @@ def test_motion_and_calibration_are_measured_until_both_stand(result, street, mo
     """Each round leaves half of the error of the rig that the motion was measured with."""
     left_deg = [0.12]
 
-    def with_motion(drive, after_step):
+    def measured(drive):
         assert angle_deg(street[1], drive.rig, TURNED) == pytest.approx(left_deg[-1], abs=1e-3)
-        after_step(4, 4)
-        return drive
+        yield from [MeasuredStep(rigid((2, 0, 0)), np.eye(6))] * (len(drive.stamps) - 1)
 
-    def halved(drive, options, after_step):
+    def halved(drive, options):
         assert angle_deg(street[1], drive.rig, TURNED) == pytest.approx(0.12, abs=1e-3)  # as stated, in every round
         left_deg.append(left_deg[-1] / 2)
-        return replace(result, rig=turned_by(street[1], left_deg[-1]))
+        yield replace(result, rig=turned_by(street[1], left_deg[-1]))
 
-    monkeypatch.setattr(in_turn, "calibrate", halved)
-    drive, steps = DriveView(street[0], rig=turned_by(street[1], 0.12)), []
-    found = in_turn.calibrate_in_turn(drive, with_motion=with_motion, after_step=lambda: steps.append(1))
+    monkeypatch.setattr(in_turn, "measure_steps", measured)
+    monkeypatch.setattr(in_turn, "calibration_steps", halved)
+    drive = DriveView(street[0], rig=turned_by(street[1], 0.12))
+    *steps, found = in_turn.calibrate_in_turn(drive, CalibrateOptions())
     assert left_deg == [0.12, 0.06, 0.03, 0.015]  # the last change is less than 0.02°
-    assert (found.rounds, len(steps)) == (3, 3 * in_turn.MOTION_STEPS)
+    assert (found.rounds, len(steps) + 1) == (3, 3 * (in_turn.MOTION_STEPS + 1))
     assert found.whole.height_deviation_m == 0.2
     assert "heights count from their stated mean" in found.text()
     assert '"rounds": 3' in found.to_json()

@@ -5,10 +5,10 @@ The drives' own calibration counts as right. Points are matched once a drive, be
 
 import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from bevcli.workshop.calibration.estimates import CameraEstimate, Verdict, delay
 from bevcli.workshop.calibration.views import Views, match_points, read_views
 from bevcli.workshop.robustness.conditions import CalibrationNoise, Draws
 
+Result = TypeVar("Result")
 LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured
 
 
@@ -56,15 +57,24 @@ class CameraError:
     deviations: tuple[float, ...]
 
 
+def done(work: Generator[None, None, Result]) -> Result:
+    """The result of work that is done in parts."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            return end.value
+
+
 def errors_of_drive(drive: Drive, levels: list[int], seeds: list[int]) -> Iterator[CameraError]:
     """Measure the calibration of a drive once a level and seed, and yield what is left for each camera."""
     options = CalibrateOptions()
-    views = read_views(drive, options.pairs)
+    views = done(read_views(drive, options.pairs))
     matches = match_points(views)
     for level in levels:
         for seed in seeds:
             noisy = _with_noise(drive, views, level, seed)
-            result = judge(drive, measure(noisy, matches, options))
+            result = judge(drive, done(measure(noisy, matches, options)))
             for right, estimate in zip(views.stated.cameras, result.cameras, strict=True):
                 yield _error(drive.name, level, seed, right, result, estimate)
 
@@ -89,12 +99,12 @@ class WrongTimes(DerivedDrive):
 def delays_of_drive(drive: Drive, delays_ms: list[float]) -> Iterator[str]:
     """One line for each camera and delay: the delay that is found, and its deviation."""
     options = CalibrateOptions()
-    views = read_views(drive, options.pairs)
+    views = done(read_views(drive, options.pairs))
     matches = match_points(views)
     for index, late_ms in enumerate(delays_ms):
         camera = views.rig.names[index % len(views.rig.names)]
-        late = read_views(WrongTimes(drive, camera, late_ms), options.pairs)
-        found = judge(drive, measure(late, matches, options))[camera]
+        late = done(read_views(WrongTimes(drive, camera, late_ms), options.pairs))
+        found = judge(drive, done(measure(late, matches, options)))[camera]
         turned = np.degrees(np.linalg.norm(found.change[:3]))
         yield (
             f"{drive.name} {camera}: planted {-late_ms:+.0f} ms, found {found.delay_ms:+.1f} ± "

@@ -5,7 +5,7 @@ In this order: the rounds of the measurement, rotations from matched points and 
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ KERB_M = 0.09  # less than from the road to a pavement
 LEAST_SHOWN = 0.7  # of a wrong roll, that the road has to show
 LEAST_SIGNAL = 16.0  # of contrast over noise, for cameras whose road shows less
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
-PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
+PARTS = 2 + len(FLOWS_PX)  # of the work, for progress
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,8 @@ class Measurement:
     road: RoadResiduals
 
 
-def measure(
-    views: Views, matches: PointMatches, options: CalibrateOptions, progress: Callable[[], None] = lambda: None
-) -> Measurement:
-    """Measure all unknowns. progress: called PARTS times."""
+def measure(views: Views, matches: PointMatches, options: CalibrateOptions) -> Generator[None, None, Measurement]:
+    """Measure all unknowns: yields PARTS times on the way, and returns the measurement."""
     unknowns = unknowns_of(views, options)
     within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
@@ -86,19 +84,22 @@ def measure(
     for scale in SCALES_PX if len(at_once.group) else ():
         x = solver.solve(unknowns, [(within, SCALES_PX[-1]), (at_once, scale), (depths, scale)], x).x
     points = consistent(unknowns, matches.where(matches.same | ~matches.moves), x)
-    progress()
+    yield
     heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
     x[heights] += search_heights(views, unknowns, x)
-    progress()
-    ties, signals = matches.where(~matches.same & matches.moves), np.zeros(unknowns.cameras)
-    roadless, after_part = x, progress
+    yield
+    ties, signals, roadless = matches.where(~matches.same & matches.moves), np.zeros(unknowns.cameras), x
     while True:
-        x, road = _with_road(views, unknowns, roadless, (points, depths, ties), signals, after_part)
+        x = roadless
+        for most_px in FLOWS_PX:
+            x, road = _with_road(views, unknowns, x, (points, depths, ties), most_px, signals)
+            if not signals.any():
+                yield
         shown = followed(views, unknowns, x, FLOWS_PX[0], signals)
         unsure = (shown < LEAST_SHOWN) & (signals == 0)
         if not unsure.any():
             break
-        signals, after_part = np.where(unsure, LEAST_SIGNAL, signals), lambda: None
+        signals = np.where(unsure, LEAST_SIGNAL, signals)
     sees = sees_road(unknowns, road, ties, x) & (shown >= LEAST_SHOWN)
     road = road.where(sees[unknowns.groups[road.group, 1]])
     for _ in range(TURN_ROUNDS):
@@ -112,27 +113,24 @@ def _with_road(
     unknowns: adjustment.Unknowns,
     x: Array,
     matches: tuple[PointMatches, DepthResiduals, PointMatches],
+    most_px: float,
     signals: Array,
-    progress: Callable[[], None],
 ) -> tuple[Array, RoadResiduals]:
-    """x (P,) and the points of the road, in rounds from x.
+    """x (P,) and the points of the road, of one round from x.
 
     matches: points of one camera or of one frame, their depths, and points of neighbours in two frames.
-    signals: see `road_residuals`.
+    most_px: of FLOWS_PX; the first round also puts cameras on the level of the road. signals: see `road_residuals`.
     """
     points, depths, ties = matches
-    heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
-    for most_px in FLOWS_PX:
-        road = road_residuals(views, unknowns, x, most_px, signals)
-        progress()
-        for scale in ROAD_SCALES_PX:
-            x = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, scale), x).x
-        if most_px == FLOWS_PX[0]:
-            levels = level_corrections(unknowns, road, ties, x)
-            x = x + levels
-            # Shared points tell the level, and the road then tells the height to the step of the search.
-            x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
-        progress()
+    road = road_residuals(views, unknowns, x, most_px, signals)
+    for scale in ROAD_SCALES_PX:
+        x = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, scale), x).x
+    if most_px == FLOWS_PX[0]:
+        levels = level_corrections(unknowns, road, ties, x)
+        x = x + levels
+        # Shared points tell the level, and the road then tells the height to the step of the search.
+        heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
+        x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
     return x, road
 
 
@@ -170,36 +168,25 @@ FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
 FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
-STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
+STEPS = READING_STEPS + 1 + PARTS + 1  # of `calibration_steps`
 SHORT_PAIRS = 8  # of frames, for findings
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The result of `calibrate`.
+    """The result of `calibrate`."""
 
-    Attributes:
-        name: of the drive.
-        stated: the rig of the drive.
-        rig: the corrected rig; cameras that are fine or not measurable are as stated.
-        cameras: the estimates, in the rig's order.
-        whole: what is said about the whole rig.
-        pairs: number of frame pairs that were used.
-        facts: of the drive, for calibration.json.
-        interval_ms: between frames, if it is the same for all: such times are often nominal; None if it is not.
-        rounds: in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated.
-        drives_beside_x_deg: direction of the measured motion, degrees to the left of x, and its deviation.
-    """
-
-    name: str
-    stated: CameraRig
-    rig: CameraRig
-    cameras: tuple[CameraEstimate, ...]
-    whole: RigEstimate
-    pairs: int
-    facts: DriveFacts
+    name: str  # of the drive
+    stated: CameraRig  # the rig of the drive
+    rig: CameraRig  # the corrected rig; cameras that are fine or not measurable are as stated
+    cameras: tuple[CameraEstimate, ...]  # in the rig's order
+    whole: RigEstimate  # what is said about the whole rig
+    pairs: int  # number of frame pairs that were used
+    facts: DriveFacts  # of the drive, for calibration.json
+    # Between frames, if it is the same for all: such times are often nominal. None if it is not.
     interval_ms: float | None = None
-    rounds: int = 0
+    rounds: int = 0  # in which its motion was measured too (`calibrate_in_turn`); 0 if the motion is stated
+    # Direction of the measured motion, degrees to the left of x, and its deviation.
     drives_beside_x_deg: tuple[float, float] = (0.0, 0.0)
 
     def __getitem__(self, camera: str) -> CameraEstimate:
@@ -236,13 +223,7 @@ class CalibrationResult:
         return [rig, report]
 
 
-def calibrate(
-    drive: Drive,
-    options: CalibrateOptions | None = None,
-    *,
-    after_step: Callable[[], None] = lambda: None,
-    **changes: Any,
-) -> CalibrationResult:
+def calibrate(drive: Drive, options: CalibrateOptions | None = None, **changes: Any) -> CalibrationResult:
     """Measure the calibration of a drive from its own images and ego-motion.
 
         result = calibrate(open_sequence("my_drive"))
@@ -256,22 +237,33 @@ def calibrate(
     Args:
         drive: of `open_sequence`, one scene with ego-motion.
         options: see `CalibrateOptions`.
-        after_step: called STEPS times, after each part of the work.
         changes: options as keywords.
 
     Raises InputError where the drive does not show how its cameras move: no ego-motion, too few frames, a vehicle that
     stands, black images, or several scenes.
     """
-    chosen = gather(CalibrateOptions, options, changes)
-    views = read_views(drive, chosen.pairs, after_step)
+    return last(calibration_steps(drive, gather(CalibrateOptions, options, changes)))
+
+
+def last(steps: Iterable[CalibrationResult | None]) -> CalibrationResult:
+    """The result of all steps of a calibration."""
+    *_, result = steps
+    assert result is not None
+    return result
+
+
+def calibration_steps(drive: Drive, options: CalibrateOptions) -> Iterator[CalibrationResult | None]:
+    """`calibrate` in STEPS parts: None after each of them but the last, then the result."""
+    views = yield from read_views(drive, options.pairs)
     matches = match_points(views)
-    after_step()
+    yield None
     if not matches.same.any():
         raise InputError(
             f"{drive.name}: no points were found in both frames of a pair (expected {FEWEST_MATCHES} or more a "
             "camera): choose a part of the drive in which the images are sharp and show something"
         )
-    return judge(drive, measure(views, matches, chosen, after_step))
+    measurement = yield from measure(views, matches, options)
+    yield judge(drive, measurement)
 
 
 def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
@@ -279,15 +271,13 @@ def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
     changes, covariances, whole = observed(measurement)
     stated, unknowns, pairs = measurement.views.stated, measurement.unknowns, len(measurement.views.pairs)
     cameras = tuple(_estimate(index, measurement, changes[index], covariances[index]) for index in range(len(changes)))
-    rig = replace(
-        stated,
-        cameras=tuple(
-            replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
-            for camera, pose, estimate in zip(
-                stated.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
-            )
-        ),
+    corrected = tuple(
+        replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
+        for camera, pose, estimate in zip(
+            stated.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
+        )
     )
+    rig = replace(stated, cameras=corrected)
     return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
 
 
@@ -339,8 +329,8 @@ def _reason(
     """
     # Matches grow with the area of an image, deviations shrink with its width.
     widest = deviations_deg.max()
-    wanted = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
-    width = int(min(WIDTH, 10 * np.ceil(wanted / 10)))
+    width_px = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
+    width = int(min(WIDTH, 10 * np.ceil(width_px / 10)))
     height = round(camera.height * width / camera.width)
     stated = f"{camera.width} x {camera.height}"
     size = f"; its images are {stated}: about {width} x {height} would do" if width > camera.width else ""
@@ -354,7 +344,7 @@ def _reason(
     ahead = np.abs(camera.ego_from_camera[0, :3])  # the direction in which the vehicle drives, in the camera frame
     if turned_deg < LEAST_TURNED_DEG and ahead[deviations_deg.argmax()] > MOSTLY:
         return f"{shown}: the road shows too little, and the vehicle turns too little; a turn at a junction would do"
-    if wanted > WIDTH > camera.width:
+    if width_px > WIDTH > camera.width:
         left = widest * camera.width / WIDTH
         size = f"; its images are {stated}: {width} x {height} would show about ±{left:.1f}°, and a longer drive less"
     return f"{shown}{size}"

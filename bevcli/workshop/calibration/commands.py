@@ -32,15 +32,15 @@ def calibrate(
     """
     from bevcli.workshop.calibration import calibrate as at_once, in_turn
 
-    steps, measure_it = (
-        (in_turn.ALL_STEPS, in_turn.calibrate_in_turn) if source.odometry else (at_once.STEPS, at_once.calibrate)
-    )
+    count, measure = at_once.STEPS, at_once.calibration_steps
+    if source.odometry:
+        count, measure = in_turn.ALL_STEPS, in_turn.calibrate_in_turn
     reading = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
     drive = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
-    with Progress(steps, "steps", drive.notes) as progress:
-        result = measure_it(drive, options, after_step=progress.advance)
+    with Progress(count, "steps", drive.notes) as progress:
+        result = at_once.last(progress.over(measure(drive, options)))
     written = result.write(out)
     say(result.to_json() if as_json else result.text())
     say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -8,7 +8,7 @@ from bevcli.findings import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.printing import say
 from bevcli.sequences.view import DriveView
-from bevcli.workshop.calibration import calibrate as calibration
+from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibration
 from bevcli.workshop.calibration.estimates import Verdict, change_text
 from bevcli.workshop.odometry.compare import stated_motion_findings, without_consequences
 
@@ -16,7 +16,7 @@ from bevcli.workshop.odometry.compare import stated_motion_findings, without_con
 def corrected(drive: Drive) -> Drive:
     """The drive with its measured calibration; the corrections are printed."""
     with Progress(calibration.STEPS, "steps of the calibration") as progress:
-        result = calibration.calibrate(drive, after_step=progress.advance)
+        result = calibration.last(progress.over(calibration.calibration_steps(drive, CalibrateOptions())))
     for camera in result.cameras:
         reason = change_text(camera) if camera.verdict is Verdict.CORRECTED else camera.reason
         say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)

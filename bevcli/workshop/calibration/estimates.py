@@ -34,41 +34,23 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class CameraEstimate:
-    """What a drive says about one camera.
+    """What a drive says about one camera. Deviations are standard deviations."""
 
-    Attributes:
-        camera: its name.
-        verdict: what is done with its calibration.
-        reason: why it is not measurable; "" else.
-        rotation_deg: yaw, pitch and roll of the stated rotation minus the measured one, degrees, as in `Mounting`.
-        rotation_deviation_deg: standard deviations.
-        position_m: x, y, z of the stated position minus the measured one, metres, ego frame.
-        position_deviation_m: standard deviations; that of the stated position where nothing is measured.
-        delay_ms: how much later than stated its images were taken.
-        delay_deviation_ms: standard deviation.
-        matches: matched points.
-        road_points: points of the road.
-        before_px: median residual of the matched points with the stated calibration, pixels of the original image.
-        after_px: the same with the measured one.
-        change: (7,) rotation in the camera frame, radians; position in the ego frame, metres; delay, seconds.
-        covariance: (7, 7) of it.
-    """
-
-    camera: str
-    verdict: Verdict
-    reason: str
-    rotation_deg: Triple
+    camera: str  # its name
+    verdict: Verdict  # what is done with its calibration
+    reason: str  # why it is not measurable; "" else
+    rotation_deg: Triple  # yaw, pitch and roll of the stated rotation minus the measured one, as in `Mounting`
     rotation_deviation_deg: Triple
-    position_m: Triple
-    position_deviation_m: Triple
-    delay_ms: float
+    position_m: Triple  # x, y, z of the stated position minus the measured one, ego frame
+    position_deviation_m: Triple  # that of the stated position where nothing is measured
+    delay_ms: float  # how much later than stated its images were taken
     delay_deviation_ms: float
-    matches: int
-    road_points: int
-    before_px: float
-    after_px: float
-    change: Array
-    covariance: Array
+    matches: int  # number of matched points
+    road_points: int  # number of points of the road
+    before_px: float  # median residual of the matched points with the stated calibration, of the original image
+    after_px: float  # the same with the measured one
+    change: Array  # (7,) rotation in the camera frame, radians; position in the ego frame, metres; delay, seconds
+    covariance: Array  # (7, 7) of it
 
     def to_dict(self) -> dict[str, Any]:
         """For the report."""
@@ -78,22 +60,13 @@ class CameraEstimate:
 
 @dataclass(frozen=True)
 class RigEstimate:
-    """What a drive says about the whole rig.
+    """What a drive says about the whole rig. Deviations are standard deviations."""
 
-    Attributes:
-        scale: of the ego-motion minus 1: 0.01 if the vehicle drove 1 % farther than stated.
-        scale_deviation: standard deviation.
-        height_m: mean height of the cameras above the road, stated minus measured, metres.
-        height_deviation_m: standard deviation.
-        tilt_deg: pitch and roll of the ego frame over the road, degrees: positive if its front, its left points down.
-        tilt_deviation_deg: standard deviations.
-    """
-
-    scale: float
+    scale: float  # of the ego-motion minus 1: 0.01 if the vehicle drove 1 % farther than stated
     scale_deviation: float
-    height_m: float
+    height_m: float  # mean height of the cameras above the road, stated minus measured
     height_deviation_m: float
-    tilt_deg: tuple[float, float]
+    tilt_deg: tuple[float, float]  # pitch and roll of the ego frame over the road: positive if front, left point down
     tilt_deviation_deg: tuple[float, float]
 
 
@@ -113,10 +86,10 @@ def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate], interval_ms: fl
 
 def common_delay_text(cameras: Items[CameraEstimate], interval_ms: float | None) -> str:
     """A time offset that is certain and the same for all cameras, in words; "" where there is none."""
-    told = [each for each in cameras if each.delay_deviation_ms <= TOLD_DELAY_MS]
+    told = [estimate for estimate in cameras if estimate.delay_deviation_ms <= TOLD_DELAY_MS]
     if not told or len(told) < min(2, len(cameras)):
         return ""
-    delays, deviations = np.array([(each.delay_ms, each.delay_deviation_ms) for each in told]).T
+    delays, deviations = np.array([(estimate.delay_ms, estimate.delay_deviation_ms) for estimate in told]).T
     delay, deviation = float(np.average(delays, weights=1 / deviations**2)), float(deviations.min())
     differ = np.abs(delays - delay) > CERTAIN_DELAY[0] * deviations
     if differ.any() or abs(delay) < max(CERTAIN_DELAY[0] * deviation, CERTAIN_DELAY[1]):

@@ -1,6 +1,6 @@
 """The frame pairs of a drive that are used, the grey images of their frames, and the points matched in both."""
 
-from collections.abc import Callable
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -74,8 +74,8 @@ class Views:
         return self.of[a, first], self.of[b if moves else a, second]
 
 
-def read_views(drive: Drive, most_pairs: int, progress: Callable[[], None] = lambda: None) -> Views:
-    """The views of a drive. progress: called READING_STEPS times.
+def read_views(drive: Drive, most_pairs: int) -> Generator[None, None, Views]:
+    """The views of a drive: yields READING_STEPS times while it is read, and returns them.
 
     Raises InputError where the drive does not show how its cameras move.
     """
@@ -96,11 +96,15 @@ def read_views(drive: Drive, most_pairs: int, progress: Callable[[], None] = lam
             view = _view(frame, camera, drive.ego_motion)
             if view is not None:
                 views[frame_index, index] = view
-        for _ in range(READING_STEPS * done // len(frames) - READING_STEPS * (done - 1) // len(frames)):
-            progress()
+        yield from steps_reached(READING_STEPS, done, len(frames))
     if not views:
         raise InputError(f"{drive.name}: no image shows anything (expected images with contrast, not black ones)")
     return Views(stated, rig, tuple(pairs), views)
+
+
+def steps_reached(steps: int, done: int, total: int) -> list[None]:
+    """The steps of progress, of some in all, that the last one of `done` parts of `total` has reached."""
+    return [None] * (steps * done // total - steps * (done - 1) // total)
 
 
 def _check(drive: Drive) -> None:
@@ -162,13 +166,12 @@ def _poses(frame: Frame, name: str, motion: EgoMotion | None) -> Array:
     time, stated = frame.images[name].timestamp_ns, frame.world_from_ego_at[name].matrix
     poses = []
     for delay in DELAYS_S:
-        wanted = time + round(delay * 1e9)
-        if motion is None:
-            near, left_s = stated, delay
-        else:
-            within = min(max(wanted, motion.first_ns), motion.last_ns)
-            near, left_s = motion.pose_at(within).matrix, (wanted - within) / 1e9
-        poses.append(near @ motion_during(left_s, frame.kinematics))
+        nearest, beyond_s = stated, delay
+        if motion is not None:
+            delayed = time + round(delay * 1e9)
+            within = min(max(delayed, motion.first_ns), motion.last_ns)
+            nearest, beyond_s = motion.pose_at(within).matrix, (delayed - within) / 1e9
+        poses.append(nearest @ motion_during(beyond_s, frame.kinematics))
     return np.stack(poses)
 
 
@@ -179,7 +182,7 @@ LENSES = np.radians([0.02, 0.02, 1.0])  # of what looks like a rotation between 
 def unknowns_of(views: Views, options: CalibrateOptions) -> Unknowns:
     """The unknowns of what a drive shows."""
     groups = [group for group, _ in views.all_groups()]
-    poses = np.stack([[_quaternions(view.poses) for view in views.sides(*each)] for each in views.all_groups()])
+    poses = np.stack([[_quaternions(view.poses) for view in views.sides(*group)] for group in views.all_groups()])
     poses[..., 4:] -= poses[:, :1, :1, 4:]
     stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
     pairs, beside = len(views.pairs), views.beside()
@@ -209,12 +212,12 @@ def match_points(views: Views) -> PointMatches:
     """The matches of all groups of views."""
     groups, moves = zip(*views.all_groups(), strict=True)
     with ThreadPoolExecutor(THREADS) as threads:
-        found = dict(zip(views.of, threads.map(features, views.of.values()), strict=True))
+        described = dict(zip(views.of, threads.map(features, views.of.values()), strict=True))
 
         def of_group(group: tuple[int, int, int], moves: bool) -> tuple[Array, Array]:
             (a, b), (_, first, second) = views.pairs[group[0]], group
             cameras = views.rig.cameras[first], views.rig.cameras[second]
-            return matched(found[a, first], found[b if moves else a, second], *cameras, at_once=not moves)
+            return matched(described[a, first], described[b if moves else a, second], *cameras, at_once=not moves)
 
         rays = list(threads.map(of_group, groups, moves))
     counts = [len(a) for a, _ in rays]
@@ -228,16 +231,12 @@ def match_points(views: Views) -> PointMatches:
 def depths_of(unknowns: Unknowns, matches: PointMatches) -> DepthResiduals:
     """The points that a camera sees in both frames of a pair, and its neighbour in the first one."""
     within, at_once = matches.where(matches.same), matches.where(~matches.moves)
-    later: dict[tuple[object, ...], Array] = {}
-    for (pair, camera, _), ray, ray_later in zip(
-        unknowns.groups[within.group], within.rays_a, within.rays_b, strict=True
-    ):
-        later[pair, camera, *ray] = ray_later
+    keys_within, keys = (
+        [(pair, camera, *ray) for (pair, camera, _), ray in zip(unknowns.groups[some.group], some.rays_a, strict=True)]
+        for some in (within, at_once)
+    )
+    later = dict(zip(keys_within, within.rays_b, strict=True))
     cross = {tuple(group): index for index, group in enumerate(unknowns.groups[unknowns.moves].tolist())}
-    keys = [
-        (pair, camera, *ray)
-        for (pair, camera, _), ray in zip(unknowns.groups[at_once.group], at_once.rays_a, strict=True)
-    ]
     groups = [cross.get(tuple(group)) for group in unknowns.groups[at_once.group].tolist()]
     kept = np.array([k for k, key in enumerate(keys) if key in later and groups[k] is not None], dtype=np.int64)
     kept = kept[np.argsort([groups[k] for k in kept], kind="stable")]

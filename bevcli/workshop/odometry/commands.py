@@ -34,16 +34,12 @@ def odometry(
     from bevcli.workshop.odometry import compare, drives, measure, picture, recording, report
 
     reading = replace(source, ego_motion="measured")
-    found = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
-    drive = picture.WatchedDrive(found if source.rate_hz or source.every else drives.at_most_rate(found))
+    opened = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
+    drive = picture.WatchedDrive(opened if source.rate_hz or source.every else drives.at_most_rate(opened))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
-    steps = []
     with Progress(len(drive.stamps) - 1, "steps", drive.notes) as progress:
-        for step in measure.measure_steps(drive, options):
-            steps.append(step)
-            progress.advance()
-    motion = measure.MeasuredMotion.of(drive, steps)
+        motion = measure.MeasuredMotion.of(drive, progress.over(measure.measure_steps(drive, options)))
     report.check_measured(motion)
     stated = drive.stated_poses
     difference = None if stated is None else report.against_stated(motion, stated)
