@@ -9,11 +9,11 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.workshop.synth.catalog import Assets
-from bevcli.workshop.synth.density import Density, draw_density
 from bevcli.workshop.synth.drive import RenderedDrive
 from bevcli.workshop.synth.material import MaterialFolder
 from bevcli.workshop.synth.mesh import PAINT, TriangleSoup, block
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
+from bevcli.workshop.synth.simulation import Density, draw_density
 
 SEED = 6
 SKY = (200, 40, 160)  # RGB

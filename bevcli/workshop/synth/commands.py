@@ -20,14 +20,16 @@ DEMO_RESOLUTION = (800, 450)
 
 def render(out: Annotated[Path, argument("The sequence folder to write.", reads=None)], options: RenderOptions) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
-    from bevcli.workshop.synth import drive, shading_kernels
+    from bevcli.workshop.synth import drive as rendering, shading_kernels
 
     if not is_compiled(shading_kernels.shade_pixels):
         say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
+    drive = rendering.drive_of(options)
     with Progress(options.frames, "frames") as progress:
-        summary = drive.render(out, options, progress=lambda frame: progress.advance())
-    size = f"{counted(summary.frames, 'frames')}, {counted(len(summary.cameras), 'cameras')}"
-    say(f"{summary.folder}: {size}, {summary.weather}, seed {summary.seed}")
+        for _ in rendering.export_frames(drive, out, force=options.force, quality=options.quality):
+            progress.advance()
+    size = f"{counted(drive.frames, 'frames')}, {counted(len(drive.rig.cameras), 'cameras')}"
+    say(f"{out}: {size}, {drive.weather.name}, seed {drive.seed}")
 
 
 def demo(options: DemoOptions) -> None:

@@ -3,7 +3,7 @@
 `render` makes a drive and writes it, `export_drive` writes a given one.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -24,17 +24,15 @@ from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
-from bevcli.workshop.synth.density import Density, draw_density
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
-from bevcli.workshop.synth.material import MaterialFolder
+from bevcli.workshop.synth.material import Coats, MaterialFolder, PhotoLooks
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
-from bevcli.workshop.synth.photo_looks import Coats, PhotoLooks
 from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
 from bevcli.workshop.synth.scenery import Scenery
-from bevcli.workshop.synth.simulation import Actor, Simulation
+from bevcli.workshop.synth.simulation import Actor, Density, Simulation, draw_density
 from bevcli.workshop.synth.traffic import ActorState
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
@@ -289,13 +287,7 @@ class RenderSummary:
     weather: str
 
 
-def render(
-    out: str | Path,
-    options: RenderOptions | None = None,
-    *,
-    progress: Callable[[Frame], None] | None = None,
-    **changes: Any,
-) -> RenderSummary:
+def render(out: str | Path, options: RenderOptions | None = None, **changes: Any) -> RenderSummary:
     """Render a drive through a procedural city and write it as a sequence with ground truth boxes and maps.
 
     The same options give the same files. The models of this project were trained on seeds below 1,000,000 only. The
@@ -304,7 +296,6 @@ def render(
     Args:
         out: the sequence folder to write.
         options: the options; by default those of `RenderOptions`.
-        progress: called with each frame after it is written.
         changes: options by name, such as `seed=7` and `resolution=(800, 450)`.
 
     Raises:
@@ -312,27 +303,33 @@ def render(
         OutputError: `out` contains a sequence and `force` is false, or it cannot be written.
     """
     chosen = gather(RenderOptions, options, changes)
-    rig = rig_for_rendering(chosen.rig, chosen.resolution)
-    samples = chosen.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
-    drive = RenderedDrive(
-        chosen.seed, chosen.frames, chosen.rate_hz, rig, chosen.weather, supersampling=samples, threads=THREADS
+    drive = drive_of(chosen)
+    export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality)
+    return RenderSummary(Path(out), chosen.seed, chosen.frames, drive.rig.names, drive.weather.name)
+
+
+def drive_of(options: RenderOptions) -> RenderedDrive:
+    """The drive that `render` writes. Raises InputError as it does."""
+    rig = rig_for_rendering(options.rig, options.resolution)
+    samples = options.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
+    return RenderedDrive(
+        options.seed, options.frames, options.rate_hz, rig, options.weather, supersampling=samples, threads=THREADS
     )
-    export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
-    return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
 
 
-def export_drive(
-    drive: RenderedDrive,
-    folder: Path,
-    *,
-    force: bool = False,
-    quality: int = JPEG_QUALITY,
-    progress: Callable[[Frame], None] | None = None,
-) -> None:
-    """Render all frames of a drive and write them, with ego-motion at EGO_MOTION_HZ, ground truth boxes and maps.
+def export_drive(drive: RenderedDrive, folder: Path, *, force: bool = False, quality: int = JPEG_QUALITY) -> None:
+    """Render all frames of a drive and write them; see `export_frames`."""
+    for _ in export_frames(drive, folder, force=force, quality=quality):
+        pass
 
+
+def export_frames(
+    drive: RenderedDrive, folder: Path, *, force: bool = False, quality: int = JPEG_QUALITY
+) -> Iterator[Frame]:
+    """Render the frames of a drive, with ground truth boxes and maps, and write them; each when it is written.
+
+    At the end the ego-motion is written at EGO_MOTION_HZ.
     folder: the sequence folder. force: whether to replace a sequence in it. quality: JPEG quality, 1 to 100.
-    progress: called with each frame after it is written.
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
     with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
@@ -348,8 +345,7 @@ def export_drive(
                 ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
             )  # fmt: skip
             writer.write(frame)
-            if progress is not None:
-                progress(frame)
+            yield frame
     # The writer has written a pose for each frame. Replace them by denser ones, so that cameras may have time offsets.
     write_ego_motion(folder / "ego_motion.csv", motion)
 

@@ -1,4 +1,4 @@
-"""The numba kernels of `photo_looks`: photographic skies and textures over shaded images.
+"""The numba kernels of `material`: photographic skies and textures over shaded images.
 
 Images hold display values (sRGB bytes); a texture is a factor on them. Positions are in the world frame in metres.
 """
@@ -9,11 +9,11 @@ Images hold display values (sRGB bytes); a texture is a factor on them. Position
 import numpy as np
 
 from bevcli.jit import njit
-from bevcli.workshop.synth.material import TEXTURE_MEAN, TEXTURE_SIZE
 from bevcli.workshop.synth.mesh import Material
 from bevcli.workshop.synth.shading_kernels import pixel_ray
 
 GROUND, GLASS, GLOW, LEAVES = (int(m) for m in (Material.GROUND, Material.GLASS, Material.GLOW, Material.LEAVES))
+TEXTURE_SIZE, TEXTURE_MEAN = 256, 85  # pixels of a side; the value that leaves the brightness as it is
 TO_DISPLAY = 1 / 2.2  # exponent that turns a factor on the light into one on display values
 
 

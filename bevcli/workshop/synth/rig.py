@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, Distortion, default_ego_from_bev, fisheye_table
@@ -54,8 +55,6 @@ def lens_parts(camera: Camera) -> tuple[LensPart, ...]:
     Raises InputError where a lens that is not "kannala_brandt" sees more than about 75 degrees off its optical axis,
     where the model of a fisheye ends within the image at a smaller angle, and where the whole image would be black.
     """
-    from scipy.interpolate import RectBivariateSpline  # 0.2 s that other rigs do not need
-
     assert camera.distortion is not None
     u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
     some_u, some_v = (np.linspace(0, p[-1], max(len(p) // STEP, 4)) for p in (u, v))
@@ -109,9 +108,9 @@ def _part(camera: Camera, camera_from_part: Array, rays: Sequence[Array] | Array
         np.nan_to_num((axis * scale + shift).astype(np.float32), copy=False, nan=OUTSIDE)
         for axis, scale, shift in zip(rays, focal, offset, strict=True)
     )
-    given = columns >= 0
+    inside = columns >= 0
     used = np.zeros((height, width), np.uint8)
-    used[rows[given].astype(np.int64), columns[given].astype(np.int64)] = 1
+    used[rows[inside].astype(np.int64), columns[inside].astype(np.int64)] = 1
     needed = cv2.dilate(used, np.ones((2, 2), np.uint8), anchor=(1, 1))  # with the pixels at the right and below
     return LensPart(pinhole, columns, rows, needed.astype(np.uint8, copy=False))
 
@@ -147,11 +146,11 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
     Raises InputError where the file is wrong, or a camera has too wide a field of view for its lens model.
     """
     if rig is None:
-        where, chosen = "", nuscenes_like_rig()
+        source, chosen = "", nuscenes_like_rig()
     elif isinstance(rig, CameraRig):
-        where, chosen = "rig: ", rig
+        source, chosen = "rig: ", rig
     else:
-        where, chosen = f"{rig}: ", read_calibration(Path(rig))
+        source, chosen = f"{rig}: ", read_calibration(Path(rig))
     if size is not None:
         chosen = replace(chosen, cameras=tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in chosen.cameras))
     for camera in chosen.cameras:
@@ -159,10 +158,11 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
             try:
                 lens_parts(camera)
             except InputError as error:
-                raise InputError(f"{where}camera {camera.name}: {error}") from None
+                raise InputError(f"{source}camera {camera.name}: {error}") from None
     return chosen
 
 
+MATERIAL_FILES = ("models/*-*.npz", "skies/*.png", "textures/*-*.png")
 _STREAM = 0x7269_6773  # keeps the draws apart from those of the street with the same seed
 _CENTER_X_M = 1.4  # middle of the vehicle, ahead of the rear axle
 Range = tuple[float, float]
@@ -229,13 +229,22 @@ class RigDistribution:
 
         Raises InputError where the material's folder is missing or holds nothing of use.
         """
-        stated = astuple(self)[:-1] if self.varied_share else astuple(self)[:-2]  # older caches stay valid
+        values = astuple(self)[:-1] if self.varied_share else astuple(self)[:-2]  # older caches stay valid
         if self.material:
-            from bevcli.workshop.synth.material import material_files  # trimesh, which other rigs do not need
-
             files = material_files(self.material)
-            stated += tuple((path.parent.name, path.name, path.stat().st_size) for path in files)
-        return hashlib.sha256(repr(stated).encode()).hexdigest()[:8]
+            values += tuple((path.parent.name, path.name, path.stat().st_size) for path in files)
+        return hashlib.sha256(repr(values).encode()).hexdigest()[:8]
+
+
+def material_files(folder: str) -> list[Path]:
+    """The files of a folder that a `MaterialFolder` reads, in a fixed order. Raises InputError where there are none."""
+    files = [path for pattern in MATERIAL_FILES for path in sorted(Path(folder).glob(pattern))]
+    if not files:
+        found = "holds none of them" if Path(folder).is_dir() else "there is no such folder"
+        raise InputError(
+            f"{folder}: {found} (expected {', '.join(MATERIAL_FILES)}): correct `material` in [training.rigs]"
+        )
+    return files
 
 
 @dataclass(frozen=True)
@@ -284,8 +293,8 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
     cameras = []
     for index, yaw_deg in enumerate(yaws):
         spread = random.uniform(-1, 1)
-        own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
-        intrinsics = _intrinsics(image_size, own_fov, distribution, random)
+        camera_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
+        intrinsics = _intrinsics(image_size, camera_fov, distribution, random)
         around = np.radians(yaw_deg + random.uniform(-20, 20))  # on an ellipse around the middle of the vehicle
         x, y = _CENTER_X_M + radius * np.cos(around), 0.5 * radius * np.sin(around)
         position = (x, y, np.clip(height + random.uniform(-0.15, 0.15), *distribution.height_m))

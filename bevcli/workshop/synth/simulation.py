@@ -1,7 +1,7 @@
 """All actors of a drive: pedestrians, what stands at the roadside, driving vehicles; and the ego vehicle's motion."""
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 
 import numpy as np
@@ -11,8 +11,46 @@ from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth import traffic
 from bevcli.workshop.synth.catalog import Assets, Body, draw_body
 from bevcli.workshop.synth.city import DIRECTIONS, KERB_M, CityPlan, Line, Street, along, rounded_rectangle, side_of
-from bevcli.workshop.synth.density import Density
 from bevcli.workshop.synth.road_users import CYCLES, PERSON_NAMES
+
+TRAFFIC = {
+    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
+}  # fmt: skip
+PARKED = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
+
+
+@dataclass(frozen=True)
+class Density:
+    """Numbers of road users, and their mixture."""
+
+    vehicles: int = 22  # around the ego vehicle, which counts as a vehicle
+    bicycles: int = 6  # that drive around the ego vehicle
+    traffic: Mapping[str, float] = field(default_factory=lambda: TRAFFIC)  # class of driving vehicles -> share
+    parked: Mapping[str, float] = field(default_factory=lambda: PARKED)  # class -> share
+    filled: float = 0.55  # share of parking spaces that are taken
+    works: float = 0.27  # share of parking lanes (one side of a stretch) with road works
+    strollers: float = 4.5  # mean number for each block
+    crosser_s: float = 8.0  # mean time between people who cross at a junction, seconds
+
+
+def draw_density(rng: np.random.Generator) -> Density:
+    """A density from that of the default to a crowded street, with a larger share of cars."""
+    return Density(
+        int(rng.integers(20, 60)),
+        int(rng.integers(3, 9)),
+        _with_cars(TRAFFIC, float(rng.uniform(0.55, 0.85))),
+        _with_cars(PARKED, float(rng.uniform(0.72, 0.93))),
+        float(rng.uniform(0.5, 1.0)),
+        float(rng.choice([0.27, 0.1])),
+        float(rng.uniform(3, 9)),
+        float(rng.uniform(4, 10)),
+    )
+
+
+def _with_cars(mix: Mapping[str, float], cars: float) -> dict[str, float]:
+    """The mixture with another share of cars; the others keep their proportions."""
+    return {name: cars if name == "car" else share * (1 - cars) / (1 - mix["car"]) for name, share in mix.items()}
+
 
 STRIDE_M = 0.72  # distance after which the pose changes
 CROSSING_LINE_M = 3.2  # from the edge of the junction to the line on which people cross
