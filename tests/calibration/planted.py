@@ -34,15 +34,6 @@ def _with_lens(camera: Camera, lens: Distortion, zoom: float) -> Camera:
     return replace(camera, distortion=lens, intrinsics=camera.intrinsics * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
 
 
-class BlackImages(DerivedDrive):
-    """A drive with black images."""
-
-    def load(self, index: int) -> Frame:
-        frame = self.drive.load(index)
-        black = {name: replace(one, pixels_bgr=np.zeros_like(one.pixels_bgr)) for name, one in frame.images.items()}
-        return replace(frame, images=black)
-
-
 def wrong_rig(rig: CameraRig, camera: str, turn_deg: tuple[float, float, float], shift_m: tuple) -> CameraRig:
     """The rig with one camera turned about its own axes (right, down, forward) and shifted in the ego frame."""
     changed = []

@@ -31,8 +31,6 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
     view: world ray from pixel (3, 3), camera position (3,), angle of a pixel in radians.
     table: sRGB bytes of light from 0 to LIGHT_LIMIT.
     needed: (H, W) 0 for the pixels that stay as they are.
-
-    The function is long because its parts would exchange a dozen numbers for every pixel.
     """
     triangles, inverse_depth = buffer
     normals, albedo, material, facade, facades, pattern = surfaces
@@ -62,8 +60,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                 _put(image, v, u, a, table, table_scale)
                 continue
             px, py, pz = eye[0] + z * rx, eye[1] + z * ry, eye[2] + z * rz
-            distance = z * length
-            footprint = z * pixel_angle
+            footprint, far = z * pixel_angle, z * length / haze_m
             grain = 0.0
             if kind == GROUND:
                 along = footprint * length / max(-rz, 0.02 * length)
@@ -79,13 +76,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                 for c in range(3):
                     a[c] *= 0.35 + 0.65 * lamps
             else:
-                lit = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
-                if lit > 0:
-                    # Look up a point a little outside; otherwise surfaces shadow themselves.
-                    off = 0.02 + 1.6 * shadows[3] * (1.0 - lit)
-                    lit *= 1.0 - _shadow(shadows, px + off * nx, py + off * ny, pz + off * nz)
-                else:
-                    lit = 0.0
+                lit = _sunlit(shadows, to_sun, px, py, pz, nx, ny, nz)
                 up = 0.5 + 0.5 * nz
                 near_ground = 1.0
                 if t >= 0 and nz < 0.5:  # walls get less light from the sky near the ground
@@ -96,11 +87,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                 if kind == GLASS or kind == PAINT:  # noqa: SIM109  (faster in numba)
                     x, y, z = rx / length, ry / length, rz / length
                     _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, lit > 0.02, mirror, a)
-            far = distance / haze_m
-            veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # about 1 - exp(-far)
-            veil *= veil
-            for c in range(3):
-                a[c] += (haze[c] - a[c]) * veil
+            _veil(a, haze, far)
             _put(image, v, u, a, table, table_scale)
 
 
@@ -111,6 +98,25 @@ def pixel_ray(ray_from_image, u, v):
     ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
     rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]
     return rx, ry, rz, np.sqrt(rx * rx + ry * ry + rz * rz)
+
+
+@njit(nogil=True, error_model="numpy")
+def _sunlit(shadows, to_sun, x, y, z, nx, ny, nz):
+    """Share of the sunlight, 0 to 1, that a surface with the normal (nx, ny, nz) gets at a point."""
+    lit = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
+    if lit <= 0:
+        return 0.0
+    off = 0.02 + 1.6 * shadows[3] * (1.0 - lit)  # a point a little outside; otherwise surfaces shadow themselves
+    return lit * (1.0 - _shadow(shadows, x + off * nx, y + off * ny, z + off * nz))
+
+
+@njit(nogil=True, error_model="numpy")
+def _veil(color, haze, far):
+    """Mix the haze into a colour (3,). far: distance, in distances of the haze."""
+    veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # about 1 - exp(-far)
+    veil *= veil
+    for c in range(3):
+        color[c] += (haze[c] - color[c]) * veil
 
 
 @njit(nogil=True, inline="always")
