@@ -50,8 +50,8 @@ def texture(pixels: NDArray[Any], seen: NDArray[np.bool_] | None = None) -> NDAr
     smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), SMOOTHING)
     fine = smooth - _mean(smooth, seen)
     contrast = np.sqrt(np.maximum(_mean(fine**2, seen), 0)) + FLAT
-    found = np.clip(128 + 40 * fine / contrast, 0, 255).astype(np.uint8)
-    return found if seen is None else np.where(seen, found, np.uint8(128))
+    levels = np.clip(128 + 40 * fine / contrast, 0, 255).astype(np.uint8)
+    return levels if seen is None else np.where(seen, levels, np.uint8(128))
 
 
 def _mean(values: NDArray[Any], seen: NDArray[np.bool_] | None) -> NDArray[Any]:

@@ -126,7 +126,7 @@ def rays_of_road_points(geometry: GroupGeometry, ego_from_second: Array, group: 
     ego_from_second: (G, 4, 4) the cameras of the second images.
     """
     pose, motion, second = (
-        each[group] for each in (geometry.ego_from_camera_a, geometry.ego_b_from_ego_a, ego_from_second)
+        matrices[group] for matrices in (geometry.ego_from_camera_a, geometry.ego_b_from_ego_a, ego_from_second)
     )
     start, direction = pose[:, :3, 3], np.einsum("nij,nj->ni", pose[:, :3, :3], rays_a)
     normal = np.array([-geometry.slopes[0], -geometry.slopes[1], 1.0])

@@ -150,9 +150,9 @@ def _at(parameters: Parameters, terms: Items[Term], x: Array, *, curvature: bool
         for group, (start, end) in enumerate(pairwise(bounds)):
             if start == end:
                 continue
-            part = slopes[start:end].reshape(-1, slopes.shape[-1])
-            weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]
-            blocks[group] += factor * part.T @ weighted
+            rows = slopes[start:end].reshape(-1, slopes.shape[-1])
+            weighted = rows * np.repeat(weights[start:end], here.shape[1])[:, None]
+            blocks[group] += factor * rows.T @ weighted
             gradients[group] += weighted.T @ here[start:end].ravel()
     return Solution(x, columns, blocks, gradients)
 

@@ -76,21 +76,14 @@ def _small(image: Pixels) -> bytes:
 
 
 class WatchedDrive(DerivedDrive):
-    """A drive that keeps what is drawn of each frame that is loaded: the road from above, and its stated pose.
-
-    Attributes:
-        road: place -> JPEG of the road from above.
-        images: place -> camera -> JPEG of its small image; of MOST_SHOWN frames at most.
-        stated: place -> world_from_ego (4, 4); of a drive with poses.
-        view: the cells of the road in the images of the rig; None before a frame is loaded.
-    """
+    """A drive that keeps what is drawn of each frame that is loaded: the road from above, and its stated pose."""
 
     def __init__(self, sequence: Drive) -> None:
         super().__init__(sequence)
-        self.road: dict[int, bytes] = {}
-        self.images: dict[int, dict[str, bytes]] = {}
-        self.stated: dict[int, Array] = {}
-        self.view: GroundView | None = None
+        self.road: dict[int, bytes] = {}  # frame -> JPEG of the road from above
+        self.images: dict[int, dict[str, bytes]] = {}  # frame -> camera -> JPEG; of MOST_SHOWN frames at most
+        self.stated: dict[int, Array] = {}  # frame -> world_from_ego (4, 4); of a drive with poses
+        self.view: GroundView | None = None  # the road in the images of the rig; None before a frame is loaded
         self._every = -(-len(sequence.stamps) // MOST_SHOWN)
 
     def load(self, index: int) -> Frame:
@@ -107,22 +100,16 @@ class WatchedDrive(DerivedDrive):
     @property
     def stated_poses(self) -> list[Array] | None:
         """(F, 4, 4) of all frames; None for a drive without poses."""
-        return [self.stated[place] for place in range(len(self.stamps))] if self.stated else None
+        return [self.stated[index] for index in range(len(self.stamps))] if self.stated else None
 
 
 @dataclass(frozen=True)
 class StitchedRoad:
-    """The road along the way.
+    """The road along the way."""
 
-    Attributes:
-        image: (H, W, 3) RGB, white where it was not seen; the first row has the largest y.
-        x_range_m: of the image, in the world frame.
-        y_range_m: the same.
-    """
-
-    image: Pixels
-    x_range_m: tuple[float, float]
-    y_range_m: tuple[float, float]
+    image: Pixels  # (H, W, 3) RGB, white where it was not seen; the first row has the largest y
+    x_range_m: tuple[float, float]  # of the image, in the world frame
+    y_range_m: tuple[float, float]  # the same
 
     def pixels(self, poses: Array) -> Array:
         """(F, 2) column and row of each of some poses (F, 4, 4), world_from_ego."""
@@ -139,10 +126,10 @@ def stitched(drive: WatchedDrive, poses: Array) -> StitchedRoad:
     width, height = (int(size) for size in np.ceil((high - low) / cell))
     image, best = np.full((height, width, 3), 255, np.uint8), np.zeros((height, width), np.float32)
     pixel_from_world = np.array([[1 / cell, 0, -low[0] / cell], [0, -1 / cell, high[1] / cell], [0, 0, 1]])
-    for place in sorted(drive.road):
-        road = np.asarray(cv2.imdecode(np.frombuffer(drive.road[place], np.uint8), cv2.IMREAD_COLOR_RGB))
+    for index in sorted(drive.road):
+        road = np.asarray(cv2.imdecode(np.frombuffer(drive.road[index], np.uint8), cv2.IMREAD_COLOR_RGB))
         weight = drive.view.weight * (road.max(-1) > 4)  # where an image is missing it is black
-        pixel_from_patch = pixel_from_world @ _world_from_patch(poses[place])
+        pixel_from_patch = pixel_from_world @ _world_from_patch(poses[index])
         corners = pixel_from_patch @ np.array([[0, SIDE, 0, SIDE], [0, 0, SIDE, SIDE], [1, 1, 1, 1]])
         x0, y0 = np.maximum(np.floor(corners[:2].min(1)), 0).astype(int)
         x1, y1 = np.minimum(np.ceil(corners[:2].max(1)), (width, height)).astype(int)
@@ -203,17 +190,17 @@ def _motion_of(motion: MeasuredMotion, stated: Sequence[Array]) -> MeasuredMotio
 
 def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> None:
     axes.imshow(road.image, extent=(*road.x_range_m, *road.y_range_m), interpolation="bilinear")
-    places = motion.poses[:, :2, 3]
+    positions = motion.poses[:, :2, 3]
     if stated is not None:
         moved = np.stack([inverse(stated[0]) @ pose for pose in stated])[:, :2, 3]
         axes.plot(*moved.T, color=STATED, linewidth=3.5, alpha=0.6, label="stated")
-    axes.plot(*places.T, color=WAY, linewidth=1.5, marker="o", markersize=2.5, label="measured")
+    axes.plot(*positions.T, color=WAY, linewidth=1.5, marker="o", markersize=2.5, label="measured")
     guessed = [index for index, step in enumerate(motion.steps) if step.reason]
     if guessed:
         for index in guessed:
-            axes.plot(*places[index : index + 2].T, color=GUESSED, linewidth=3)
+            axes.plot(*positions[index : index + 2].T, color=GUESSED, linewidth=3)
         axes.plot([], [], color=GUESSED, linewidth=3, label="not measured")
-    axes.plot(*places[0], marker="s", color="black", markersize=6)
+    axes.plot(*positions[0], marker="s", color="black", markersize=6)
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.legend(loc="best", fontsize=9)

@@ -35,10 +35,10 @@ def write_recording(
             for part, text, color, width in SERIES:
                 style = rr.SeriesLines(colors=color, widths=width, names=text)
                 stream.log(f"curves/{name}/{part}", style, static=True)
-        for place, stamp in enumerate(drive.stamps):
+        for index, stamp in enumerate(drive.stamps):
             stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
             stream.set_time(entities.TIME_TIMELINE, duration=(stamp.timestamp_ns - drive.stamps[0].timestamp_ns) / 1e9)
-            _log_frame(stream, motion, drive, road, place)
+            _log_frame(stream, motion, drive, road, index)
 
 
 def _layout(drive: WatchedDrive, road: StitchedRoad) -> Layout:

@@ -72,34 +72,26 @@ def end_deviations(motion: MeasuredMotion) -> tuple[float, float]:
     such as of a height, which is the same in all steps; the rest is independent.
     """
     poses, end = motion.poses, motion.poses[-1][:3, 3]
-    own, common = np.zeros(6), np.zeros((6, 6))  # of the place and the rotation vector, world frame
+    independent, common = np.zeros(6), np.zeros((6, 6))  # of the place and the rotation vector, world frame
     for pose, following, step in zip(poses, poses[1:], motion.steps, strict=False):
         x, y, z = end - following[:3, 3]
         cross, turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), pose[:3, :3]
         gain = np.block([[-cross @ turn, turn], [turn, np.zeros((3, 3))]])
-        own += np.diag(gain @ step.covariance @ gain.T)
+        independent += np.diag(gain @ step.covariance @ gain.T)
         common += gain @ np.linalg.cholesky(step.covariance + 1e-18 * np.eye(6))
-    variances = (1 - COMMON) * own + COMMON * (common**2).sum(-1)
+    variances = (1 - COMMON) * independent + COMMON * (common**2).sum(-1)
     return float(np.sqrt(variances[:3].sum())), float(np.degrees(np.sqrt(variances[3:].sum())))
 
 
 @dataclass(frozen=True)
 class StatedDifference:
-    """The measured motion against the poses that the drive states.
+    """The measured motion against the poses that the drive states."""
 
-    Attributes:
-        end_m: distance between both ends of the way, where both begin at the same pose.
-        end_deg: angle between both last poses.
-        length_m: length of the stated way.
-        steps_m: (F - 1,) difference of each step, metres.
-        steps_deg: (F - 1,) the same of its rotation, degrees.
-    """
-
-    end_m: float
-    end_deg: float
-    length_m: float
-    steps_m: Array
-    steps_deg: Array
+    end_m: float  # distance between both ends of the way, where both begin at the same pose
+    end_deg: float  # angle between both last poses
+    length_m: float  # length of the stated way
+    steps_m: Array  # (F - 1,) difference of each step, metres
+    steps_deg: Array  # (F - 1,) the same of its rotation, degrees
 
     def text(self) -> str:
         """One line."""
@@ -126,8 +118,8 @@ def against_stated(motion: MeasuredMotion, stated: Items[Array]) -> StatedDiffer
         end_m=float(np.linalg.norm(end[:3, 3])),
         end_deg=float(np.linalg.norm(_turn_deg(end))),
         length_m=float(sum(np.linalg.norm(step[:3, 3]) for step in steps)),
-        steps_m=np.array([np.linalg.norm(each[:3, 3]) for each in apart]),
-        steps_deg=np.array([np.linalg.norm(_turn_deg(each)) for each in apart]),
+        steps_m=np.array([np.linalg.norm(difference[:3, 3]) for difference in apart]),
+        steps_deg=np.array([np.linalg.norm(_turn_deg(difference)) for difference in apart]),
     )
 
 
@@ -174,13 +166,15 @@ def report_text(motion: MeasuredMotion, stated: StatedDifference | None = None, 
         ("not measured", _reasons(motion) or "no step"),
     ]
     if stated is not None:
-        rows += [("stated poses", stated.text()), *(("", f"{each.severity}: {each.line}") for each in findings)]
+        rows.append(("stated poses", stated.text()))
+        rows += [("", f"{finding.severity}: {finding.line}") for finding in findings]
     return "\n".join([motion.name, aligned(rows, left=(0, 1))])
 
 
 def to_json(motion: MeasuredMotion, stated: StatedDifference | None = None, findings: Items[Finding] = ()) -> str:
     """The content of report.json. findings: about the stated poses."""
     seconds, length, (end_m, end_deg) = seconds_of(motion), lengths_m(motion), end_deviations(motion)
+    comparison = stated and {**stated.to_dict(), "findings": [asdict(finding) for finding in findings]}
     content = {
         "drive": motion.name,
         "length_m": float(length.sum()),
@@ -189,7 +183,7 @@ def to_json(motion: MeasuredMotion, stated: StatedDifference | None = None, find
         "end_deviation_m": end_m,
         "end_deviation_deg": end_deg,
         "not_measured": dict(not_measured(motion)),
-        "stated": None if stated is None else {**stated.to_dict(), "findings": [asdict(each) for each in findings]},
+        "stated": comparison,
         "steps": [_entry(motion, index) for index in range(len(motion.steps))],
     }
     return json.dumps(content, indent=1, ensure_ascii=False)

@@ -42,11 +42,11 @@ def distance_votes(
             part = np.s_[row : row + TILE, column : column + TILE]
             if a.seen[part].mean() < LEAST_SEEN or a.texture[part].std() < LEAST_CONTRAST:
                 continue
-            found = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[part]), cv2.TM_CCOEFF_NORMED).max(0)
+            alike = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[part]), cv2.TM_CCOEFF_NORMED).max(0)
             at = column - shifts
             inside = (at >= 0) & (at <= last)
             usable = inside & (covered[0, at.clip(0, last)] >= LEAST_SEEN)
-            correlations.append(np.where(usable, found[at.clip(0, last)], np.nan))
+            correlations.append(np.where(usable, alike[at.clip(0, last)], np.nan))
             weights.append(np.exp(-((beside / WAY_M) ** 2)))
     if not correlations:
         return distances, np.zeros(len(shifts))

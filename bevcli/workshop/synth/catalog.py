@@ -252,10 +252,10 @@ def _foliage(rng: np.random.Generator) -> mesh.Finish:
 def _crumpled(crown: mesh.Mesh, rng: np.random.Generator) -> mesh.Mesh:
     """Move the corners of a crown at random, shared corners together, and vary the brightness of its faces."""
     points = crown.faces.reshape(-1, 3)
-    unique, where = np.unique(np.round(points, 3), axis=0, return_inverse=True)
+    unique, corner_of = np.unique(np.round(points, 3), axis=0, return_inverse=True)
     middle = unique.mean(0)
     crumpled = middle + (unique - middle) * rng.uniform(0.82, 1.2, (len(unique), 1))
-    faces = crumpled[where.reshape(-1)].reshape(-1, 3, 3).astype(np.float32)
+    faces = crumpled[corner_of.reshape(-1)].reshape(-1, 3, 3).astype(np.float32)
     tone = rng.uniform(0.72, 1.25, (len(faces), 1)).astype(np.float32)
     return mesh.Mesh(faces, crown.albedo * tone, crown.material)
 

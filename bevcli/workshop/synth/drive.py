@@ -270,21 +270,13 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class RenderSummary:
-    """Summary of the sequence that `render` has written.
+    """Summary of the sequence that `render` has written."""
 
-    Attributes:
-        folder: the sequence folder.
-        seed: seed of the drive.
-        frames: number of frames.
-        cameras: names of the cameras.
-        weather: name of the weather.
-    """
-
-    folder: Path
-    seed: int
-    frames: int
-    cameras: tuple[str, ...]
-    weather: str
+    folder: Path  # the sequence folder
+    seed: int  # of the drive
+    frames: int  # number of frames
+    cameras: tuple[str, ...]  # their names
+    weather: str  # name of the weather
 
 
 def render(out: str | Path, options: RenderOptions | None = None, **changes: Any) -> RenderSummary:

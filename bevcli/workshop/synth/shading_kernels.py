@@ -47,11 +47,11 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                 continue
             rx, ry, rz, length = pixel_ray(ray_from_image, u, v)
             t = triangles[v, u]
-            kind = GROUND
+            surface = GROUND
             nx, ny, nz = 0.0, 0.0, 1.0
             if t >= 0:
                 z = 1.0 / inverse_depth[v, u]
-                kind = material[t]
+                surface = material[t]
                 nx, ny, nz = normals[t, 0], normals[t, 1], normals[t, 2]
             elif rz < -1e-4 * length:
                 z = -eye[2] / rz
@@ -62,17 +62,17 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
             px, py, pz = eye[0] + z * rx, eye[1] + z * ry, eye[2] + z * rz
             footprint, far = z * pixel_angle, z * length / haze_m
             grain = 0.0
-            if kind == GROUND:
+            if surface == GROUND:
                 along = footprint * length / max(-rz, 0.02 * length)
                 grain = _ground(ground, px, py, footprint, along, rx, ry, a)
-            elif kind == FACADE:
+            elif surface == FACADE:
                 if _facade(facades[facade[t]], px, py, pz, footprint, lamps, a):
-                    kind = GLASS
+                    surface = GLASS
             else:
                 a[0], a[1], a[2] = albedo[t, 0], albedo[t, 1], albedo[t, 2]
-            if pattern[0] > 0 and kind != GROUND:
+            if pattern[0] > 0 and surface != GROUND:
                 grain = _pattern(pattern, ground[2], px, py, pz, footprint)
-            if kind == GLOW:
+            if surface == GLOW:
                 for c in range(3):
                     a[c] *= 0.35 + 0.65 * lamps
             else:
@@ -84,9 +84,9 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
                 for c in range(3):
                     a[c] *= sun[c] * lit + near_ground * (sky[c] * up + bounce[c] * (1.0 - up))
                     a[c] *= 1.0 + grain
-                if kind == GLASS or kind == PAINT:  # noqa: SIM109  (faster in numba)
+                if surface == GLASS or surface == PAINT:  # noqa: SIM109  (faster in numba)
                     x, y, z = rx / length, ry / length, rz / length
-                    _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, lit > 0.02, mirror, a)
+                    _reflect(x, y, z, nx, ny, nz, surface, light, to_sun, clouds, lit > 0.02, mirror, a)
             _veil(a, haze, far)
             _put(image, v, u, a, table, table_scale)
 

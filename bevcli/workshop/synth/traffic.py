@@ -122,20 +122,20 @@ def _acceleration(
     free = strongest * (1 - (speed / max(limit, 0.3)) ** 4) if speed <= limit else max(-2.2, (limit - speed) * 2.0)
     corridor = 0.9 if vehicle.bicycle else CORRIDOR_M
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
-    wanted = free
+    acceleration = free
     if gap < np.inf:
         lead = 0.0
         if other >= 0:  # the speed counts if the other vehicle drives in about the same direction, within 60 degrees
             yaw = vehicles[other].route.yaw_at(vehicles[other].front)
             lead = vehicles[other].speed if np.cos(route.yaw_at(vehicle.front) - yaw) > 0.5 else 0.0
-        wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
+        acceleration = min(acceleration, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
         room = crossing.stop - vehicle.front
         needed = speed**2 / (2 * max(room, 0.1))
         if needed < 3.0 and not _may_enter(vehicle, crossing, vehicles, signals, time_s):
-            wanted = min(wanted, _follow(speed, limit, strongest, room + 1.4, 0.0))
-    return float(np.clip(wanted, HARDEST, strongest))
+            acceleration = min(acceleration, _follow(speed, limit, strongest, room + 1.4, 0.0))
+    return float(np.clip(acceleration, HARDEST, strongest))
 
 
 def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed: float) -> float:
@@ -186,19 +186,19 @@ def points_between(points: Array, positions: Array, start: float, end: float, co
 
 @njit(nogil=True)
 def _nearest_in_way(
-    points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, own: int, corridor: float
+    points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, owner: int, corridor: float
 ) -> tuple[float, int]:
     """Find the first obstacle ahead on a route.
 
     points: (P, 2) of the route. positions: (P,) along it, metres. front: start of the search, metres.
     obstacles: (O, 2). owners: (O,) index of the vehicle that an obstacle point belongs to, -1 for people.
-    own: index whose points are ignored. corridor: half the width of the search, metres.
+    owner: index whose points are ignored. corridor: half the width of the search, metres.
     Returns the distance in metres and the owner; infinity and -1 where the road is free.
     """
     squared = corridor * corridor
     way = points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
     reach = (LOOK_AHEAD_M + 5.0) ** 2
-    near = [k for k in range(obstacles.shape[0]) if owners[k] != own
+    near = [k for k in range(obstacles.shape[0]) if owners[k] != owner
             and (obstacles[k, 0] - way[0, 0]) ** 2 + (obstacles[k, 1] - way[0, 1]) ** 2 < reach]  # fmt: skip
     for i in range(LOOK_STEPS):
         for k in near:
