@@ -77,6 +77,7 @@ def test_true_boxes_stay_where_they_are_seen_from_the_vehicle(measuring):
         a, b = (each.ground_truth.transformed(inverse(each.world_from_ego.matrix)) for each in (frame, other))
         assert a.centers == pytest.approx(b.centers, abs=1e-6)
         assert a.velocities == pytest.approx(b.velocities, abs=1e-6, nan_ok=True)
+        assert np.linalg.norm(frame.ground_truth.centers - other.ground_truth.centers, axis=-1).min() > 1
 
 
 def test_frames_between_those_that_are_used_are_measured_too(folder, measuring):
