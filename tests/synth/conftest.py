@@ -1,11 +1,13 @@
-"""Fixtures of the rendered world: the meshes, built once, and one small drive."""
+"""Fixtures of the rendered world: the meshes, built once, and two small drives."""
+
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("numba")
 
 from bevcli.workshop.synth.catalog import Assets
-from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
+from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 
 
@@ -23,3 +25,17 @@ def drive(assets: Assets) -> RenderedDrive:
 @pytest.fixture(scope="session")
 def frame(drive: RenderedDrive) -> RenderedFrame:
     return drive.frame(9)
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Path]:
+    """Seed 5, and the folder that it is written into. Images of 160x90."""
+    folder = tmp_path_factory.mktemp("rendered") / "drive"
+    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
+    export_drive(drive, folder)
+    return drive, folder
+
+
+@pytest.fixture(scope="session")
+def rendered(written: tuple[RenderedDrive, Path]) -> RenderedFrame:
+    return written[0].frame(1)

@@ -16,25 +16,16 @@ from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, read_lines
 from bevcli.workshop.synth.catalog import Assets
-from bevcli.workshop.synth.drive import RenderedDrive, export_drive, render as render_sequence
+from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive, render as render_sequence
 from bevcli.workshop.synth.looks import WEATHER_NAMES
 from bevcli.workshop.synth.options import Weather, parse_resolution
 from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Path]:
-    folder = tmp_path_factory.mktemp("rendered") / "drive"
-    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
-    export_drive(drive, folder)
-    return drive, folder
-
-
-def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDrive, Path]):
-    drive, folder = written
-    sequence = open_sequence(folder)
+def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDrive, Path], rendered: RenderedFrame):
+    sequence = open_sequence(written[1])
     assert [stamp.index for stamp in sequence.stamps] == [0, 1]
-    read, rendered = sequence.load(1), drive.frame(1)
+    read = sequence.load(1)
     assert sequence.facts.rendered
     assert read.stamp.timestamp_ns == rendered.stamp.timestamp_ns
     for name, image in rendered.images.items():
@@ -47,11 +38,10 @@ def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDri
     np.testing.assert_allclose(read.world_from_ego.matrix, rendered.world_from_ego.matrix, atol=1e-9)
 
 
-def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive, Path]):
+def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive, Path], rendered: RenderedFrame):
     drive, folder = written
     lines = read_lines(folder / LINES_FILE)
     assert (lines.frame_of_reference, lines.classes, len(lines.frames)) == ("world", LINE_CLASSES, 2)
-    rendered = drive.frame(1)
     world_from_bev = rendered.world_from_ego.matrix @ drive.rig.ego_from_bev
     assert len(lines.frames[1].lines) == len(rendered.lines) > 3
     for found, expected in zip(lines.frames[1].lines.points, rendered.lines.points, strict=True):
