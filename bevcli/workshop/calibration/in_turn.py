@@ -17,7 +17,7 @@ from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, calibration_steps
 from bevcli.workshop.calibration.estimates import RigEstimate
 from bevcli.workshop.calibration.views import steps_reached
-from bevcli.workshop.odometry.drives import MeasuredDrive, at_most_rate
+from bevcli.workshop.odometry.drives import at_most_rate
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.workshop.odometry.report import check_measured
 
@@ -45,7 +45,8 @@ def calibrate_in_turn(drive: Drive, options: CalibrateOptions) -> Iterator[Calib
             yield from steps_reached(MOTION_STEPS, len(steps), total)
         motion = MeasuredMotion.of(part, steps)
         check_measured(motion)
-        for result in calibration_steps(DriveView(MeasuredDrive(drive, motion), rig=drive.rig), options):
+        moving = DriveView(drive, rig=drive.rig, motions={drive.stamps[0].scene: motion.ego_motion})
+        for result in calibration_steps(moving, options):
             if result is None:
                 yield None
         assert result is not None  # the last one
