@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
@@ -479,12 +480,12 @@ class Prediction:
         """The ground below the bev frame."""
         return Ground(self.stamp, self.ego_from_bev, self.world_from_ego)
 
-    @property
+    @cached_property
     def boxes_ego(self) -> Boxes3D:
         """The boxes in the ego frame at the frame's time."""
         return self.boxes.transformed(self.ego_from_bev)
 
-    @property
+    @cached_property
     def boxes_world(self) -> Boxes3D:
         """The boxes in the world frame. Velocities are over ground in every frame; only their direction changes."""
         return self.boxes.transformed(self.world_from_ego.matrix @ self.ego_from_bev)

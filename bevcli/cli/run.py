@@ -61,8 +61,7 @@ def run(
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
         from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
         from bevcli.cli.stop_signals import StopSignals
-        from bevcli.rig.sequence_checks import CheckedDrive
-        from bevcli.runs.run_into_folder import run_into_folder
+        from bevcli.runs.run_into_folder import run_in_folder
         from bevcli.sequences.format import format_of
         from bevcli.sequences.open import open_sequence
         from bevcli.workshop.checks.standing_check import IMAGES_MOVE, StandingCheck
@@ -80,38 +79,31 @@ def run(
         from bevcli.workshop.calibration.core_options import corrected
 
         drive = corrected(drive)
-    drive = CheckedDrive(drive, shlex.quote(str(sequence)))
-    loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "", report=print_note)
+    probes = "--probe" if recording.probes else ""
+    loaded = loaded.in_engine(drive.rig, drive, parts=probes, report=print_note)
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
-    view = None
+    live = None
     if output.live:
         from bevcli.viewer.web import LiveView
 
-        view = LiveView()
-
+        live = LiveView()
     standing = StandingCheck() if source.ego_motion == "static" and run_options.temporal else None
-
-    def show(frame: "Frame", prediction: "Prediction") -> None:
-        for warning in _frame_warnings(frame, prediction):
-            progress.message(f"warning: {warning}")
-        if standing is not None and prediction.started_anew is None and standing.images_move(frame):
-            progress.message(f"warning: frame {frame.stamp.index}: {IMAGES_MOVE}")
-        progress.advance()
-
-    notes = [*drive.input_errors, *_run_notes(loaded, drive, live=output.live)]
-    with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
-        summary = run_into_folder(
-            loaded,
-            drive,
-            out,
-            replace(run_options, recording=recording),
-            live=view,
-            force=output.force,
-            resume=output.resume,
-            after_frame=show,
-            resumed=progress.skip,
-            should_stop=signals.received,
-        )
+    options, path = replace(run_options, recording=recording), shlex.quote(str(sequence))
+    files = run_in_folder(loaded, drive, out, options, live=live, force=output.force, resume=output.resume, source=path)
+    with StopSignals("frame") as signals, files as running:
+        notes = [*running.summary.input_errors, *_run_notes(loaded, drive, live=output.live)]
+        with Progress(len(drive.stamps), "frames", notes) as progress:
+            if running.done:
+                progress.skip(running.done)
+            for frame, prediction in running.frames:
+                for warning in _frame_warnings(frame, prediction):
+                    progress.message(f"warning: {warning}")
+                if standing is not None and prediction.started_anew is None and standing.images_move(frame):
+                    progress.message(f"warning: frame {frame.stamp.index}: {IMAGES_MOVE}")
+                progress.advance()
+                if signals.received():
+                    break
+    summary = running.summary
     say(summary.table())
     if score_without_labels:
         from bevcli.workshop.trust.estimate import estimate_of_run

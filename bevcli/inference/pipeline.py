@@ -7,12 +7,12 @@ with one wait, which may come after the next frame was launched, and are checked
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import fields, replace
 from itertools import islice, pairwise
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -64,47 +64,40 @@ def read_ahead(
                 threaded.shutdown(wait=False, cancel_futures=True)
 
 
-class WriteBehind(AbstractContextManager["WriteBehind[S]"], Generic[S]):
-    """`with WriteBehind(work) as writer: writer.put(item)`: work(item) of every item, in order, in a background thread.
+def write_behind(items: Iterable[T], write: Callable[[T], S], depth: int = QUEUE) -> Generator[S]:
+    """Yields write(item) for every item, in order, computed in a background thread while the next items are made.
 
-    Nothing more is done once `work` has returned False or raised. `put` or the end of the block raises its exception.
-    The end of the block waits for all items, also after an error in the block.
-    Raises WaitError if an item takes more than WRITING_TIMEOUT_S.
+    After an error in `items`, or where the caller stops early, all items that were made are still written. Nothing is
+    written after an error in `write`. Raises WaitError if an item takes more than WRITING_TIMEOUT_S.
+
+    depth: items that may wait, beside the one that is written.
     """
+    pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
+    pending = deque[Future[S]]()
 
-    def __init__(self, work: Callable[[S], bool], depth: int = QUEUE) -> None:
-        """depth: items that may wait, beside the one that is worked on."""
-        self._work, self._depth, self._goes_on = work, depth, True
-        self._pending: deque[Future[None]] = deque()
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
+    def write_after(before: Future[S] | None, item: T) -> S:
+        if before is not None:
+            before.result()  # raises its error
+        return write(item)
 
-    def put(self, item: S) -> bool:
-        """Add an item, and wait while too many of them are pending. False once `work` has returned False."""
-        self._pending.append(self._pool.submit(self._write, item))
-        self._finish(1 + self._depth)
-        return self._goes_on
+    def written(kept: int) -> Iterator[S]:
+        while pending and (len(pending) > kept or pending[0].done()):
+            yield result_within(pending.popleft(), WRITING_TIMEOUT_S, "writing a frame")
 
-    def __exit__(self, *_error: object) -> None:
-        try:
-            self._finish(0)
-        finally:
-            for task in self._pending:
-                task.cancel()
-            wait(self._pending, WRITING_TIMEOUT_S)
-            self._pool.shutdown(wait=False)
-
-    def _write(self, item: S) -> None:
-        try:
-            self._goes_on = self._goes_on and self._work(item)
-        except BaseException:
-            self._goes_on = False
-            raise
-
-    def _finish(self, allowed: int) -> None:
-        """Wait until at most `allowed` items are pending. An exception of a finished item is raised."""
-        while self._pending and (len(self._pending) > allowed or self._pending[0].done()):
-            result_within(self._pending[0], WRITING_TIMEOUT_S, "writing a frame")
-            self._pending.popleft()
+    last: Future[S] | None = None
+    try:
+        for item in items:
+            last = pool.submit(write_after, last, item)
+            pending.append(last)
+            yield from written(1 + depth)
+        yield from written(0)
+    except Exception:
+        yield from written(0)
+        raise
+    finally:
+        for _ in written(0):
+            pass
+        pool.shutdown(wait=False)
 
 
 def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:

@@ -231,27 +231,35 @@ class Runner:
 
         The next frame may be launched before a frame is finished, see `overlap`; its errors are raised afterwards.
         """
-        before, begun = state or RunnerState(), deque[BegunStep]()
+        state, frames = state or RunnerState(), self.frames(sequence, indices, preprocessor)
+        if self.overlap:
+            yield from self._overlapped(frames, state)
+            return
+        for prepared, upcoming in frames:
+            state, prediction = self.finish(self.begin(state, prepared, upcoming), state.tracks)
+            yield prepared.frame, prediction, state
 
-        def finished(kept: int) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
-            nonlocal before
-            while len(begun) > kept:
-                step, *later = begun
-                begun.clear()  # an error in this step is the end
-                before, prediction = self.finish(step, before.tracks)
-                yield step.prepared.frame, prediction, before
-                if prediction.not_finite:  # the next one was begun with its history
-                    later = [self.begin(before, each.prepared, each.upcoming) for each in later]
-                begun.extend(later)
-
-        try:
-            for prepared, upcoming in self.frames(sequence, indices, preprocessor):
-                begun.append(self.begin(begun[-1].after if begun else before, prepared, upcoming))
-                yield from finished(self.overlap)
-        except Exception:
-            yield from finished(0)
-            raise
-        yield from finished(0)
+    def _overlapped(
+        self, frames: Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]], state: RunnerState[Any]
+    ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
+        """As `run`. Each frame but the first is launched before the frame before it is finished."""
+        begun: BegunStep | None = None
+        is_last = False
+        while not is_last:
+            following, error = None, None
+            try:
+                if (frame := next(frames, None)) is not None:
+                    following = self.begin(begun.after if begun else state, *frame)
+            except Exception as raised:  # after the frame before it
+                error = raised
+            if begun is not None:
+                state, prediction = self.finish(begun, state.tracks)
+                yield begun.prepared.frame, prediction, state
+                if following is not None and prediction.not_finite:  # it was begun with a history that is not finite
+                    following = self.begin(state, following.prepared, following.upcoming)
+            if error is not None:
+                raise error
+            begun, is_last = following, following is None
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""

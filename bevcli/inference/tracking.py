@@ -130,7 +130,9 @@ def track(
         return state, prediction
     state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
     columns = {name: getattr(tracked, name) for name in ("instances", "track_scores", "duplicates")}
-    return state, replace(prediction, boxes=replace(prediction.boxes, **columns))
+    prediction = replace(prediction, boxes=replace(prediction.boxes, **columns))
+    vars(prediction)["boxes_world"] = tracked  # the cached property: boxes are turned once a frame
+    return state, prediction
 
 
 def step(

@@ -1,6 +1,6 @@
 """All checks of a sequence: its rig, in their order, and ego-motion (units, jumps, axes).
 
-`CheckedDrive` runs the cheap ones before a run.
+`input_errors` runs the cheap ones before a run.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from bevcli.findings import Finding, errors_of
-from bevcli.frame import DerivedDrive, Drive, FrameStamp
+from bevcli.frame import Drive, FrameStamp
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
@@ -32,29 +32,23 @@ JUMP_FACTOR = 5.0  # a step this much faster than the median is a jump
 CHECKED_POSES = 5000  # before a run: of a longer drive, every second, third, … pose is checked
 
 
-class CheckedDrive(DerivedDrive):
-    """A drive that was checked once: the errors of `check_calibration` that need no images and no BEV grid.
+def input_errors(drive: Drive, source: str = "SEQUENCE") -> tuple[str, ...]:
+    """One line for each mistake in a drive's rig and ego-motion that is seen without images and BEV grid.
 
     source: the drive's path, for the command that each line names.
-
-    Attributes:
-        input_errors: one line for each mistake in the drive's rig and ego-motion; none where they are plausible.
     """
-
-    def __init__(self, drive: Drive, source: str = "SEQUENCE") -> None:
-        super().__init__(drive)
-        findings = errors_of(rig_findings(drive.rig))
-        motion, stamps = drive.ego_motion, drive.stamps
-        if motion is not None and stamps:
-            times = motion.timestamps_ns
-            during = np.flatnonzero((times >= stamps[0].timestamp_ns) & (times <= stamps[-1].timestamp_ns))
-            checked = during[:: 1 + len(during) // CHECKED_POSES]
-            findings += errors_of(check_scenes(motion.of_rows(checked), stamps))
-        first = {(finding.code, finding.camera): finding for finding in reversed(findings)}  # scenes repeat a mistake
-        self.input_errors = tuple(
-            f"error in the input: {finding.line}; `bevcli project-debug {source}` says more"
-            for finding in reversed(first.values())
-        )
+    findings = errors_of(rig_findings(drive.rig))
+    motion, stamps = drive.ego_motion, drive.stamps
+    if motion is not None and stamps:
+        times = motion.timestamps_ns
+        during = np.flatnonzero((times >= stamps[0].timestamp_ns) & (times <= stamps[-1].timestamp_ns))
+        checked = during[:: 1 + len(during) // CHECKED_POSES]
+        findings += errors_of(check_scenes(motion.of_rows(checked), stamps))
+    first = {(finding.code, finding.camera): finding for finding in reversed(findings)}  # scenes repeat a mistake
+    return tuple(
+        f"error in the input: {finding.line}; `bevcli project-debug {source}` says more"
+        for finding in reversed(first.values())
+    )
 
 
 def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[Finding]:

@@ -2,8 +2,9 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,9 +16,13 @@ from bevcli.frame import Drive, Frame, FrameResult, Prediction, result_of
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.recording.writer import LiveSink, Recording, RecordingState
+from bevcli.inference.runner import RunnerState
+from bevcli.model.upload import tensors_in
+from bevcli.recording.writer import LiveSink, Recording
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
+from bevcli.runs.state import FilesState, RunState, save_state
+from bevcli.runs.summary import RunSummary
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.boxes_table import CsvWriter
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
@@ -31,62 +36,52 @@ if TYPE_CHECKING:
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
+SHARE = 0.02  # of the run's time that saving may take
+ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long it takes
 Growing = TypeVar("Growing", bound=GrowingFile)
 
 
-@dataclass(frozen=True)
-class FilesState:
-    """Sizes and states with which the files of an interrupted run go on.
-
-    Attributes:
-        recording: of recording.rrd.
-        sizes: name -> bytes of each other file that grows.
-        map_frames: indices of the frames that have a map.
-        bev_frames: indices of the frames that have BEV features.
-    """
-
-    recording: RecordingState
-    sizes: Mapping[str, int]
-    map_frames: tuple[int, ...]
-    bev_frames: tuple[int, ...]
-
-
 class RunFiles:
-    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, tracks, maps, BEV features
-    and further results."""
+    """`with RunFiles(…) as files: files.write(step)`: recording, boxes, tracks, maps, BEV features, further results.
+
+    A frame that is written is counted, and the state is saved as often as SHARE of the run's time allows. The end of
+    the block, whatever causes it, saves the state after the last whole frame.
+    """
 
     def __init__(
         self,
         folder: RunFolder,
-        sequence: Drive,
+        drive: Drive,
         model: Model,
         options: RunOptions,
+        summary: RunSummary,
+        state: RunState[Any],
         live: LiveSink | None = None,
-        resume: FilesState | None = None,
-        *,
-        done: int = 0,
     ) -> None:
-        """done: number of frames that the files of `resume` hold. Raises OutputError where these were changed."""
-        self._folder, self._out, self._resume = folder, folder.path, resume
-        self._sequence, self._model, self._options, self._live = sequence, model, options, live
+        """state: from which the files go on. Raises OutputError where files of an interrupted run were changed."""
+        self._folder, self._out, self._resume, self._fingerprint = folder, folder.path, state.files, state.fingerprint
+        self._drive, self._model, self._options, self._live = drive, model, options, live
+        self._summary = summary
+        self._began = self._frame_began = time.perf_counter()
+        self._saving_s = 0.0
+        self._after: RunnerState[Any] | None = None  # the state after a whole frame that is not saved yet
         self._stack = contextlib.ExitStack()
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
         self._submission: SubmissionWriter | None = None  # of nuScenes drives
         self._tracks: CsvWriter | None = None
-        self._reference = "world" if sequence.has_ego_motion else "ego"
-        self._is_complete = done == len(sequence.stamps)
+        self._reference = "world" if drive.has_ego_motion else "ego"
         self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
-        self._map_frames = [] if resume is None else list(resume.map_frames)
-        self._bev_frames = [] if resume is None else list(resume.bev_frames)
-        if resume is not None:
-            self._check_files(resume)
+        self._map_frames = list(state.files.map_frames) if state.files else []
+        self._bev_frames = list(state.files.bev_frames) if state.files else []
+        if state.files is not None:
+            self._check_files(state.files)
 
     def __enter__(self) -> "RunFiles":
-        out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
+        out, drive, model, resume = self._out, self._drive, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
         past = None if resume is None else resume.recording
-        recording = Recording(out / RECORDING, sequence, model, self._options.recording, self._live, past)
+        recording = Recording(out / RECORDING, drive, model, self._options.recording, self._live, past)
         config, grid = model.config, model.config.bev_grid
         settings = as_table(config)["class_settings"]  # of classes of the model's own
         extras = {
@@ -95,7 +90,7 @@ class RunFiles:
             "classes": list(config.classes),
             **({"class_settings": settings} if settings else {}),
             "range_m": grid.nearest_side_m,
-            **({"ego_motion": "measured"} if sequence.facts.motion_measured else {}),
+            **({"ego_motion": "measured"} if drive.facts.motion_measured else {}),
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
         with self._stack:  # closes what is open if the next one cannot be opened
@@ -103,24 +98,52 @@ class RunFiles:
             self._boxes = self._open(PREDICTIONS, BoxesWriter, frame_of_reference=self._reference, extras=extras)
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
-            for kind, names in config.results.items():
-                facts = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
-                self._results[kind] = self._open(kind.file_name, kind.writer, **facts)
+            for result, names in config.results.items():
+                about = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
+                self._results[result] = self._open(result.file_name, result.writer, **about)
             if resume is not None and SUBMISSION in resume.sizes:
                 self._submission = self._open_submission()
-            if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
+            if len({stamp.scene for stamp in drive.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
-                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
-            for note in sequence.notes if resume is None else ():
+                write_calibration(out / CALIBRATION, drive.rig, drive.facts, regular=True)
+            for note in drive.notes if resume is None else ():
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
         return self
 
     def __exit__(self, *raised: Any) -> None:
-        self._stack.__exit__(*raised)
+        try:
+            if self._after is not None:
+                self._save(self._after)
+        finally:
+            self._stack.__exit__(*raised)
 
-    def write(self, frame: Frame, prediction: Prediction) -> None:
-        """Add a frame to every file."""
+    def write(self, step: tuple[Frame, Prediction, RunnerState[Any]]) -> tuple[Frame, Prediction]:
+        """Add a frame to every file, and count it. step: of `Runner.run`."""
+        frame, prediction, after = step
+        self._after, began = None, time.perf_counter()
+        self._write(frame, prediction)
+        now = time.perf_counter()
+        self._summary.add(frame, prediction, recording_s=now - began, whole_s=now - self._frame_began)
+        self._after, self._frame_began = after, now
+        saving_s = ASSUMED_S + sum(tensor.nbytes for _, tensor in tensors_in(after)) / ASSUMED_BYTES_PER_S
+        if self._saving_s + saving_s <= SHARE * (now - self._began):
+            self._save(after)
+        return frame, prediction
+
+    def _save(self, after: RunnerState[Any]) -> None:
+        """Save the state after the last frame, if the files can go on from there. Raises OutputError."""
+        recording, began = self._recording.state(), time.perf_counter()
+        if recording is None:
+            return
+        sizes = {name: file.size for name, file in self._files.items()}
+        files = FilesState(recording, sizes, self._map_frames, self._bev_frames)
+        kept = RunnerState() if self._summary.is_complete else after  # nothing comes after the last frame
+        save_state(self._folder.state_path, RunState(self._fingerprint, files, self._summary.counts, kept))
+        self._after = None
+        self._saving_s += time.perf_counter() - began
+
+    def _write(self, frame: Frame, prediction: Prediction) -> None:
         if prediction.segmentation is not None:
             maps = self._out / SEGMENTATION
             self._folder.add(map_path(maps, frame.stamp.index))
@@ -137,7 +160,7 @@ class RunFiles:
             extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
         if frame.sample_token is not None:
             extras["sample_token"] = frame.sample_token
-        in_world = self._sequence.has_ego_motion  # boxes are in the world frame, or else in the ego frame
+        in_world = self._drive.has_ego_motion  # boxes are in the world frame, or else in the ego frame
         boxes = prediction.boxes_world if in_world else prediction.boxes_ego
         boxes = replace(boxes, attributes=attributes_by_speed(boxes, self._model.config.object_classes))
         of_frame = FrameBoxes(frame.stamp, frame.world_from_ego if in_world else None, boxes, extras)
@@ -149,20 +172,11 @@ class RunFiles:
             self._submission = self._submission or self._open_submission()
             self._submission.write(of_frame)
         ground = prediction.ground if in_world else replace(prediction.ground, world_from_ego=None)
-        for kind, writer in self._results.items():
-            writer.write(ground, result_of(kind, prediction.results))
+        for result, writer in self._results.items():
+            writer.write(ground, result_of(result, prediction.results))
         self._boxes.write(of_frame)  # last: a frame in predictions.json is in the other files too
         if any(file.is_deleted() for file in (self._recording.file, *self._files.values())):
             raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
-        self._is_complete = frame.stamp == self._sequence.stamps[-1]
-
-    def state(self) -> FilesState | None:
-        """The state with which later RunFiles go on after the last frame; None as long as they cannot."""
-        recording = self._recording.state()
-        if recording is None:
-            return None
-        sizes = {name: file.size for name, file in self._files.items()}
-        return FilesState(recording, sizes, tuple(self._map_frames), tuple(self._bev_frames))
 
     def _check_files(self, resume: FilesState) -> None:
         """Raises OutputError where a file of the finished frames is missing, or shorter than it was."""
@@ -192,7 +206,7 @@ class RunFiles:
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
-        paths += [self._out / kind.file_name for kind in self._results]
+        paths += [self._out / result.file_name for result in self._results]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 

@@ -1,6 +1,6 @@
 """RunFolder: the output folder of a run, locked against other runs, with a list of the files that runs wrote into it.
 
-Its own files are in the subfolder .bevcli: `lock`, `written` (one path a line) and `state.safetensors` (for `resume`).
+Its own files are in the subfolder .bevcli: `lock`, `written` (one path a line) and `state.pt` (for `resume`).
 """
 
 import contextlib
@@ -29,7 +29,7 @@ class RunFolder(contextlib.ExitStack):
 
     def __init__(self, path: Path, *, force: bool = False, resume: bool = False) -> None:
         super().__init__()
-        self.path, self.state_path = path, path / OWN / "state.safetensors"
+        self.path, self.state_path = path, path / OWN / "state.pt"
         self._force, self._resume = force, resume
         self._written: GrowingFile | None = None
         self._names: set[str] = set()

@@ -1,26 +1,40 @@
-"""`run_into_folder`: run a model over a sequence and write files, as `bevcli run` does."""
+"""`run_into_folder`: run a model over a drive and write files, as `bevcli run` does; `run_in_folder`, step by step."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Drive, Frame, Prediction
 from bevcli.inference.load import Model
-from bevcli.inference.pipeline import WriteBehind
-from bevcli.inference.runner import RunnerState, read_commands
+from bevcli.inference.pipeline import write_behind
+from bevcli.inference.runner import read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
-from bevcli.rig.sequence_checks import CheckedDrive
+from bevcli.rig.sequence_checks import input_errors
 from bevcli.runs.files import RunFiles
 from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions
-from bevcli.runs.state import START_ANEW, RunState, RunWriter, run_facts, save_state, saved_state
+from bevcli.runs.state import START_ANEW, RunState, run_fingerprint, save_state, saved_state
 from bevcli.runs.summary import Counts, RunSummary
 from bevcli.sequences.images import no_image_error
 
-Step = tuple[Frame, Prediction, RunnerState[Any]]
+
+@dataclass(frozen=True)
+class FolderRun:
+    """A run into a folder.
+
+    Attributes:
+        frames: each frame with its prediction, once it is in the files.
+        done: number of frames that an interrupted run had finished.
+        summary: counts and times so far.
+    """
+
+    frames: Iterator[tuple[Frame, Prediction]]
+    done: int
+    summary: RunSummary
 
 
 def run_into_folder(
@@ -32,9 +46,6 @@ def run_into_folder(
     live: LiveSink | None = None,
     force: bool = False,
     resume: bool = False,
-    after_frame: Callable[[Frame, Prediction], None] = lambda frame, prediction: None,
-    resumed: Callable[[int], None] = lambda frames: None,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
     """Run a model over a sequence and write recording, boxes, tracks, maps and summary.json into a folder.
 
@@ -49,11 +60,8 @@ def run_into_folder(
         options: default `RunOptions()`.
         live: a viewer that shows the recording while it is written.
         force: remove the files that earlier runs wrote into `out`.
-        resume: go on with an interrupted run of the same model, options and input; the files then equal those of a run
-            without interruption. Where there is none, the run starts at the first frame.
-        after_frame: called after each frame has been written, in the thread that writes.
-        resumed: called once with the number of frames that an interrupted run had finished, if there are any.
-        should_stop: asked after each frame, in the same thread; True ends the run.
+        resume: go on with an interrupted run of the same model, options and input; the results then equal those of a
+            run without interruption. Where there is none, the run starts at the first frame.
 
     Raises:
         InputError: see `run`; or not one image of the drive could be read.
@@ -62,36 +70,57 @@ def run_into_folder(
     """
     options = RunOptions() if options is None else options
     model = model.in_engine(sequence.rig, sequence, parts="`probes` (`--probe`)" if options.recording.probes else "")
+    with run_in_folder(model, sequence, out, options, live=live, force=force, resume=resume) as run:
+        for _ in run.frames:
+            pass
+    return run.summary
+
+
+@contextlib.contextmanager
+def run_in_folder(
+    model: Model,
+    drive: Drive,
+    out: Path,
+    options: RunOptions,
+    *,
+    live: LiveSink | None = None,
+    force: bool = False,
+    resume: bool = False,
+    source: str = "SEQUENCE",
+) -> Iterator[FolderRun]:
+    """A run of `run_into_folder` that the caller steps:
+
+        with run_in_folder(model, drive, out, options) as run:
+            for frame, prediction in run.frames:
+                ...  # `break` stops the run: it can be resumed
+
+    model: in its engine. source: the path of the drive, for texts. Other arguments and errors: see `run_into_folder`.
+    """
     commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options) | {"commands": str(commands)}
-        state = _state_to_start_from(folder, facts, model, resume)
-        done = state.counts.whole.count
-        if state.files is not None:
-            resumed(done)
-        checked = sequence if isinstance(sequence, CheckedDrive) else CheckedDrive(sequence)
-        summary = RunSummary(model, checked, options, state.counts)
+        fingerprint = run_fingerprint(model, drive, options) | {"commands": str(commands)}
+        state = _state_to_start_from(folder, fingerprint, model, resume)
+        done, summary = state.counts.whole.count, RunSummary(model, drive, options, state.counts)
+        summary.input_errors = input_errors(drive, source)
         folder.add(out / SUMMARY)
-        files = RunFiles(folder, sequence, model, options, live, state.files, done=done)
-        writer = RunWriter(folder.state_path, facts, files, summary)
-
-        def write(step: Step) -> bool:
-            writer.write(*step)
-            after_frame(*step[:2])
-            return not should_stop()
-
+        files = RunFiles(folder, drive, model, options, summary, state, live)
         try:
-            with files, writer, WriteBehind(write) as background:
-                asked = {"ask_attention": options.recording.shows_internals, "probes": tuple(options.recording.probes)}
-                runner = model.runner(track=options.track, temporal=options.temporal, commands=commands, **asked)
-                indices, preprocessor = range(done, len(sequence.stamps)), runner.preprocessor(options.cameras)
-                for step in runner.run(sequence, indices, preprocessor, state.runner):
-                    if not background.put(step):
-                        break
+            with files:
+                runner = model.runner(
+                    track=options.track,
+                    temporal=options.temporal,
+                    commands=commands,
+                    ask_attention=options.recording.shows_internals,
+                    probes=tuple(options.recording.probes),
+                )
+                indices, preprocessor = range(done, len(drive.stamps)), runner.preprocessor(options.cameras)
+                steps = runner.run(drive, indices, preprocessor, state.runner)
+                with contextlib.closing(write_behind(steps, files.write)) as frames:
+                    yield FolderRun(frames, done if state.files else 0, summary)
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:
-                raise no_image_error(sequence.name, (image[1:] for image in summary.counts.dropped))
+                raise no_image_error(drive.name, (image[1:] for image in summary.counts.dropped))
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 _close(folder, summary, files, error)
@@ -101,7 +130,6 @@ def run_into_folder(
                 raise OutputError(message) from error
             raise
         summary.write(out, files.written())
-    return summary
 
 
 def _close(folder: RunFolder, summary: RunSummary, files: RunFiles, error: BaseException) -> None:
@@ -116,14 +144,14 @@ def _close(folder: RunFolder, summary: RunSummary, files: RunFiles, error: BaseE
         summary.write(folder.path, files.written())
 
 
-def _state_to_start_from(folder: RunFolder, facts: dict[str, str], model: Model, resume: bool) -> RunState[Any]:
+def _state_to_start_from(folder: RunFolder, fingerprint: dict[str, str], model: Model, resume: bool) -> RunState[Any]:
     """The saved state of an interrupted run, or a new one without files; then those of earlier runs are removed."""
     memory = model_class(model.config).memory_type
-    state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
+    state = saved_state(folder, fingerprint, RunState[memory]) if resume else None  # type: ignore[valid-type]
     if resume and state is None and folder.has_files():
         raise OutputError(f"{folder.path}: `resume` (`--resume`): its run saved no state; {START_ANEW}")
     if state is None or state.files is None:
         folder.remove_written()
-        state = RunState(facts, None, Counts())
+        state = RunState(fingerprint, None, Counts())
         save_state(folder.state_path, state)
     return state

@@ -1,54 +1,66 @@
-"""The state of a run that can be resumed: its file, when it is saved, and if it fits the run that wants to go on.
+"""The state of a run that can be resumed: its file, and the fingerprint of the run that it is of.
 
-A state is a dataclass with its tensors, arrays and plain values in a .safetensors file. Tensors and arrays of numbers
-are tensors of the file. Everything else is one more tensor, MessagePack that msgspec writes and reads. The reader names
-the type that it expects, so that nothing in a file decides what is made of it.
+PyTorch writes and reads the file. The reader names the type that it expects: of other classes than those in its fields
+nothing is made.
 """
 
-import contextlib
 import hashlib
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import pickle
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, is_dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, get_origin
+from typing import Any, Generic, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
 import torch
-from safetensors.torch import save
-from torch import Tensor
 
 from bevcli._version import __version__
-from bevcli.checkpoints import read_safetensors
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Drive, Frame, Prediction
-from bevcli.inference.load import Model, hash_of
+from bevcli.frame import Drive
+from bevcli.inference.load import Model
 from bevcli.inference.runner import Memory, RunnerState
-from bevcli.model.upload import tensors_in
+from bevcli.model.upload import exchanged, tensors_in
 from bevcli.parsing.files import read_bytes
-from bevcli.runs.files import FilesState, RunFiles
+from bevcli.recording.writer import RecordingState
 from bevcli.runs.folder import RunFolder
-from bevcli.runs.summary import Counts, RunSummary
+from bevcli.runs.summary import Counts
 from bevcli.writing import write_whole
 
-FORMAT = "bevcli-state/8"
-LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may state an array of gigabytes
-SHARE = 0.02  # of the run's time that saving may take
-ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
+FORMAT = b"bevcli-state/9\n"
+LARGEST_BYTES = 8 << 30
 HASHED_BYTES = 1 << 24  # files up to this size are hashed; of larger ones size and modification time count
 DIGITS = 12  # of a hash in a text
 START_ANEW = "pass `force=True` (`--force`) to start anew"
-_TREE = "tree"
+NUMPY = [bytes, np.ndarray, np.dtype, *(getattr(np.dtypes, name) for name in np.dtypes.__all__)]
+NUMPY += [np.zeros(0).__reduce__()[0], np.float64().__reduce__()[0]]  # what makes arrays and numbers of a pickle
 
 
-class _HasFacts(Protocol):
+class _HasFingerprint(Protocol):
     @property
-    def facts(self) -> Mapping[str, str]: ...
+    def fingerprint(self) -> Mapping[str, str]: ...
 
 
 Loaded = TypeVar("Loaded")
-State = TypeVar("State", bound=_HasFacts)
+State = TypeVar("State", bound=_HasFingerprint)
+
+
+@dataclass(frozen=True)
+class FilesState:
+    """Sizes and states with which the files of an interrupted run go on.
+
+    Attributes:
+        recording: of recording.rrd.
+        sizes: name -> bytes of each other file that grows.
+        map_frames: indices of the frames that have a map.
+        bev_frames: indices of the frames that have BEV features.
+    """
+
+    recording: RecordingState
+    sizes: dict[str, int]
+    map_frames: list[int]
+    bev_frames: list[int]
 
 
 @dataclass(frozen=True)
@@ -56,22 +68,22 @@ class RunState(Generic[Memory]):
     """A run after a number of finished frames.
 
     Attributes:
-        facts: what the run was made of, see `run_facts`.
+        fingerprint: of the run, see `run_fingerprint`.
         files: None as long as nothing can be kept; the run then starts anew.
         counts: of the summary so far.
         runner: what the next frame needs; nothing before the first frame and after the last one.
     """
 
-    facts: Mapping[str, str]
+    fingerprint: dict[str, str]
     files: FilesState | None
     counts: Counts
     runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
 
-def run_facts(model: Model, sequence: Drive, options: object) -> dict[str, str]:
+def run_fingerprint(model: Model, drive: Drive, options: object) -> dict[str, str]:
     """Name -> hash or value of all that the results of a run depend on.
 
-    options: the dataclass of the run's options; each of its fields is a fact.
+    options: the dataclass of the run's options; each of its fields is part of the fingerprint.
     """
     return {
         "version of bevcli": __version__,
@@ -80,18 +92,18 @@ def run_facts(model: Model, sequence: Drive, options: object) -> dict[str, str]:
         "device": model.device.type,
         "precision": f"{model.precision}, {model.engine}" if model.is_exported else model.precision,
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
-        "frames of the input": f"{len(sequence.stamps)}, {digest(sequence.stamps)[:DIGITS]}",
-        "calibration": digest(sequence.rig)[:DIGITS],
-        "ego-motion": "measured from the images" if sequence.facts.motion_measured else "of the input",
-        "files of the input": digest(tuple(map(_file_facts, sequence.input_files)))[:DIGITS],
-        "images of the input": _image_facts(sequence),
+        "frames of the input": f"{len(drive.stamps)}, {digest(drive.stamps)[:DIGITS]}",
+        "calibration": digest(drive.rig)[:DIGITS],
+        "ego-motion": "measured from the images" if drive.facts.motion_measured else "of the input",
+        "files of the input": digest(tuple(map(_described, drive.input_files)))[:DIGITS],
+        "images of the input": _described_images(drive),
     }
 
 
-def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) -> State | None:
+def saved_state(folder: RunFolder, fingerprint: Mapping[str, str], kind: type[State]) -> State | None:
     """The state of a kind in a folder, None if there is none.
 
-    Raises OutputError if it is damaged, of another kind, or of a run with other facts.
+    Raises OutputError if it is damaged, of another kind, or of a run with another fingerprint.
     """
     if not folder.state_path.exists():
         return None
@@ -99,9 +111,9 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
         state = load_state(folder.state_path, kind)
     except InputError as error:
         raise OutputError(f"`resume` (`--resume`): {error}; {START_ANEW}") from None
-    names = [name for name in {**state.facts, **facts} if state.facts.get(name) != facts.get(name)]
-    if names:
-        pairs = (f"{name}: was {state.facts.get(name)}, is {facts.get(name)}" for name in names)
+    before, now = state.fingerprint, fingerprint
+    if names := [name for name in {**before, **now} if before.get(name) != now.get(name)]:
+        pairs = (f"{name}: was {before.get(name)}, is {now.get(name)}" for name in names)
         raise OutputError(
             f"{folder.path}: `resume` (`--resume`): the interrupted run differs from this one ({'; '.join(pairs)}): "
             f"pass the same model, options and input, or {START_ANEW.removeprefix('pass ')}"
@@ -109,87 +121,13 @@ def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) 
     return state
 
 
-class RunWriter(contextlib.AbstractContextManager["RunWriter"]):
-    """`with RunWriter(…) as writer: writer.write(frame, prediction, after)`.
-
-    Writes frames to the files of a run, counts them, and saves the state as often as SHARE of its time allows. The end
-    of the block, whatever causes it, saves the state after the last whole frame.
-    """
-
-    def __init__(self, path: Path, facts: Mapping[str, str], files: RunFiles, summary: RunSummary) -> None:
-        """path: of the state file. facts: of `run_facts`."""
-        self._path, self._facts, self._files, self._summary = path, facts, files, summary
-        self._began = self._frame_began = time.perf_counter()
-        self._spent_s = 0.0
-        self._longest_s: float | None = None
-        self._after: RunnerState[Any] | None = None  # the state after a frame that is not saved yet
-        self._is_whole = True
-
-    def __exit__(self, *_error: object) -> None:
-        if self._is_whole and self._after is not None:
-            self.save(self._after)
-
-    def write(self, frame: Frame, prediction: Prediction, after: RunnerState[Any]) -> None:
-        """Write the next frame. after: the state of the runner after it."""
-        self._is_whole, began = False, time.perf_counter()
-        self._files.write(frame, prediction)
-        now = time.perf_counter()
-        self._summary.add(frame, prediction, recording_s=now - began, whole_s=now - self._frame_began)
-        self._after, self._is_whole, self._frame_began = after, True, now
-        if self.is_due(after):
-            self.save(after)
-
-    def is_due(self, runner: RunnerState[Any]) -> bool:
-        """Time has been long enough for another save."""
-        assumed_s = ASSUMED_S + sum(tensor.nbytes for _, tensor in tensors_in(runner)) / ASSUMED_BYTES_PER_S
-        next_s = assumed_s if self._longest_s is None else self._longest_s
-        return self._spent_s + next_s <= SHARE * (time.perf_counter() - self._began)
-
-    def save(self, runner: RunnerState[Any]) -> None:
-        """Save the state after the last frame, if the files can go on from there. Raises OutputError."""
-        parts, summary, began = self._files.state(), self._summary, time.perf_counter()
-        if parts is None:
-            return
-        kept = RunnerState() if summary.is_complete else runner  # nothing comes after the last frame
-        save_state(self._path, RunState(self._facts, parts, summary.counts, kept))
-        took = time.perf_counter() - began
-        self._after = None
-        self._spent_s += took
-        self._longest_s = max(self._longest_s or 0.0, took)
-
-
-def _file_facts(path: Path) -> tuple[str, int, str]:
-    """Name, size, and hash or time of a file of the input."""
-    try:
-        facts = path.stat()
-        if facts.st_size > HASHED_BYTES:
-            return path.name, facts.st_size, str(facts.st_mtime_ns)
-        return path.name, facts.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
-    except OSError as error:
-        return path.name, -1, str(error.strerror)
-    except InputError as error:
-        return path.name, -1, str(error)
-
-
-def _image_facts(sequence: Drive) -> str:
-    """Number, and hash of names, sizes and times of change, of the image files and videos of all frames."""
-    paths = dict.fromkeys(path for index in range(len(sequence.stamps)) for path in sequence.image_files(index))
-    facts_hash = hashlib.sha256()
-    for path in paths:
-        try:
-            facts = path.stat()
-            facts_hash.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
-        except OSError as error:
-            facts_hash.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
-        except ValueError:  # a null byte in the name
-            facts_hash.update(b"no name\n")
-    return f"{len(paths)}, {facts_hash.hexdigest()[:DIGITS]}"
-
-
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
-    tensors = _tensors_of(state)
-    write_whole(path, save(tensors, {"format": FORMAT, "sha256": hash_of(sorted(tensors.items()))}), regular=True)
+    copies = (tensor.detach().cpu().clone() for _, tensor in tensors_in(state))  # a view would bring its whole memory
+    written = BytesIO()
+    torch.save(exchanged(state, copies), written)
+    content = written.getvalue()
+    write_whole(path, FORMAT + hashlib.sha256(content).digest() + content, regular=True)
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:
@@ -198,55 +136,63 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
     kind: the type of the state. Its dataclasses state the type of every field.
     Raises InputError for a changed or damaged file, and for a state of another type.
     """
-    tensors, metadata = read_safetensors(path)
-    if metadata.get("format") != FORMAT:
-        raise InputError(
-            f'{path}: is not a state file of this version: "format" must be "{FORMAT}", '
-            f'found "{metadata.get("format", ""):.40}"'
-        )
-    if _TREE not in tensors or metadata.get("sha256") != hash_of(sorted(tensors.items())):
+    written = read_bytes(path, LARGEST_BYTES)
+    content = memoryview(written)[len(FORMAT) + hashlib.sha256().digest_size :]
+    if not written.startswith(FORMAT):
+        raise InputError(f"{path}: is not a state file of this version (expected one of {FORMAT.decode().strip()})")
+    if hashlib.sha256(content).digest() != written[len(FORMAT) : -len(content)]:
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
-
-    def decoded(expected: type, packed: Any) -> Any:
-        if expected is Tensor:
-            return tensors[packed]
-        assert get_origin(expected) is np.ndarray, expected
-        return tensors[packed].numpy() if isinstance(packed, str) else _strings(*packed)
-
     try:
-        return msgspec.msgpack.decode(tensors[_TREE].numpy().tobytes(), type=kind, dec_hook=decoded)
-    except (msgspec.MsgspecError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: the state cannot be read ({error})") from None
+        with torch.serialization.safe_globals([*NUMPY, *_classes_in(kind, set())]):
+            state = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).rpartition("WeightsUnpickler error: ")[2].split())
+        raise InputError(f"{path}: the state cannot be read ({reason:.200})") from None
+    if not isinstance(state, get_origin(kind) or kind):
+        raise InputError(f"{path}: the state cannot be read (expected {kind}, found a {type(state).__name__})")
+    return state
+
+
+def _classes_in(hint: Any, known: set[Any]) -> Iterator[Any]:
+    """The dataclasses in a type, and in the types of their fields."""
+    for argument in get_args(hint):
+        yield from _classes_in(argument, known)
+    kind = get_origin(hint) or hint
+    if is_dataclass(kind) and kind not in known:
+        known.add(kind)
+        yield kind
+        for of_field in get_type_hints(kind).values():
+            yield from _classes_in(of_field, known)
 
 
 def digest(tree: object) -> str:
-    """The hash of a tree that `save_state` could write."""
-    return hash_of(sorted(_tensors_of(tree).items()))
+    """SHA-256 of plain values, dataclasses and arrays."""
+    return hashlib.sha256(msgspec.msgpack.encode(tree, enc_hook=lambda array: array.tolist())).hexdigest()
 
 
-def _tensors_of(tree: object) -> dict[str, Tensor]:
-    """The tensors of a state file."""
-    tensors: dict[str, Tensor] = {}
-
-    def encoded(value: Any) -> Any:
-        if isinstance(value, np.generic):
-            return value.item()
-        if isinstance(value, np.ndarray) and value.dtype.kind == "U":
-            return value.tolist(), value.dtype.str
-        if isinstance(value, np.ndarray):
-            value = torch.from_numpy(np.array(value, order="C"))
-        assert isinstance(value, Tensor), f"a state cannot hold a {type(value).__name__}"
-        name = str(len(tensors))
-        tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
-        return name
-
-    text = msgspec.msgpack.encode(tree, enc_hook=encoded)
-    return tensors | {_TREE: torch.frombuffer(bytearray(text), dtype=torch.uint8)}
+def _described(path: Path) -> tuple[str, int, str]:
+    """Name, size, and hash or time of a file of the input."""
+    try:
+        found = path.stat()
+        if found.st_size > HASHED_BYTES:
+            return path.name, found.st_size, str(found.st_mtime_ns)
+        return path.name, found.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
+    except OSError as error:
+        return path.name, -1, str(error.strerror)
+    except InputError as error:
+        return path.name, -1, str(error)
 
 
-def _strings(content: Any, dtype: str) -> np.ndarray:
-    """An array of strings of a type such as "<U20"."""
-    width = int(dtype.removeprefix("<U"))
-    if width < 0 or 4 * width * len(content) > LARGEST_STRINGS:
-        raise ValueError(f"an array of the type {dtype:.20}")
-    return np.array(content, dtype=f"<U{width}")
+def _described_images(drive: Drive) -> str:
+    """Number, and hash of names, sizes and times of change, of the image files and videos of all frames."""
+    paths = dict.fromkeys(path for index in range(len(drive.stamps)) for path in drive.image_files(index))
+    hashed = hashlib.sha256()
+    for path in paths:
+        try:
+            found = path.stat()
+            hashed.update(f"{path.name} {found.st_size} {found.st_mtime_ns}\n".encode(errors="surrogateescape"))
+        except OSError as error:
+            hashed.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
+        except ValueError:  # a null byte in the name
+            hashed.update(b"no name\n")
+    return f"{len(paths)}, {hashed.hexdigest()[:DIGITS]}"

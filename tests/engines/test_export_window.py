@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from interrupted import run_frames
 from memory_drive import WithoutImages
 from typer.testing import CliRunner
 
@@ -108,7 +109,7 @@ def test_levels_of_image_features_follow_from_the_configuration(cropping_model):
 def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_file, tmp_path):
     model = load_model(window_file())
     run_into_folder(model, DRIVE, tmp_path / "whole")
-    run_into_folder(model, DRIVE, tmp_path / "cut", should_stop=iter([*[False] * 5, True]).__next__)
+    run_frames(6, model, DRIVE, tmp_path / "cut")
     run_into_folder(model, DRIVE, tmp_path / "cut", resume=True)
     for name in ("predictions.json", "tracks.csv"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -209,7 +209,7 @@ READERS = {
     "MCAP": Reader("bag.mcap", "bytes", _bag("bag.mcap")),
     "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _bag("rosbag2")),
     "submission": Reader("results_nusc.json", "json", _submission),
-    "state": Reader("out/.bevcli/state.safetensors", "bytes", _state),
+    "state": Reader("out/.bevcli/state.pt", "bytes", _state),
     "written files": Reader("out/.bevcli/written", "bytes", _state),
     "summary": Reader("older/summary.json", "json", _older_run),
     "checkpoint": Reader("checkpoint.pt", "bytes", _checkpoint),

@@ -192,7 +192,7 @@ def _runs(folder: Path) -> None:
     (folder / "out/.bevcli/written").write_text("recording.rrd\npredictions.json\n")
     memory, stamp = BevHistory(torch.zeros(1, 4, 2), Pose.identity()), FrameStamp(0, "", 5)
     runner = RunnerState(memory, stamp)
-    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, None, Counts(), runner))
+    save_state(folder / "out/.bevcli/state.pt", RunState({"model": "mini"}, None, Counts(), runner))
     (folder / "older").mkdir()
     (folder / "older/summary.json").write_text(json.dumps({"bevcli_version": "0.1", "files": ["older/recording.rrd"]}))
     model = torch.nn.Linear(2, 1)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from interrupted import run_frames
 from memory_drive import MemoryDrive, WithoutImages
 from simulated_device import simulated
 from test_other_devices import CPU, sample_plainly, small_version
@@ -129,7 +130,7 @@ def interrupt_and_resume(model, out):
         run_into_folder(model, drive, out)
     assert len(read_boxes(out / "predictions.json").frames) == 4
     drive.broken = FRAMES
-    run_into_folder(model, drive, out, resume=True, should_stop=lambda: True)
+    run_frames(5, model, drive, out, resume=True)
     assert len(read_boxes(out / "predictions.json").frames) == 5
     run_into_folder(model, drive, out, resume=True)
 

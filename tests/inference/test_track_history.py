@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from interrupted import run_frames
 from memory_drive import MemoryDrive, WithoutImages
 from stepping import CPU, run
 
@@ -219,18 +220,12 @@ def test_an_interrupted_run_is_resumed_with_its_tracks(loaded, tmp_path):
     options = RunOptions(recording=RecordingOptions(score=0.5))
     drive = MemoryDrive(5, scenes="aaabb")
     run_into_folder(loaded, drive, tmp_path / "whole", options)
-    stops = iter([False, True]).__next__
-    run_into_folder(loaded, drive, tmp_path / "cut", options, should_stop=stops)
-    run_into_folder(loaded, drive, tmp_path / "cut", options, resume=True, should_stop=stops_after(2))
+    run_frames(2, loaded, drive, tmp_path / "cut", options)
+    run_frames(4, loaded, drive, tmp_path / "cut", options, resume=True)
     run_into_folder(loaded, drive, tmp_path / "cut", options, resume=True)
     for name in ("predictions.json", "tracks.csv", "segmentation/000004.png", "segmentation/map.json"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     assert any((frame.boxes.instances != "").any() for frame in read_boxes(tmp_path / "whole/predictions.json").frames)
-
-
-def stops_after(frames: int):
-    """Asked after each frame: whether the run ends."""
-    return iter([*[False] * (frames - 1), True]).__next__
 
 
 class OneDrive(list):

@@ -1,25 +1,17 @@
 import threading
+from itertools import islice
 
 import pytest
 
-from bevcli.inference.pipeline import QUEUE, WriteBehind
+from bevcli.inference.pipeline import write_behind
 
 
-def write_behind(work, items, depth=QUEUE):
-    with WriteBehind(work, depth) as writer:
-        for item in items:
-            if not writer.put(item):
-                break
+def test_every_item_is_written_in_order():
+    assert list(write_behind(range(20), lambda item: 2 * item)) == list(range(0, 40, 2))
+    assert list(write_behind([], lambda item: item)) == []
 
 
-def test_every_item_is_worked_on_in_order():
-    worked = []
-    write_behind(lambda item: worked.append(item) or True, range(20))
-    write_behind(lambda item: worked.append(item) or True, [])
-    assert worked == list(range(20))
-
-
-def test_items_are_made_while_the_first_one_is_worked_on():
+def test_items_are_made_while_the_first_one_is_written():
     made, all_made = [], threading.Event()
 
     def items():
@@ -28,67 +20,51 @@ def test_items_are_made_while_the_first_one_is_worked_on():
             yield item
         all_made.set()
 
-    def work(item):
-        return all_made.wait(5)
-
-    write_behind(work, items(), depth=3)
+    assert all(write_behind(items(), lambda item: all_made.wait(5), depth=3))
     assert made == list(range(4))
-    assert all_made.is_set()
 
 
 def test_no_more_items_are_made_than_may_wait():
-    made, most = [], []
+    made = []
 
     def items():
         for item in range(20):
             made.append(item)
             yield item
 
-    def work(item):
-        most.append(len(made) - item)
-        return True
-
-    write_behind(work, items(), depth=2)
-    assert max(most) <= 4  # the one worked on, two that wait, and one that was made meanwhile
+    most = max(write_behind(items(), lambda item: len(made) - item, depth=2))
+    assert most <= 4  # the one worked on, two that wait, and one that was made meanwhile
 
 
-def test_no_item_is_worked_on_after_work_says_so():
-    worked, made = [], threading.Event()
-
-    def items():
-        yield from range(4)
-        made.set()
-        yield from range(4, 1000)
-
-    def work(item):
-        worked.append(item)
-        made.wait(5)
-        return item < 2
-
-    write_behind(work, items(), depth=4)
-    assert worked == [0, 1, 2]
+def test_what_was_made_is_written_where_the_caller_stops():
+    made, written = [], []
+    steps = write_behind((made.append(item) or item for item in range(1000)), written.append, depth=4)
+    list(islice(steps, 3))
+    steps.close()
+    assert written == made
+    assert 3 <= len(made) <= 9
 
 
 @pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
-def test_made_items_are_worked_on_before_the_failure_of_the_next(kind):
-    worked = []
+def test_made_items_are_written_before_the_failure_of_the_next(kind):
+    written = []
 
     def items():
         yield from range(3)
         raise kind("no image")
 
     with pytest.raises(kind, match="no image"):
-        write_behind(lambda item: worked.append(item) or True, items())
-    assert worked == [0, 1, 2]
+        list(write_behind(items(), written.append))
+    assert written == [0, 1, 2]
 
 
-def test_after_an_error_in_the_work_nothing_more_is_done():
-    worked = []
+def test_nothing_is_written_after_an_error():
+    written = []
 
-    def work(item):
-        worked.append(item)
-        return bool(1 / (1 - item))
+    def write(item):
+        written.append(item)
+        return 1 / (1 - item)
 
     with pytest.raises(ZeroDivisionError):
-        write_behind(work, range(1000))
-    assert worked == [0, 1]
+        list(write_behind(range(1000), write))
+    assert written == [0, 1]

@@ -10,7 +10,7 @@ from command_line import MINI_TOML, command
 
 from bevcli.findings import errors_of
 from bevcli.rig.check_calibration import check_calibration
-from bevcli.rig.sequence_checks import CheckedDrive
+from bevcli.rig.sequence_checks import input_errors
 from bevcli.sequences.open import open_sequence
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
@@ -38,13 +38,13 @@ def in_millimetres(cameras):
 
 
 def test_the_sample_and_the_first_frames_of_it_are_plausible():
-    assert CheckedDrive(open_sequence(SAMPLE)).input_errors == ()
-    assert CheckedDrive(open_sequence(SAMPLE, frames=slice(0, 1))).input_errors == ()
+    assert input_errors(open_sequence(SAMPLE)) == ()
+    assert input_errors(open_sequence(SAMPLE, frames=slice(0, 1))) == ()
 
 
 def test_a_camera_in_millimetres_is_one_line(spoilt):
     drive = spoilt(in_millimetres)
-    (line,) = CheckedDrive(open_sequence(drive), str(drive)).input_errors
+    (line,) = input_errors(open_sequence(drive), str(drive))
     assert "camera CAM_FRONT: the translation is in millimetres" in line
     assert line.endswith(f"`bevcli project-debug {drive}` says more")
     assert [finding.code for finding in errors_of(check_calibration(drive).findings)] == ["translation-unit"]
@@ -55,7 +55,7 @@ def test_ego_motion_in_millimetres_is_one_line_of_chosen_frames():
     motion = drive.ego_motion
     assert motion is not None
     drive.ego_motion = replace(motion, translations=1000 * motion.translations)
-    (line,) = CheckedDrive(drive).input_errors
+    (line,) = input_errors(drive)
     assert "wrong unit of timestamps or translations" in line
 
 

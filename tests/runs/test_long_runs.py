@@ -16,7 +16,8 @@ from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import Model
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.runs.options import RunOptions
+from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -69,13 +70,8 @@ def usage() -> Usage:
 
 def measured_run(mini_model, out: Path, frames: int, measured: range) -> list[Usage]:
     """Runs over a drive; the usage at each of the measured frames."""
-    found = []
-
-    def measure(frame, prediction):
-        if frame.stamp.index in measured:
-            found.append(usage())
-
-    run_into_folder(Model(mini_model), SmallDrive(frames), out, after_frame=measure)
+    with run_in_folder(Model(mini_model), SmallDrive(frames), out, RunOptions()) as running:
+        found = [usage() for frame, _ in running.frames if frame.stamp.index in measured]
     with open_recording(out / "recording.rrd") as file:
         assert file == out / "recording.rrd"
         indices = [frame.index for frame in RecordingReader(file).frames()]

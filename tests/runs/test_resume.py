@@ -1,5 +1,6 @@
 """Interrupted runs: resumed they equal uninterrupted ones, and the output folder keeps what is not theirs."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -7,38 +8,37 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from memory_drive import MemoryDrive
 
 from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.recording.options import RecordingOptions
-from bevcli.runs import state as run_state
-from bevcli.runs.run_into_folder import RunOptions, run_into_folder
+from bevcli.recording.writer import RecordingState
+from bevcli.runs import files
+from bevcli.runs.options import RunOptions
+from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
 from bevcli.runs.state import RunState, load_state, save_state
 from bevcli.runs.summary import Counts
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 
-FRAMES, NINE = 6, np.ones(9)
+FRAMES = 6
 pytestmark = pytest.mark.usefixtures("unchecked_recordings")
 
 
 class MadeDrive(MemoryDrive):
     """A drive with the tokens of nuScenes keyframes; loading the frame `broken` fails."""
 
-    broken = FRAMES
-
-    def __init__(self, count=FRAMES, **options):
-        super().__init__(count, **options)
+    def __init__(self, count=FRAMES, broken=FRAMES):
+        super().__init__(count)
+        self.broken = broken
 
     def load(self, place):
         if place == self.broken:
@@ -54,9 +54,21 @@ def model(mini_config):
     return Model(BEVFormer(config).eval(), tracker=TrackerConfig(birth_score=0.0, keep_score=0.0))
 
 
-def run_all(model, out, sequence=None, score=0.0, **arguments):
-    options = RunOptions(recording=RecordingOptions(score=score), save_bev=out.parent / f"{out.name}-bev")
-    return run_into_folder(model, MadeDrive() if sequence is None else sequence, out, options, **arguments)
+def options_for(out, score=0.0):
+    return RunOptions(recording=RecordingOptions(score=score), save_bev=out.parent / f"{out.name}-bev")
+
+
+def run_all(model, out, drive=None, score=0.0, **arguments):
+    return run_into_folder(model, drive or MadeDrive(), out, options_for(out, score), **arguments)
+
+
+def stepped(model, out, drive=None, **arguments):
+    return run_in_folder(model, drive or MadeDrive(), out, options_for(out), **arguments)
+
+
+def interrupt(model, out, frames, drive=None):
+    with pytest.raises(KeyboardInterrupt):
+        run_all(model, out, drive or MadeDrive(broken=frames))
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -101,11 +113,15 @@ def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finis
 
 
 def test_a_run_may_be_interrupted_after_every_frame(model, whole, tmp_path):
-    out, resumed = tmp_path / "out", []
-    run_all(model, out, should_stop=iter([False, True]).__next__)
-    for _ in range(FRAMES):
-        run_all(model, out, resume=True, should_stop=lambda: True, resumed=resumed.append)
-    assert resumed == [2, 3, 4, 5, 6, 6]
+    out = tmp_path / "out"
+    for broken in range(2, FRAMES):
+        with pytest.raises(KeyboardInterrupt):
+            run_all(model, out, MadeDrive(broken=broken), resume=broken > 2)
+        assert len(read_boxes(out / "predictions.json").frames) == broken
+    for done in (FRAMES - 1, FRAMES):
+        with stepped(model, out, resume=True) as running:
+            assert running.done == done
+            assert len(list(running.frames)) == FRAMES - done
     assert_equals(out, whole)
 
 
@@ -119,42 +135,19 @@ def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
 
     hook = model.prepared.get_submodule("neck").register_forward_hook(spoil)
     try:
-        first = run_all(model, tmp_path / "out", should_stop=iter([False, False, True]).__next__)
+        interrupt(model, tmp_path / "out", 3)
     finally:
         hook.remove()
-    failed = first.to_dict()["not_finite_frames"]
+    failed = json.loads((tmp_path / "out/summary.json").read_text())["not_finite_frames"]
     assert [each["frame"] for each in failed] == [1]
     assert run_all(model, tmp_path / "out", resume=True).to_dict()["not_finite_frames"] == failed
-
-
-def test_a_killed_run_goes_on_from_its_last_saved_state(model, whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_state, "SHARE", 1.0)
-    monkeypatch.setattr(run_state, "ASSUMED_S", 0.0)
-    out, copy = tmp_path / "out", tmp_path / "copy"
-
-    def copy_at_four(frame, prediction):
-        if frame.stamp.index == 3:  # what a kill here leaves
-            shutil.copytree(out, copy)
-
-    run_all(model, out, after_frame=copy_at_four)
-    assert (copy / "predictions.json.partial").exists()
-    assert not (copy / "predictions.json").exists()
-    assert len(read_boxes(copy / "predictions.json").frames) == 4
-    resumed = []
-    (tmp_path / "out-bev").rename(tmp_path / "copy-bev")
-    shutil.rmtree(out)
-    copy.rename(out)
-    (tmp_path / "copy-bev").rename(tmp_path / "out-bev")
-    run_all(model, out, resume=True, resumed=resumed.append)
-    assert 2 <= resumed[0] <= 4
-    assert_equals(out, whole)
 
 
 @pytest.fixture(scope="module")
 def interrupted_once(model, tmp_path_factory):
     """The folder of a run after three frames, and a copy of it, with all that is beside them."""
     folder, kept = (tmp_path_factory.mktemp(name) for name in ("interrupted", "kept"))
-    run_all(model, folder / "out", should_stop=iter([False, False, True]).__next__)
+    interrupt(model, folder / "out", 3)
     shutil.copytree(folder, kept, dirs_exist_ok=True)
     return folder, kept
 
@@ -189,51 +182,8 @@ def test_an_interrupted_run_is_not_overwritten_unasked(model, interrupted):
 
 
 def test_a_broken_state_is_an_error_of_one_line(model, interrupted):
-    (interrupted / ".bevcli/state.safetensors").write_bytes(b"no state")
-    with pytest.raises(OutputError, match="`force=True` to start anew") as error:
-        run_all(model, interrupted, resume=True)
-    assert "\n" not in str(error.value)
-
-
-def with_runner(change):
-    return lambda state: replace(state, runner=change(state.runner))
-
-
-def with_memory(**changes):
-    return with_runner(lambda runner: replace(runner, memory=replace(runner.memory, **changes)))
-
-
-def with_size(name, size):
-    return lambda state: replace(state, files=replace(state.files, sizes={**state.files.sizes, name: size}))
-
-
-def with_times(**changes):
-    def change(state):
-        for name, value in changes.items():
-            object.__setattr__(state.counts.whole, name, value)
-        return state
-
-    return change
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        with_memory(bev=torch.zeros(1, 3, 2)),
-        with_memory(bev=torch.zeros(0)),
-        with_memory(pose=Pose(np.zeros(1), np.zeros((2, 2)))),
-        with_size("predictions.json", 1 << 63),
-        with_size("tracks.csv", -1),
-        with_runner(lambda it: replace(it, tracks=replace(it.tracks, tracks=replace(it.tracks.tracks, frames=NINE)))),
-        with_times(count=-1),
-        with_times(total_s=float("nan")),
-        with_times(bins={10**6: 3}),
-    ],
-)  # fmt: skip
-def test_a_state_of_wrong_content_is_an_error_of_one_line(model, interrupted, change):
-    path = interrupted / ".bevcli/state.safetensors"
-    save_state(path, change(load_state(path, RunState[BevHistory])))
-    with pytest.raises(OutputError) as error:
+    (interrupted / ".bevcli/state.pt").write_bytes(b"no state")
+    with pytest.raises(OutputError, match=r"`force=True` .* to start anew") as error:
         run_all(model, interrupted, resume=True)
     assert "\n" not in str(error.value)
 
@@ -265,47 +215,49 @@ def test_a_file_that_no_run_wrote_is_not_overwritten(model, tmp_path):
 
 
 def test_a_second_run_in_a_folder_is_refused_and_names_the_first(model, whole, tmp_path):
-    refusals = []
-
-    def start_another(frame, prediction):
-        for how in ({"force": True}, {"resume": True}):
-            with pytest.raises(OutputError, match=f"in use by another run .process {os.getpid()}: ") as error:
-                run_all(model, tmp_path / "out", **how)
-            refusals.append(error)
-
-    run_all(model, tmp_path / "out", after_frame=start_another)
-    assert len(refusals) == 2 * FRAMES
+    with stepped(model, tmp_path / "out") as running:
+        for _ in running.frames:
+            for how in ({"force": True}, {"resume": True}):
+                with pytest.raises(OutputError, match=f"in use by another run .process {os.getpid()}: "):
+                    run_all(model, tmp_path / "out", **how)
     assert_equals(tmp_path / "out", whole)
     assert not (tmp_path / "out/.bevcli/lock").exists()
 
 
 def test_a_folder_that_is_deleted_during_the_run_is_an_error(model, tmp_path):
-    def delete(frame, prediction):
-        if frame.stamp.index == 2:
-            shutil.rmtree(tmp_path / "out")
-
-    with pytest.raises(OutputError, match=r"deleted|cannot be written"):
-        run_all(model, tmp_path / "out", after_frame=delete)
+    with contextlib.ExitStack() as stack:
+        running = stack.enter_context(stepped(model, tmp_path / "out"))
+        next(running.frames)
+        shutil.rmtree(tmp_path / "out")
+        with pytest.raises(OutputError, match=r"deleted|cannot be written"):
+            list(running.frames)
+        with pytest.raises(OutputError, match=r"deleted|cannot be written"):
+            stack.close()
 
 
 def test_saving_states_takes_two_percent_of_the_time_at_most(model, tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(run_state.time, "perf_counter", lambda: clock[0])
+    clock, saved = [0.0], []
+    monkeypatch.setattr(files.time, "perf_counter", lambda: clock[0])
 
     def slow_save(path, state):
         clock[0] += 0.5
+        saved.append(clock[0])
 
-    monkeypatch.setattr(run_state, "save_state", slow_save)
-    files, summary = SimpleNamespace(state=object), SimpleNamespace(counts=Counts(), is_complete=False)
-    saver = run_state.RunWriter(tmp_path / "state", {}, files, summary)
-    spent = 0
+    with stepped(model, tmp_path / "out", MemoryDrive(1)) as running:
+        frame, prediction = next(running.frames)
+    monkeypatch.setattr(files, "save_state", slow_save)
+    written = SimpleNamespace(add=lambda *_, **__: None, is_complete=False, counts=Counts())
+    state = RunState({}, None, Counts())
+    run_files = files.RunFiles(
+        SimpleNamespace(path=tmp_path, state_path=None), MadeDrive(), model, None, written, state
+    )
+    run_files._recording = SimpleNamespace(state=lambda: RecordingState(""))
+    run_files._write = lambda frame, prediction: None
     for _ in range(10_000):
         clock[0] += 0.1
-        if saver.is_due(RunnerState()):
-            saver.save(RunnerState())
-            spent += 1
-        assert spent * 0.5 <= 0.02 * clock[0] + 0.5  # the first save's time is not known before
-    assert spent >= 30
+        run_files.write((frame, prediction, RunnerState()))
+        assert len(saved) * 0.5 <= 0.02 * clock[0] + 0.5
+    assert len(saved) >= 30
 
 
 DAMAGE = {
@@ -325,7 +277,7 @@ def test_cut_files_are_named_and_left_alone(model, interrupted):
         damage(interrupted / name)
         before = contents(interrupted)
         named = (interrupted / name).resolve().name
-        with pytest.raises(OutputError, match=rf"{named}: `resume`: was cut or removed.*`force=True`"):
+        with pytest.raises(OutputError, match=rf"{named}: `resume` .*: was cut or removed.*`force=True`"):
             run_all(model, interrupted, resume=True)
         assert contents(interrupted) == before
         shutil.copytree(folder, interrupted.parent, dirs_exist_ok=True)
@@ -338,7 +290,7 @@ def test_pipes_and_devices_in_place_of_files_are_not_waited_for(model, interrupt
         path = interrupted / "segmentation/000001.png"
         path.unlink()
         replaced(path)
-        with pytest.raises(OutputError, match=r"000001.png: `resume`: was cut or removed"):
+        with pytest.raises(OutputError, match=r"000001.png: `resume` .*: was cut or removed"):
             run_all(model, interrupted, resume=True)
 
 
@@ -351,8 +303,10 @@ def test_a_pipe_in_place_of_the_calibration_is_replaced(model, interrupted):
 
 
 def test_a_pipe_that_appears_under_way_is_replaced(model, tmp_path):
-    summary, state = tmp_path / "out/summary.json", tmp_path / "state.safetensors"
-    run_all(model, tmp_path / "out", MadeDrive(1), after_frame=lambda frame, prediction: os.mkfifo(summary))
+    summary, state = tmp_path / "out/summary.json", tmp_path / "state.pt"
+    with stepped(model, tmp_path / "out", MadeDrive(1)) as running:
+        next(running.frames)
+        os.mkfifo(summary)
     assert summary.is_file()
     os.mkfifo(state)
     save_state(state, Counts())
@@ -367,7 +321,7 @@ def test_changed_images_are_seen(model, tmp_path):
     for place in range(FRAMES):
         (tmp_path / f"{place}.jpg").write_bytes(bytes(place))
     out = tmp_path / "out"
-    run_all(model, out, WithImages(), should_stop=iter([False, True]).__next__)
+    interrupt(model, out, 2, WithImages(broken=2))
     shutil.copy(tmp_path / "5.jpg", tmp_path / "3.jpg")
     with pytest.raises(OutputError, match=r"images of the input: was 6, \w+, is 6, \w+"):
         run_all(model, out, WithImages(), resume=True)
@@ -396,25 +350,11 @@ def test_nothing_is_deleted_or_written_through_links(model, interrupted):
     assert [path.name for path in elsewhere.rglob("*")] == ["maps", "000000.png"]
 
 
-def run_beside_refused_runs(model, out, after_refusal):
-    """A run into a folder whose lock is deleted before each of the runs that it refuses, one a frame."""
-
-    def start_another(frame, prediction):
-        (out / ".bevcli" / "lock").unlink(missing_ok=True)
-        with pytest.raises(OutputError, match="in use by another run"):
-            run_all(model, out, resume=True)
-        after_refusal(frame)
-
-    run_all(model, out, after_frame=start_another)
-
-
-def test_a_deleted_lock_admits_no_second_run(model, tmp_path):
-    refused = []
-    run_beside_refused_runs(model, tmp_path / "out", lambda frame: refused.append(frame.stamp.index))
-    assert refused == list(range(FRAMES))
-
-
-def test_a_refused_run_leaves_no_lock(model, tmp_path):
-    out, left = tmp_path / "out", []
-    run_beside_refused_runs(model, out, lambda frame: left.extend(out.glob(".bevcli/lock")))
-    assert left == []
+def test_a_deleted_lock_admits_no_second_run_which_leaves_no_lock(model, tmp_path):
+    out = tmp_path / "out"
+    with stepped(model, out) as running:
+        for _ in running.frames:
+            (out / ".bevcli/lock").unlink(missing_ok=True)
+            with pytest.raises(OutputError, match="in use by another run"):
+                run_all(model, out, resume=True)
+            assert not (out / ".bevcli/lock").exists()

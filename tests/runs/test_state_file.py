@@ -1,15 +1,14 @@
 """State files give back what was written, bit by bit, and run nothing."""
 
 import errno
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
@@ -17,7 +16,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.runner import RunnerState
 from bevcli.model.bevformer.bevformer import BevHistory
-from bevcli.runs.state import RunState, load_state, save_state
+from bevcli.runs.state import FORMAT, RunState, load_state, save_state
 from bevcli.runs.summary import Counts
 from bevcli.workshop.bevformer_v2.window import FeatureWindow
 from bevcli.workshop.uniad.uniad import TrackMemory
@@ -74,29 +73,25 @@ def test_a_run_state_takes_the_memory_of_its_model(tmp_path, memory):
 
 def test_a_state_of_another_type_is_refused(tmp_path):
     save_state(tmp_path / "state", FrameStamp(7, "", 5))
+    for kind in (Pose, RunState[None]):
+        with pytest.raises(InputError, match="the state cannot be read"):
+            load_state(tmp_path / "state", kind)
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.mkdir, ("made",)
+
+
+def test_nothing_in_a_file_is_called(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_state(tmp_path / "state", FrameStamp(Hostile(), "", 5))
     with pytest.raises(InputError, match="the state cannot be read"):
-        load_state(tmp_path / "state", Pose)
-    save_state(tmp_path / "state", FrameStamp("7", "", 5))
-    with pytest.raises(InputError, match=r"Expected `int`, got `str` - at `\$\.index`"):
         load_state(tmp_path / "state", FrameStamp)
+    assert not (tmp_path / "made").exists()
 
 
-def test_a_state_of_an_earlier_version_is_refused_in_one_line(tmp_path):
-    save_file({}, tmp_path / "state", {"format": "bevcli-state/1", "tree": "{}"})
-    with pytest.raises(InputError, match=r'state file of this version.*found "bevcli-state/1"'):
-        load_state(tmp_path / "state", FrameStamp)
-
-
-@pytest.mark.parametrize("dtype", ["(1,2", ",", "<U-1", "<U999999999", "O", 7])
-def test_an_array_of_a_wrong_type_is_refused(tmp_path, monkeypatch, dtype):
-    encode = msgspec.msgpack.encode
-    monkeypatch.setattr(msgspec.msgpack, "encode", lambda tree, enc_hook: encode([["car"], dtype]))
-    save_state(tmp_path / "state", None)
-    with pytest.raises(InputError, match="the state cannot be read"):
-        load_state(tmp_path / "state", np.ndarray[Any, np.dtype[np.str_]])
-
-
-@pytest.mark.parametrize("content", [b"", b"nothing", b"\x08" + bytes(7) + b"{}      "])
+@pytest.mark.parametrize("content", [b"", b"nothing", b"bevcli-state/8", FORMAT, FORMAT + bytes(32)])
 def test_another_file_is_an_error_of_one_line(tmp_path, content):
     (tmp_path / "state").write_bytes(content)
     with pytest.raises(InputError, match="state"):
@@ -106,7 +101,7 @@ def test_another_file_is_an_error_of_one_line(tmp_path, content):
 def test_a_state_with_one_changed_byte_is_refused(tmp_path):
     save_state(tmp_path / "state", BevHistory(torch.arange(4.0), Pose.identity()))
     whole = (tmp_path / "state").read_bytes()
-    for place in range(len(whole)):
+    for place in range(0, len(whole), 7):
         broken = bytearray(whole)
         broken[place] ^= 1
         (tmp_path / "state").write_bytes(broken)

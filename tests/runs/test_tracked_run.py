@@ -15,7 +15,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig, track
 from bevcli.recording.options import RecordingOptions
-from bevcli.runs.run_into_folder import RunOptions, run_into_folder
+from bevcli.runs.run_into_folder import RunOptions, run_in_folder, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 
 # The mini model is untrained: its scores and places mean nothing, so every box may start a track.
@@ -74,9 +74,9 @@ def test_a_tracked_run_cut_in_two_equals_the_whole(model):
 
 
 def test_predictions_and_tracks_files_hold_the_identities(model, tmp_path):
-    seen = []
     options = RunOptions(recording=RecordingOptions("minimal", score=0.0))
-    run_into_folder(model, MemoryDrive(3), tmp_path, options, after_frame=lambda _, p: seen.append(p))
+    with run_in_folder(model, MemoryDrive(3), tmp_path, options) as running:
+        seen = [prediction for _, prediction in running.frames]
     frames = read_boxes(tmp_path / "predictions.json").frames
     for frame, prediction in zip(frames, seen, strict=True):
         assert list(frame.boxes.instances) == list(prediction.boxes.instances)

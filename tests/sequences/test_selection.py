@@ -9,7 +9,6 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, FrameStamp
-from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.sequences import images
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.view import DriveView, select_every, select_range, select_rate
@@ -155,7 +154,7 @@ def test_derived_drives_decode_no_image_for_scoring(drive, monkeypatch):
     turned = DriveView(whole, rig=replace(whole.rig, ego_from_bev=np.eye(4)))
     assert Reversed(whole).ground_truth_frame(0).stamp.index == 13  # what only states `load`
     monkeypatch.setattr(images, "decode_image", None)  # as each image would be
-    for derived in (DerivedDrive(whole), turned, ReversedColors(whole), CheckedDrive(whole), DriveView(turned, [1])):
+    for derived in (DerivedDrive(whole), turned, ReversedColors(whole), DriveView(turned, [1])):
         assert not derived.ground_truth_frame(0).images
     assert (turned.ground_truth_frame(0).rig.ego_from_bev == np.eye(4)).all()
 

@@ -32,7 +32,7 @@ from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage
 from bevcli.workshop.scores.detection import ClassMatches, DetectionScores, with_all_columns
 from bevcli.workshop.scores.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
 
-MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
+MATCHES = "matches.pt"  # in the folder of a drive's results: for the joint metrics
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 _COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
 WORST = 10  # drives in the table of the worst ones

@@ -24,14 +24,13 @@ import numpy as np
 import torch
 
 from bevcli.errors import BevcliError
-from bevcli.frame import Frame, Prediction
+from bevcli.frame import Drive
 from bevcli.inference.load import Model
 from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.parsing.files import is_there
 from bevcli.printing import reason_of, valid_text
-from bevcli.rig.sequence_checks import CheckedDrive
 from bevcli.runs.folder import SUMMARY
-from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.format import format_of
@@ -102,18 +101,19 @@ class Worker:
             path = _fetched(drive, job, inputs)
             fetched = time.perf_counter()
             try:
-                sequence = CheckedDrive(job.open(path, drive.scene), shlex.quote(drive.source))
+                sequence = job.open(path, drive.scene)
                 histogram = np.zeros(SCORE_BINS, dtype=np.int64)  # of the boxes that are shown
-
-                def after_frame(frame: Frame, prediction: Prediction) -> None:
-                    scores = prediction.boxes.scores
-                    if scores is not None:
-                        shown = scores[scores >= job.run.recording.score]
-                        np.add(histogram, np.histogram(shown, SCORE_BINS, (0, 1))[0], out=histogram)
-
-                summary = run_into_folder(
-                    self._model, sequence, aside, job.run, after_frame=after_frame, should_stop=should_stop
+                model = self._model.in_engine(
+                    sequence.rig, sequence, parts="`probes` (`--probe`)" if job.run.recording.probes else ""
                 )
+                with run_in_folder(model, sequence, aside, job.run, source=shlex.quote(drive.source)) as running:
+                    for _, prediction in running.frames:
+                        shown = prediction.boxes.scored(job.run.recording.score).scores
+                        if shown is not None:
+                            histogram += np.histogram(shown, SCORE_BINS, (0, 1))[0]
+                        if should_stop():
+                            break
+                summary = running.summary
             except BevcliError as error:
                 raise BevcliError(_with_final_paths(str(error), (path, drive.source), (aside, result))) from None
             if not summary.is_complete:
@@ -161,7 +161,7 @@ class Worker:
         save_state(aside / MATCHES, matches)
         return scores, ""
 
-    def _estimated(self, sequence: CheckedDrive, aside: Path) -> Record:
+    def _estimated(self, sequence: Drive, aside: Path) -> Record:
         """The columns of the score that is estimated without ground truth; empty for weights without a fit."""
         if self._model.weights_hash not in fits():
             return {}

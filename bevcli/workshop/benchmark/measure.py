@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.inference.machine import describe_machine, peak_memory
-from bevcli.inference.pipeline import WriteBehind
+from bevcli.inference.pipeline import write_behind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model.config import ModelConfig
@@ -269,15 +269,13 @@ def _time_run(
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
-    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> bool:
+    def record(step: tuple[Frame, Prediction, RunnerState[Any]]) -> None:
         made.append(time.perf_counter())  # recording begins as soon as the model has made the step, or late
         recording.log(*step[:2])
         fast.state = step[2]
-        return True
 
-    with WriteBehind(record) as writer:
-        for step in fast.runner.run(drive, places, preprocessor, fast.state):
-            writer.put(step)
+    for _ in write_behind(fast.runner.run(drive, places, preprocessor, fast.state), record):
+        pass
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 

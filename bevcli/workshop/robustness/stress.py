@@ -20,7 +20,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
 from bevcli.runs.folder import RunFolder
-from bevcli.runs.state import DIGITS, digest, load_state, run_facts, save_state, saved_state
+from bevcli.runs.state import DIGITS, digest, load_state, run_fingerprint, save_state, saved_state
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView, scenes_of, select, select_range
 from bevcli.workshop.calibration.calibrate import calibrate
@@ -142,7 +142,7 @@ def read_results(path: Path) -> StressResults:
 class StressState:
     """A test after a number of finished conditions, for `resume`."""
 
-    facts: dict[str, str]  # see `run_facts`
+    fingerprint: dict[str, str]  # see `run_fingerprint`
     scores: tuple[ConditionScores, ...] = ()  # of the finished conditions
 
 
@@ -339,7 +339,7 @@ def _order(scores: ConditionScores) -> int:
 
 def _facts(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:
     """The facts that the results depend on, apart from the conditions."""
-    of_drives = [run_facts(model, drive, options) for drive in drives]
+    of_drives = [run_fingerprint(model, drive, options) for drive in drives]
     facts = dict(of_drives[0])
     if len(of_drives) > 1:
         facts |= {name: digest(tuple(of_drive[name] for of_drive in of_drives))[:12] for name in _INPUT_FACTS}
