@@ -257,8 +257,8 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
     for options, message in (
         ({"weights": "w.pth"}, "an exported file holds its weights: leave out `weights=w.pth`"),
         ({"untrained": True}, "leave out `untrained"),
-        ({"precision": "bf16"}, "`precision=bf16`: .* has a fixed precision"),
-        ({"device": "cuda"}, "`device=cuda`: .* runs on the CPU"),
+        ({"precision": "bf16"}, r"`precision=bf16` \(`--precision`\): .* has a fixed precision"),
+        ({"device": "cuda"}, r"`device=cuda` \(`--device`\): .* runs on the CPU"),
     ):
         with pytest.raises(BevcliError, match=message):
             load_model(small_file, **options)

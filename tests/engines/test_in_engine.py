@@ -113,7 +113,9 @@ def test_the_first_time_says_what_it_does(steps, drive, network):
 def test_a_session_takes_the_file_and_int8_needs_frames(steps, drive, network):
     assert Session(chosen(network, "openvino", "int8"), drive.rig).notes == ()
     other = replace(drive.rig, cameras=drive.rig.cameras[:1])
-    with pytest.raises(InputError, match=r"no frames to calibrate with: pass `calibrate_with=DRIVE`"):
+    with pytest.raises(
+        InputError, match=r"no frames to calibrate with: pass `calibrate_with` \(`--int8-drive DRIVE`\)"
+    ):
         Session(chosen(network, "onnxruntime", "int8"), other)
 
 
@@ -162,10 +164,13 @@ def test_probes_need_torch(drive, network):
     ("options", "message"),
     [
         ({"engine": "openvinno"}, "unknown engine .expected torch, onnxruntime, openvino"),
-        ({"engine": "openvino", "precision": "fp16"}, "`engine=openvino` computes in fp32 or bf16 or int8"),
+        (
+            {"engine": "openvino", "precision": "fp16"},
+            r"`engine=openvino` \(`--engine openvino`\) computes in fp32 or bf16 or int8",
+        ),
         ({"engine": "openvino", "device": "mps"}, "PyTorch sees no Apple GPU|runs on the CPU"),
         ({"engine": "torch", "precision": "int8"}, "PyTorch has no INT8"),
-        ({"calibrate_with": STREET}, "`calibrate_with`: is for `precision=int8`"),
+        ({"calibrate_with": STREET}, r"`calibrate_with` \(`--int8-drive`\): is for `precision=int8`"),
         ({"model": "uniad-track-map", "engine": "openvino"}, "a UniAD cannot be exported"),
     ],
 )
@@ -183,12 +188,12 @@ def test_int8_takes_the_first_engine_that_is_installed(monkeypatch):
     monkeypatch.setattr(OpenVinoEngine, "packages", ("no_such_package",))
     assert load_model("demo", precision="int8").engine == "onnxruntime"
     monkeypatch.setattr(OnnxRuntimeEngine, "packages", ("no_such_package",))
-    with pytest.raises(BevcliError, match="`precision=int8`: no engine is installed"):
+    with pytest.raises(BevcliError, match=r"`precision=int8` \(.*\): no engine is installed"):
         load_model("demo", precision="int8")
 
 
 def test_a_model_in_an_engine_needs_a_drive(network):
-    with pytest.raises(BevcliError, match=r"`engine=openvino`: needs a drive"):
+    with pytest.raises(BevcliError, match=r"`engine=openvino` \(`--engine`\): needs a drive"):
         chosen(network, "openvino").prepared.step(torch.zeros(1))
 
 
