@@ -127,6 +127,9 @@ def test_a_window_that_clips_cannot_fill_is_rejected(tmp_path: Path) -> None:
         WINDOW.check_training(1)
     with pytest.raises(ConfigError, match=r"frames after the current one cannot be trained; .* found \[0, 1\]"):
         replace(WINDOW, frames=(0, 1)).check_training(SHORT.clips.frames)
+    for name, architecture in (("uniad-track-map", "UniAD"), ("vad-tiny", "VAD")):
+        with pytest.raises(ConfigError, match=rf"{name}: a {architecture} cannot be trained; expected a BEVFormer"):
+            load_config(name).check_training(2)
     V1.check_training(1)
 
 
