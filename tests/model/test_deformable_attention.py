@@ -1,4 +1,4 @@
-"""Deformable attention compared with its definition as loops, and its initial weights."""
+"""Deformable attention equals its definition as loops; all sampling modules compute the same."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes, sampling_locations
+from bevcli.model.kernels.choose import softmax_of_few
+from bevcli.model.kernels.compiled import CompiledSampling, Hits, sample_hits
+from bevcli.model.kernels.loops import softmax_of_groups
+from bevcli.workshop.benchmark.versions import PaddedSampling
 
-SHAPES = ((4, 6), (2, 3))
+TWO_LEVELS = ((4, 6), (2, 3))
 sample = GridSampling()
 
 
@@ -20,27 +24,26 @@ def test_sampling_equals_its_definition_as_loops() -> None:
     locations = random.uniform(-0.3, 1.3, size=(5, 3, 2, 2, 2))
     weights = random.random((5, 3, 2, 2))
     ours = sample(
-        torch.from_numpy(values).float(), SHAPES, torch.from_numpy(locations).float(), torch.from_numpy(weights), [2, 3]
+        torch.from_numpy(values).float(),
+        TWO_LEVELS,
+        torch.from_numpy(locations).float(),
+        torch.from_numpy(weights),
+        [2, 3],
     )
     np.testing.assert_allclose(ours, _by_loops(values, locations, weights, map_of_query=[0, 0, 1, 1, 1]), atol=1e-5)
 
 
 def test_a_map_that_no_query_samples_changes_nothing() -> None:
     values, locations, weights = torch.randn(3, 24, 2, 4), torch.rand(6, 2, 1, 2, 2), torch.rand(6, 2, 1, 2)
-    with_empty = sample(values, SHAPES[:1], locations, weights, [4, 0, 2])
-    without = sample(values[[0, 2]], SHAPES[:1], locations, weights, [4, 2])
+    with_empty = sample(values, TWO_LEVELS[:1], locations, weights, [4, 0, 2])
+    without = sample(values[[0, 2]], TWO_LEVELS[:1], locations, weights, [4, 2])
     assert torch.equal(with_empty, without)
-
-
-def test_without_queries_the_result_has_no_rows() -> None:
-    empty = sample(torch.randn(2, 24, 2, 4), SHAPES[:1], torch.rand(0, 2, 1, 2, 2), torch.rand(0, 2, 1, 2), [0, 0])
-    assert empty.shape == (0, 8)
 
 
 def test_samples_far_outside_the_map_are_zero() -> None:
     locations = torch.full((1, 1, 1, 1, 2), 6.7e6)
     assert torch.equal(
-        sample(torch.ones(1, 24, 1, 4), SHAPES[:1], locations, torch.ones(1, 1, 1, 1), [1]), torch.zeros(1, 4)
+        sample(torch.ones(1, 24, 1, 4), TWO_LEVELS[:1], locations, torch.ones(1, 1, 1, 1), [1]), torch.zeros(1, 4)
     )
 
 
@@ -48,7 +51,7 @@ def test_gradients_reach_values_locations_and_weights() -> None:
     values = torch.randn(1, 30, 2, 2, dtype=torch.float32, requires_grad=True)
     locations = torch.rand(3, 2, 2, 2, 2, requires_grad=True)
     weights = torch.rand(3, 2, 2, 2, requires_grad=True)
-    sample(values, SHAPES, locations, weights, [3]).square().sum().backward()
+    sample(values, TWO_LEVELS, locations, weights, [3]).square().sum().backward()
     for leaf in (values, locations, weights):
         assert leaf.grad is not None
         assert leaf.grad.abs().sum() > 0
@@ -56,7 +59,7 @@ def test_gradients_reach_values_locations_and_weights() -> None:
 
 def test_offsets_are_cells_of_their_own_level() -> None:
     offsets = torch.ones(1, 2, 1, 2)
-    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, level_sizes(SHAPES, offsets.device))
+    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, level_sizes(TWO_LEVELS, offsets.device))
     expected = [[0.5 + 1 / 6, 0.5 + 1 / 4], [0.5 + 1 / 3, 0.5 + 1 / 2]]
     torch.testing.assert_close(locations[0, :, 0], torch.tensor(expected))
 
@@ -79,12 +82,133 @@ def test_untrained_heads_sample_in_a_ring_with_equal_weights(heads: int) -> None
 def _by_loops(values: np.ndarray, locations: np.ndarray, weights: np.ndarray, map_of_query: list[int]) -> np.ndarray:
     queries, heads, levels, points = weights.shape
     out = np.zeros((queries, heads, values.shape[-1]))
-    starts = [0, SHAPES[0][0] * SHAPES[0][1]]
+    starts = [0, TWO_LEVELS[0][0] * TWO_LEVELS[0][1]]
     for query, head, level, point in np.ndindex(queries, heads, levels, points):
-        height, width = SHAPES[level]
+        height, width = TWO_LEVELS[level]
         x, y = locations[query, head, level, point] * (width, height) - 0.5
         for row, column in np.ndindex(height, width):
             share = max(0.0, 1 - abs(x - column)) * max(0.0, 1 - abs(y - row))
             value = values[map_of_query[query], starts[level] + row * width + column, head]
             out[query, head] += weights[query, head, level, point] * share * value
     return out.reshape(queries, -1)
+
+
+SHAPES = ((5, 7), (3, 4), (1, 1))
+PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()
+CELLS = sum(height * width for height, width in SHAPES)
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+
+
+def case(depth: int = 4, counts: tuple[int, ...] = (200, 0, 3), dtype: torch.dtype = torch.float32):
+    """Locations inside a map, on its rim and far outside."""
+    random = torch.Generator().manual_seed(depth)
+    queries = sum(counts)
+    values = torch.randn(len(counts), CELLS, 3, depth, generator=random).to(dtype)
+    locations = torch.rand(queries, 3, len(SHAPES), 2, 2, generator=random) * 1.6 - 0.3
+    for xy, query in zip((6.7e6, -6.7e6, 0.0, 1.0), range(queries), strict=False):
+        locations[query] = xy
+    weights = torch.rand(queries, 3, len(SHAPES), 2, generator=random)
+    return values, SHAPES, locations, weights, counts
+
+
+@pytest.mark.parametrize("depth", [1, 4, 8, 32, 33, 48, 64])
+@pytest.mark.parametrize("sampling", [PADDED, COMPILED])
+def test_sampling_modules_equal_the_plain_one(sampling, depth):
+    inputs = case(depth)
+    torch.testing.assert_close(sampling(*inputs), PLAIN(*inputs))
+
+
+@pytest.mark.parametrize("depth", [8, 33])
+def test_hits_are_sampled_as_by_their_locations_and_weights(depth):
+    values, shapes, _, logits, counts = case(depth)
+    random = torch.Generator().manual_seed(0)
+    points, count = torch.rand(sum(counts), 2, 2, generator=random), sum(counts)
+    cells = torch.randperm(count, generator=random)
+    hits = Hits(cells, points, counts, torch.randint(2, (count,), generator=random))
+    logits = 50 * torch.stack([logits, logits.flip(0)], dim=2)  # two predictions, each for its own map
+    offsets = 3 * torch.randn(*logits.shape, 2, generator=random)
+    weights = logits.flatten(-2).softmax(-1).view_as(logits)
+    found = [each[cells, :, hits.prediction] for each in (offsets, weights)]
+    locations = sampling_locations(points[:, None, None], found[0], level_sizes(shapes, offsets.device))
+    expected = COMPILED(values, shapes, locations, found[1], counts)
+    torch.testing.assert_close(sample_hits(values, shapes, hits, offsets, logits), expected)
+    logits[cells[3], :, hits.prediction[3]] = torch.nan
+    is_damaged = sample_hits(values, shapes, hits, offsets, logits).isnan().any(1)
+    assert is_damaged.nonzero().flatten().tolist() == [3]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("depth", [1, 16, 33])
+def test_compiled_loops_have_the_gradients_of_the_plain_module(depth, threads, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    gradients = []
+    for sampling in (PLAIN, COMPILED):
+        values, shapes, locations, weights, counts = case(depth)
+        learned = [tensor.requires_grad_() for tensor in (values, locations, weights)]
+        result = sampling(values, shapes, locations, weights, counts)
+        direction = torch.randn(result.shape, generator=torch.Generator().manual_seed(1))
+        gradients.append(torch.autograd.grad((result * direction).sum(), learned))
+    for expected, found in zip(*gradients, strict=True):
+        inside = expected.abs() < 1e6  # the gradients of locations 6.7e6 away are not defined
+        torch.testing.assert_close(found[inside], expected[inside], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_values_are_summed_in_float32(dtype):
+    inputs = case(16, dtype=dtype)
+    found = COMPILED(*inputs)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, PLAIN(*inputs))
+
+
+@pytest.mark.parametrize("sampling", [PLAIN, PADDED, COMPILED])
+def test_without_queries_the_result_has_no_rows(sampling):
+    assert sampling(*case(4, (0, 0))).shape == (0, 12)
+
+
+def test_the_memory_layout_of_the_inputs_changes_nothing():
+    values, shapes, locations, weights, counts = case(8)
+    strided = values.transpose(1, 2).contiguous().transpose(1, 2)
+    strided_weights = weights.movedim(0, -1).contiguous().movedim(-1, 0)
+    found = COMPILED(strided, shapes, locations, strided_weights, counts)
+    torch.testing.assert_close(found, PLAIN(values, shapes, locations, weights, counts))
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads():
+    inputs = case(32, (3000,))
+    threads = torch.get_num_threads()
+    results = []
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        results.append(COMPILED(*inputs))
+    torch.set_num_threads(threads)
+    assert torch.equal(*results)
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_the_gpu_equals_the_cpu(dtype):
+    gpu = torch.device("cuda")
+    sampling = pytest.importorskip("bevcli.model.kernels.triton_attention").TritonSampling()
+    values, shapes, locations, weights, counts = case(32, dtype=dtype)
+    on_gpu = (values.to(gpu), shapes, locations.to(gpu), weights.to(gpu), counts)
+    found = sampling(*on_gpu).float().cpu()
+    expected = PLAIN(values, shapes, locations, weights, counts)
+    torch.testing.assert_close(found, expected, rtol=2e-2 if dtype != torch.float32 else 1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("elements", [1, 4, 8, 16])
+def test_the_softmax_of_few_elements_equals_that_of_pytorch(elements):
+    logits = 200 * torch.randn(50, 3, elements, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(softmax_of_few(logits[:, :, None])[:, :, 0], logits.softmax(-1))
+
+
+@pytest.mark.parametrize("count", [4, 6, 8, 32])
+def test_the_compiled_softmax_equals_that_of_pytorch(count):
+    logits = 50 * torch.randn(3 * count, generator=torch.Generator().manual_seed(0))
+    logits[0], logits[count] = torch.nan, torch.inf
+    found = logits.numpy().copy()
+    softmax_of_groups(found, count, np.empty(len(found), np.int32))
+    expected = logits.view(3, count).softmax(-1).flatten()
+    torch.testing.assert_close(torch.from_numpy(found), expected, equal_nan=True)
