@@ -6,6 +6,7 @@ trimesh reads them, in a process of its own with limits of memory and time.
 import io
 import os
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -126,8 +127,6 @@ def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
 
 def write_parts(path: str, *color: str) -> str | int | None:
     """Write the arrays of a mesh file to stdout, for `read_mesh`. Returns what `sys.exit` takes."""
-    import sys
-
     try:
         corners, normals, faces, colors = zip(*read_parts(Path(path), tuple(map(int, color))), strict=True)
         starts = np.cumsum([0, *map(len, corners[:-1])])

@@ -18,9 +18,11 @@ from command_line import MINI_TOML, command
 from file_server import serving
 
 from bevcli.checkpoints import bundled_weights
+from bevcli.cli.progress import load_with_bar
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
+from bevcli.inference.options import ModelOptions
 from bevcli.model.temporal_model import build_model
 from bevcli.published import all_weights, named_weights, own_table, read_sources
 from bevcli.weights import fetch
@@ -318,6 +320,16 @@ def test_a_hugging_face_repository_is_an_address(server, model, content, monkeyp
     assert read_sources()["own"].url == "https://huggingface.co/team/bev/resolve/v2/deep/weights.safetensors"
     monkeypatch.setenv("HF_ENDPOINT", f"{server[0]}/whole/")
     assert fetch_weights(named_weights("own")).path.read_bytes() == content
+
+
+def test_a_command_shows_the_download_of_its_models_weights(server, model, tmp_path, capsys):
+    url, handler = server
+    add_source(model, f"{url}/whole/weights.safetensors")
+    options = ModelOptions(model="own", device="cpu", fetch=True)
+    for _ in range(2):
+        assert load_with_bar(options).weights == tmp_path / "weights/own/weights.safetensors"
+    assert capsys.readouterr().err.startswith(f"note: own: {url}/whole/weights.safetensors\n")
+    assert len(handler.asked) == 1
 
 
 def test_a_model_is_loaded_by_the_name_of_its_weights(server, model, tmp_path):
