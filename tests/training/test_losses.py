@@ -9,22 +9,35 @@ import numpy as np
 import pytest
 import torch
 
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.workshop.training.losses import (
+    DenseHead,
+    DenseLossConfig,
     DetectionLossConfig,
+    dense_loss,
     detection_loss,
     dice_costs,
     dice_loss,
     focal_cost,
     focal_loss,
-    hungarian_matching,
+    hungarian_matchings,
 )
 from bevcli.workshop.training.targets import DetectionTargets
+
+
+def pairs(costs: torch.Tensor, truths: int | None = None) -> tuple[list[int], list[int]]:
+    """The queries that are matched, and the ground truth of each. truths: how many are no padding."""
+    count = costs.shape[1] if truths is None else truths
+    of_queries, of_truths = (matches[0].tolist() for matches in hungarian_matchings(costs[None], [count]))
+    queries = [query for query, truth in enumerate(of_queries) if truth >= 0]
+    assert sorted(queries) == sorted(query for query in of_truths if query >= 0)
+    return queries, [of_queries[query] for query in queries]
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])
 def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> None:
     costs = np.random.default_rng(sum(shape)).normal(size=shape)
-    queries, truths = (indices.tolist() for indices in hungarian_matching(torch.from_numpy(costs)))
+    queries, truths = pairs(torch.from_numpy(costs))
     small, large = sorted(shape)
     wide = costs if shape[0] == small else costs.T
     cheapest = min(sum(wide[i, p] for i, p in enumerate(order)) for order in permutations(range(large), small))
@@ -33,12 +46,11 @@ def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> 
 
 
 def test_no_ground_truth_gives_no_pairs() -> None:
-    assert len(hungarian_matching(torch.zeros(4, 0))[0]) == 0
+    assert pairs(torch.zeros(4, 1), 0) == ([], [])
 
 
 def test_a_pair_with_a_nan_cost_is_chosen_last() -> None:
-    queries, truths = hungarian_matching(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
-    assert (queries.tolist(), truths.tolist()) == ([0, 1], [1, 0])
+    assert pairs(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]])) == ([0, 1], [1, 0])
 
 
 def test_focal_loss_by_hand() -> None:
@@ -146,3 +158,32 @@ def test_without_boxes_every_query_is_background() -> None:
     loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
     assert loss["boxes"].item() == 0
     assert loss["classes"].item() == pytest.approx(2 * 6 * 0.75 / 4 * log(2))
+
+
+GRID = BevGrid(4, 4, (-4, 4), (-4, 4), (-3, 3), 4)  # cells of 2 m, centres at ±1 and ±3
+
+
+def at(x: float, y: float) -> list[float]:
+    return [x, y, 0, 0, 0, 0, 0, 0, 0, 0]
+
+
+def zero_head() -> DenseHead:
+    head = DenseHead(2, 3, GRID)
+    for parameter in head.parameters():
+        torch.nn.init.zeros_(parameter)
+    return head
+
+
+def test_cells_in_reach_are_positives_of_the_nearest_object() -> None:
+    truth = DetectionTargets(torch.tensor([2, 0]), torch.tensor([at(1, 1), at(1.5, 3)]))
+    config, weights = DenseLossConfig(weight=2.0, reach_m=1.0), DetectionLossConfig(box_weight=0.5)
+    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [truth], config, weights)
+    # Two cells are positives: (1, 1) without an error, (1, 3) with half a metre.
+    assert loss["cell boxes"].item() == pytest.approx(2.0 * 0.5 * 0.5 / 2)
+
+
+def test_a_frame_without_objects_has_negatives_only() -> None:
+    nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
+    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig())
+    assert loss["cell boxes"].item() == 0
+    assert loss["cell classes"].item() > 0

@@ -8,10 +8,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
@@ -44,19 +42,8 @@ def focal_cost(logits: Tensor) -> Tensor:
     return positive - negative
 
 
-def hungarian_matching(costs: Tensor) -> tuple[Tensor, Tensor]:
-    """The one-to-one assignment with the smallest sum of costs: (K,) int64 query and (K,) ground truth indices.
-
-    costs: (Q, G) of each query and ground truth. The K = min(Q, G) pairs are on their device, sorted by query.
-    """
-    queries, truths = (
-        torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(_finite(costs))
-    )
-    return queries, truths
-
-
 def hungarian_matchings(costs: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The assignments of many matrices at once, with one copy to the CPU and one back.
+    """The one-to-one assignments with the smallest sums of costs. Many matrices take one copy to the CPU and one back.
 
     Args:
         costs: (..., B, Q, G) of each query and ground truth.
@@ -66,7 +53,8 @@ def hungarian_matchings(costs: Tensor, counts: Sequence[int]) -> tuple[Tensor, T
     -1 for none.
     """
     *leading, queries, truths = costs.shape
-    matrices = _finite(costs).reshape(-1, queries, truths)
+    finite = costs.detach().cpu().double().nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST)
+    matrices = finite.numpy().reshape(-1, queries, truths)
     pairs = torch.full((len(matrices), queries + truths), -1)
     numbers = pairs.numpy()
     for index, matrix in enumerate(matrices):
@@ -75,11 +63,6 @@ def hungarian_matchings(costs: Tensor, counts: Sequence[int]) -> tuple[Tensor, T
         numbers[index, queries + of_truths] = of_queries
     truth_of_query, query_of_truth = upload(pairs, costs.device).split([queries, truths], dim=1)
     return truth_of_query.view(*leading, queries), query_of_truth.view(*leading, truths)
-
-
-def _finite(costs: Tensor) -> NDArray[np.float64]:
-    finite = costs.detach().cpu().double()
-    return np.asarray(finite.nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST).numpy())
 
 
 VELOCITY_START = 8  # entries 8 and 9 of a box code are vx and vy

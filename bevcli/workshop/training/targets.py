@@ -86,25 +86,16 @@ def pad_rows(tensors: Sequence[Tensor]) -> Tensor:
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
     """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
-    return box_targets(boxes_inside(boxes, config), config.classes)
-
-
-def boxes_inside(boxes: Boxes3D, config: ModelConfig) -> Boxes3D:
-    """The boxes (ground truth, bev frame) that are `detection_targets`, in their order."""
     grid = config.bev_grid
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
-    return _learned(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
+    return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
 def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
     """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
-    kept = _learned(boxes, classes)
+    kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
     labels = [classes.index(name) for name in kept.classes]
     return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
-
-
-def _learned(boxes: Boxes3D, classes: tuple[str, ...]) -> Boxes3D:
-    return boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
 
 
 def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
