@@ -11,7 +11,10 @@
 Every name is imported when it is first used: `import bevcli` itself loads no PyTorch. See docs/python.md.
 """
 
+import ast
 import importlib
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bevcli._version import __version__ as __version__
@@ -57,50 +60,25 @@ if TYPE_CHECKING:
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
     from bevcli.workshop.video.video import video as video
 
-# The public names by the modules that define them.
-_NAMES = {
-    "bevcli.workshop.calibration.calibrate": "calibrate",
-    "bevcli.errors": "BevcliError",
-    "bevcli.workshop.scores.evaluate": "evaluate",
-    "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Drive Sequence",
-    "bevcli.geometry.boxes": "Box3D Boxes3D",
-    "bevcli.geometry.cameras": "Camera CameraRig Distortion",
-    "bevcli.geometry.ego_motion": "Kinematics",
-    "bevcli.geometry.transforms": "Pose",
-    "bevcli.inference.load": "Model load_model",
-    "bevcli.inference.run": "Session run",
-    "bevcli.recording.options": "RecordingOptions",
-    "bevcli.workshop.scores.record": "record",
-    "bevcli.recording.writer": "Recording",
-    "bevcli.rig.check_calibration": "check_calibration",
-    "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
-    "bevcli.sequences.files.calibration_file": "read_calibration",
-    "bevcli.sequences.open": "open_sequence",
-    "bevcli.weights.model_file": "model_file_for",
-    "bevcli.workshop.batch.batch": "batch",
-    "bevcli.workshop.engines.write_model": "export_onnx quantize",
-    "bevcli.workshop.formats.convert": "convert",
-    "bevcli.workshop.hub.pack": "pack_model",
-    "bevcli.workshop.odometry.measure": "measure_motion",
-    "bevcli.workshop.scores.compare": "compare",
-    "bevcli.workshop.synth.drive": "render",
-    "bevcli.workshop.training.train": "train validate",
-    "bevcli.workshop.trust.estimate": "estimate_score",
-    "bevcli.workshop.formats.export": "export",
-    "bevcli.viewer.recording_file": "screenshot show",
-    "bevcli.workshop.video.video": "video",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-__all__ = list(_MODULES)
+
+@cache
+def _modules() -> dict[str, str]:
+    """The public names by the modules that define them: the imports above, read from this file."""
+    body = ast.parse(Path(__file__).read_text(encoding="utf-8")).body
+    (block,) = (node for node in body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name == "__all__":
+        return list(_modules())
+    if name not in _modules():
         raise AttributeError(f"module 'bevcli' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULES[name]), name)
+    value = getattr(importlib.import_module(_modules()[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return sorted({*globals(), *_modules()})
