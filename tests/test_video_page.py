@@ -57,7 +57,7 @@ def test_a_video_alone_is_told_in_one_line_what_is_missing(folder, name):
     done = command(folder, name, "dash.mp4", *model)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "pass --fov 70 and --height 1.5, or --calibration FILE" in done.stderr
+    assert "pass `fov_deg=70` (`--fov 70`) and `height=1.5` (`--height 1.5`), or `calibration`" in done.stderr
 
 
 def test_a_video_is_one_camera_of_a_calibration_by_its_name(folder):

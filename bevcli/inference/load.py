@@ -108,7 +108,7 @@ class Model:
         if not isinstance(calibration, CameraRig | str | Path):
             found = "is missing" if calibration is None else f"is a {type(calibration).__name__}"
             raise InputError(
-                f"`calibration` (`--calibration`) {found}: model {self.name} does not know where your cameras are: "
+                f"`calibration` {found}: model {self.name} does not know where your cameras are: "
                 "pass a calibration.json, or a CameraRig such as `drive.rig`"
             )
         rig = calibration if isinstance(calibration, CameraRig) else read_calibration(Path(calibration))

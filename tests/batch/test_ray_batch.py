@@ -168,7 +168,7 @@ def test_a_worker_that_cannot_start_ends_the_batch_with_one_line(tmp_path):
     write_fleet(tmp_path / "drives", 2, frames=1)
     done = command(tmp_path, *BATCH, "--workers", "2", "--gpus-per-worker", "1")
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith("error: --gpus-per-worker 1: Ray has 0 GPUs")
+    assert done.stderr.splitlines()[-1].startswith("error: `gpus=1` (`--gpus-per-worker`): Ray has 0 GPUs")
     shutil.rmtree(tmp_path / "out")
     done = command(tmp_path, *BATCH, "--ray", "127.0.0.1:1")  # nothing listens there
     assert done.returncode == 1

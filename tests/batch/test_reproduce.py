@@ -76,7 +76,7 @@ def test_real_frames_are_scored_and_an_interrupted_run_goes_on(place, shared):
     assert "these of 4: they need not agree" in done.stderr
     [result] = (place / "out/drives").iterdir()
     written = result.stat().st_mtime_ns
-    assert "pass --resume to go on with it" in command(place, *arguments).stderr
+    assert "pass `resume=True` (`--resume`) to go on with it" in command(place, *arguments).stderr
     again = command(place, *arguments, "--resume", "--json")
     assert json.loads(again.stdout)["scores"]["NDS"]["published"] == 0.5
     assert result.stat().st_mtime_ns == written

@@ -58,13 +58,13 @@ def test_a_shell_is_given_the_names_that_start_with_the_text():
 
 @pytest.mark.parametrize("name", ["cuda:", "gpu", "cuda:x"])
 def test_an_unknown_device_is_an_error(name):
-    with pytest.raises(BevcliError, match=f"`device={name}`: unknown device"):
+    with pytest.raises(BevcliError, match=rf"`device={name}` \(`--device`\): unknown device"):
         choose_device(name)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_numbered_gpu_that_is_not_there_is_an_error():
-    with pytest.raises(BevcliError, match="`device=cuda:1`: PyTorch sees no CUDA GPU here"):
+    with pytest.raises(BevcliError, match=r"`device=cuda:1` \(`--device`\): PyTorch sees no CUDA GPU here"):
         choose_device("cuda:1")
 
 

@@ -255,7 +255,7 @@ def test_a_command_of_another_package_appears(tmp_path):
         "def greet(greeting: GreetingOptions) -> None:\n"
         '    """Print a greeting."""\n'
         "    if greeting.name == 'nobody':\n"
-        "        raise InputError('pass another `name`')\n"
+        "        raise InputError('pass another `name` (`--to`)')\n"
         "    print('hello', greeting.name)\n"
     )
     package = tmp_path / "greeting-1.0.dist-info"
@@ -271,7 +271,7 @@ def test_a_command_of_another_package_appears(tmp_path):
     shown = program("--help").stdout
     assert shown.index("Deploy") < shown.index("Other commands") < shown.index("Print a greeting.")
     assert program("greet", "--to", "me").stdout == "hello me\n"
-    assert program("greet", "--to", "nobody").stderr == "error: pass another --to\n"
+    assert program("greet", "--to", "nobody").stderr == "error: pass another `name` (`--to`)\n"
 
 
 def test_a_command_imports_no_other_file_of_commands():

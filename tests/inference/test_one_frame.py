@@ -60,7 +60,8 @@ def test_wrong_arguments_are_told_what_to_pass(model, images):
         session.step(images, here, 1.5)
     with pytest.raises(InputError, match="pass an int"):
         session.step(images, here, "now")
-    with pytest.raises(WeightsError, match=r"`model=mine\.pth`: is a file of weights: pass it as `weights=mine\.pth`"):
+    expected = r"`model=mine\.pth` \(`--model`\): is a file of weights: pass it as `weights=mine\.pth`"
+    with pytest.raises(WeightsError, match=expected):
         bevcli.load_model("mine.pth")
     with pytest.raises(InputError, match=r"`sequence=drive`: .*: pass what `bevcli\.open_sequence` returns"):
         bevcli.run(model, "drive")

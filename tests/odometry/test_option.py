@@ -121,7 +121,7 @@ def test_a_drive_without_poses_names_the_option(folder, tmp_path):
     done = command(tmp_path, "run", str(folder), "--model", "mini.toml", "--untrained")
     assert done.returncode == 1
     assert "ego_motion.csv: the file is missing" in done.stderr
-    assert "pass --odometry to measure them from the images, --static if the vehicle stands" in done.stderr
+    assert "pass `odometry=True` (`--odometry`) to measure them from the images, " in done.stderr
 
 
 def test_a_run_measures_first_and_says_so(folder, tmp_path, measuring):

@@ -60,7 +60,7 @@ def test_a_note_a_set_names_dropped_boxes_with_counts(prepare: Callable[..., Tra
     job = prepare("d000", "d001", "d002", classes=("bicycle", "deer"))
     dropped, absent, scored, _ = job.notes
     assert dropped.startswith(
-        "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map`"
+        "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map` "
     )
     assert absent == "the 2 drives to train on: no box has the class deer of the model mini"
     assert scored.startswith("the drive to score on: 3 boxes have other classes and are not scored: car (3)")
@@ -148,9 +148,9 @@ def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
     scored = scored_drives(DriveOptions(split=file), load_config(fleet / "mini.toml"))
     assert isinstance(scored, FolderDrives)
     assert [scored.open(index).name for index in range(len(scored))] == ["d003"]
-    with pytest.raises(InputError, match="states the drives: remove `data`, or `split`"):
+    with pytest.raises(InputError, match=r"states the drives: remove `data` \(`--data`\), or `split` \(`--split`\)"):
         scored_drives(DriveOptions(data=(fleet,), split=file), load_config(fleet / "mini.toml"))
-    with pytest.raises(InputError, match="remove `held_out`, or `split`"):
+    with pytest.raises(InputError, match=r"remove `held_out` \(`--held-out`\), or `split` \(`--split`\)"):
         prepare_training("demo", CPU, DriveOptions(split=file), TrainOptions(tmp_path / "other", held_out=1))
 
 
@@ -212,7 +212,7 @@ def test_changes_have_the_types_of_toml() -> None:
     ],
 )
 def test_a_wrong_change_is_one_clear_line(key: str, value: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=f"`changes`: .*{message}"):
+    with pytest.raises(ConfigError, match=rf"`changes` \(`--set`\): .*{message}"):
         with_changes(TrainingConfig(), {key: value})
 
 

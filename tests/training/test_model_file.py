@@ -94,7 +94,7 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
     with pytest.raises(InputError, match="memory: has no ground truth boxes"):
         look_at([MemoryDrive(2)], FRAME)
     for data, message in (
-        (DriveOptions(), "give either `data=DIR`"),
+        (DriveOptions(), r"give either `data` \(`--data[^`]*`\)"),
         (DriveOptions(rendered=(1,)), "rendered drives are trained with demo"),
     ):
         with pytest.raises(InputError, match=message):
