@@ -1,7 +1,6 @@
 """Reads TOML files into frozen dataclasses. An unknown key or a wrong type is an error that names file and key."""
 
 import dataclasses
-import difflib
 import json
 import math
 import re
@@ -21,6 +20,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
+from bevcli.printing import did_you_mean
 from bevcli.published import hub_model, read_sources
 from bevcli.registry import entries, is_of_hub, known_models, load
 
@@ -150,7 +150,8 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(kind)
     for key in table.keys() - fields.keys():
-        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
+        hint = did_you_mean(key, fields, f"expected one of {', '.join(fields)}", '"')
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
     values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
@@ -202,8 +203,3 @@ def _describe(kind: Any) -> str:
         return f"a list of {len(arguments)}, each element {_describe(arguments[0])}"
     names = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
     return names.get(kind, "a table")
-
-
-def _nearest(key: str, keys: list[str]) -> str:
-    match = difflib.get_close_matches(key, keys, n=1)
-    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(keys)}"

@@ -13,12 +13,13 @@ A text of the library names an option as both spell it: "pass `rate_hz` (`--rate
 """
 
 import dataclasses
-import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform, get_type_hints
+
+from bevcli.printing import did_you_mean
 
 Reads = Literal["path", "path or name", "path or pattern"]
 _Class = TypeVar("_Class", bound=type[Any])
@@ -130,9 +131,8 @@ def refuse(left: Mapping[str, Any], function: str, *kinds: type[Any]) -> None:
     """Raise TypeError for keywords that a function does not take. kinds: the dataclasses of its options."""
     if left:
         name, known = next(iter(left)), [field.name for kind in kinds for field in dataclasses.fields(kind)]
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f": did you mean {near[0]}?" if near else f" (expected some of {', '.join(sorted(set(known)))})"
-        raise TypeError(f"{function}() has no option {name}{hint}")
+        hint = did_you_mean(name, known, f"expected some of {', '.join(sorted(set(known)))}")
+        raise TypeError(f"{function}() has no option {name}: {hint}")
 
 
 def defaults(kind: type[Any]) -> dict[str, Any]:

@@ -1,10 +1,11 @@
 """Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
 
+import difflib
 import io
 import math
 import sys
 import unicodedata
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 LONGEST_MESSAGE = 1000  # characters
@@ -37,6 +38,12 @@ def say(*texts: object, err: bool = False) -> None:
     if not text.replace("\n", "").isprintable():
         text = "".join(char if char in "\n\t" else _escaped(char) for char in text)
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str, quote: str = "") -> str:
+    """The question for the known name that is most similar, or another text. quote: mark around the name."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"did you mean {quote}{near[0]}{quote}?" if near else otherwise
 
 
 def print_note(text: str) -> None:

@@ -1,7 +1,6 @@
 """Commands for typer from functions that take dataclasses of options."""
 
 import dataclasses
-import difflib
 import glob
 import os
 import types
@@ -16,10 +15,12 @@ import typer
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
+from bevcli.printing import did_you_mean
 from bevcli.registry import is_of_hub
 from bevcli.sequences.format import option_classes
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+_UNIONS = (Union, types.UnionType)
 
 
 def argument(help: str, reads: Reads | None = "path", **settings: Any) -> Option:
@@ -41,19 +42,15 @@ InputDrive = Annotated[
 
 @dataclass(frozen=True)
 class Part:
-    """The options that a command takes of a dataclass, in an annotation: `Annotated[ModelOptions, Part(only=…)]`.
-
-    Or those that it takes of `FormatValues`.
+    """The options that a command takes of a dataclass or of `FormatValues`: `Annotated[ModelOptions, Part(only=…)]`.
 
     Attributes:
         only: names of its fields; empty for all of them.
         without: names of fields that the command does not have.
-        classes: makes the list of the dataclasses whose options are in `FormatValues`.
     """
 
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
-    classes: Callable[[], list[type[Any]]] = option_classes
 
 
 @dataclass(frozen=True)
@@ -74,41 +71,31 @@ class _Flag:
     default: Any
     panel: str | None
 
-    @property
-    def spellings(self) -> list[str]:
-        return self.option.spellings(self.name)
-
-    @property
-    def yes(self) -> str:
-        """Spelling without that of the opposite."""
-        return self.spellings[0].partition("/")[0]
-
     def parameter(self) -> Parameter:
         """The parameter of a function, as typer reads it."""
-        stated, kind, default = self.option, self.kind, self.default
-        kinds = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+        option, kind, default = self.option, self.kind, self.default
+        kinds = get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
         if Path in kinds:  # of several that Python takes, such as `str | Path | None`
             kind = Path | None if type(None) in kinds else Path
-        if stated.flag_value is not None:
+        if option.flag_value is not None:
             kind, default = bool, False
-        elif stated.repeatable or stated.parse is not None:
-            kind = str if stated.parse is not None else get_args(self.kind)[0]
-            kind = types.GenericAlias(list, (kind,)) if stated.repeatable else kind
+        elif option.repeatable or option.parse is not None:
+            kind = str if option.parse is not None else get_args(self.kind)[0]
+            kind = types.GenericAlias(list, (kind,)) if option.repeatable else kind
             if default is not Parameter.empty:
                 kind, default = kind | None, None
         value = kind  # what `--help` calls by its name: PATH, TEXT or the choices
-        while get_origin(value) in (list, tuple, Union, types.UnionType):
+        while get_origin(value) in (list, tuple, *_UNIONS):
             value = get_args(value)[0]
-        metavar = None if value is bool else "|".join(get_args(value)) or _METAVARS.get(value)
-        settings: dict[str, Any] = {
-            "help": stated.help,
-            "metavar": stated.metavar or (self.name.upper() if stated.is_argument else metavar),
-        }
-        if stated.is_argument:
+        metavar = self.name.upper() if option.is_argument else "|".join(get_args(value)) or _METAVARS.get(value)
+        settings: dict[str, Any] = {"help": option.help, "metavar": option.metavar or metavar}
+        if value is Path:
+            settings["parser"] = _path
+        if option.is_argument:
             info = typer.Argument(**settings)
         else:
-            settings |= {"min": stated.minimum, "max": stated.maximum, "autocompletion": stated.complete}
-            info = typer.Option(*self.spellings, rich_help_panel=self.panel, **settings)
+            settings |= {"min": option.minimum, "max": option.maximum, "autocompletion": option.complete}
+            info = typer.Option(*option.spellings(self.name), rich_help_panel=self.panel, **settings)
         return Parameter(self.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
     def value(self, given: Any) -> Any:
@@ -122,47 +109,52 @@ class _Flag:
         try:
             return tuple(given) if self.option.parse is None else self.option.parse(given)
         except ValueError as error:
-            raise typer.BadParameter(str(error), param_hint=self.yes) from None
+            name = self.option.spellings(self.name)[0]
+            raise typer.BadParameter(str(error), param_hint=name) from None
 
 
-def command(function: Callable[..., None]) -> Callable[..., dict[str, Any]]:
-    """The arguments of a function from what typer has read, for `PlainCommand`, which calls the function itself.
+def _path(text: str) -> Path:
+    """A path; an empty one, as of a variable that is not set, would be the current folder."""
+    if not text:
+        raise typer.BadParameter("is empty (expected a path, . for this folder)")
+    return Path(text)
 
-    Each parameter that is a dataclass of options becomes one parameter for each field.
-    """
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """The function with a parameter for each field of its dataclasses of options, as typer reads it."""
     parts: list[Parameter | _Flag] = []
-    flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
+    names: set[str] = set()
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in signature(function).parameters.items():
-        hint, marks = hints[name], getattr(hints[name], "__metadata__", ())
-        make, fields = _flags_of(hint)
-        for twice in fields.keys() & flags.keys():  # one of them is of another package
-            raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
-        if make is not None:
-            makers[name] = make, fields
+        hint, *marks = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
+        if hint == FormatValues or dataclasses.is_dataclass(hint):
+            part = next((mark for mark in marks if isinstance(mark, Part)), Part())
+            fields = _flags_of(hint, part)
+            for twice in fields.keys() & names:  # one of them is of another package
+                raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
+            names |= fields.keys()
+            makers[name] = dict if hint == FormatValues else hint, fields
+            parts += fields.values()
         elif marks and isinstance(marks[0], Option):
-            parts.append(_Flag(name, marks[0], get_args(hint)[0], parameter.default, marks[0].panel or None))
+            parts.append(_Flag(name, marks[0], hint, parameter.default, marks[0].panel or None))
         else:  # without an `Option` it stays as typer has it
-            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
-        flags |= fields
-        parts += fields.values()
+            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
     inputs = [part for part in parts if isinstance(part, _Flag) and part.option.reads]
 
-    def arguments(**given: Any) -> dict[str, Any]:
+    def run(**given: Any) -> None:
         read = [(given[flag.name], flag) for flag in inputs]
         for parameter, (make, fields) in makers.items():
             values = {name: flag.value(given.pop(name)) for name, flag in fields.items()}
             given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
         for value, flag in read:  # before anything is imported that takes seconds
             _require(value, flag)
-        return given
+        function(**given)
 
-    arguments.__name__, arguments.__doc__ = function.__name__, function.__doc__
-    arguments.__module__ = function.__module__
+    run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
     made = [part.parameter() if isinstance(part, _Flag) else part for part in parts]
-    vars(arguments).update(__signature__=Signature(made), function=function)
-    return arguments
+    vars(run)["__signature__"] = Signature(made)
+    return run
 
 
 def _require(value: Any, flag: _Flag) -> None:
@@ -189,34 +181,25 @@ def _require(value: Any, flag: _Flag) -> None:
         if reads == "path or name" and not Path(text).suffix and os.sep not in text:
             if complete is not None and text not in complete(""):
                 names = sorted(complete(""))
-                near = difflib.get_close_matches(text, names, n=1)
-                hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(names)}, or a file"
-                raise InputError(f"{flag.yes} {text}: is unknown: {hint}")
+                hint = did_you_mean(text, names, f"expected one of {', '.join(names)}, or a file")
+                raise InputError(f"{flag.option.spellings(flag.name)[0]} {text}: is unknown: {hint}")
         elif reads != "path or pattern" or not glob.has_magic(text):
             raise InputError(f"{text}: there is no such file or folder")
         elif next(glob.iglob(text), None) is None:
             raise InputError(f"{text}: nothing matches this pattern (expected drives)")
 
 
-def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
-    """The maker of a parameter's value, and its options by name; None for a parameter without options."""
-    marks = getattr(hint, "__metadata__", ())
-    hint = get_args(hint)[0] if marks else hint
-    part = next((mark for mark in marks if isinstance(mark, Part)), Part())
-    make: Callable[..., Any] = hint
-    classes: list[type[Any]] = [hint]
-    if hint == FormatValues:
-        make, classes = dict, part.classes()
-    elif not dataclasses.is_dataclass(hint):
-        return None, {}
+def _flags_of(hint: Any, part: Part) -> dict[str, _Flag]:
+    """The options that a command takes of a dataclass or of all formats, by the names of the fields."""
     flags: dict[str, _Flag] = {}
+    classes: list[type[Any]] = [*option_classes()] if hint == FormatValues else [hint]
     for kind in classes:
         kinds, values = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):
-            stated, name = field.metadata.get("option"), field.name
+            option, name = field.metadata.get("option"), field.name
             is_taken = name not in part.without and (not part.only or name in part.only)
-            if stated is not None and not stated.hidden and is_taken:
+            if option is not None and not option.hidden and is_taken:
                 default = values.get(name, Parameter.empty)
-                flags.setdefault(name, _Flag(name, stated, kinds[name], default, stated.panel or kind.panel))
+                flags.setdefault(name, _Flag(name, option, kinds[name], default, option.panel or kind.panel))
     assert set(part.only) <= flags.keys(), f"{hint}: {part.only}"
-    return make, flags
+    return flags

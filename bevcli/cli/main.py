@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -44,34 +44,10 @@ def printable(text: str) -> str:
 
 
 class PlainCommand(TyperCommand):
-    """A command of a function that takes dataclasses of options; its `--help` lists the options by their panels."""
-
-    def __init__(self, *arguments: Any, callback: Any, **settings: Any) -> None:
-        """callback: of typer, for `bevcli.cli.bridge.command`: it returns the arguments of the function."""
-        super().__init__(*arguments, callback=callback.function, **settings)
-        self._arguments = callback
+    """A command whose `--help` lists the options by their panels."""
 
     def get_help(self, ctx: Any) -> str:
         return printable(super().get_help(ctx))
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse; an empty path, as of a variable that is not set, would be the current folder."""
-        given, *_ = self.make_parser(ctx).parse_args(args=list(args))
-        takes = inspect.signature(self._arguments).parameters
-        parameters: list[Any] = self.get_params(ctx)
-        for param in parameters:
-            value = given.get(param.name)
-            empty = "" in (value if isinstance(value, list | tuple) else [value])
-            if empty and param.name in takes and _takes_path(takes[param.name].annotation):
-                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=param)
-        rest = super().parse_args(ctx, args)
-        if not ctx.resilient_parsing:  # as for completion in a shell
-            try:
-                ctx.params = self._arguments(**ctx.params)
-            except typer.BadParameter as error:
-                error.ctx = ctx
-                raise
-        return rest
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The options and the arguments, without hidden ones."""
@@ -93,10 +69,6 @@ class PlainCommand(TyperCommand):
                 panels.setdefault(panel or "Options", []).append((name, row[1]))
         panels["Options"] = panels.pop("Options", [])
         write_panels(panels, formatter)
-
-
-def _takes_path(hint: Any) -> bool:
-    return hint is Path or any(_takes_path(part) for part in get_args(hint))
 
 
 def write_panels(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
