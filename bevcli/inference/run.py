@@ -61,8 +61,13 @@ def run(
         if isinstance(given, str | Path):
             raise InputError(f"`{argument}={given}`: is a text or path: pass what `bevcli.{maker}` returns for it")
     model = model.in_engine(sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
-    asked = {"ask_attention": attention or bool(probes), "probes": tuple(probes)}
-    runner = model.runner(track=track, temporal=temporal, commands=read_commands(command, model.config), **asked)
+    runner = model.runner(
+        track=track,
+        temporal=temporal,
+        commands=read_commands(command, model.config),
+        ask_attention=attention or bool(probes),
+        probes=tuple(probes),
+    )
     steps = runner.run(sequence, range(len(sequence.stamps)), runner.preprocessor(cameras))
     return ((frame, prediction) for frame, prediction, _ in steps)
 

@@ -16,7 +16,7 @@ from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import make_job, results_of, write_drive, write_fleet
 
 from bevcli.errors import InputError, OutputError
-from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
@@ -163,10 +163,11 @@ def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp
     answers = iter([False] * 5)
     stopped = batch(should_stop=lambda: next(answers, True))
     assert stopped.stopped
-    assert len(results_of(tmp_path / "out")) == 1  # the second drive was stopped after its second frame
+    done = len(results_of(tmp_path / "out"))
+    assert done in (1, 2)  # the second drive was stopped after its second frame, and had computed the rest or not
     assert not [path for path in (tmp_path / "out/.bevcli/attempts").iterdir() if path.suffix == ".run"]
     summary = batch(resume=True)
-    assert (summary.skipped, summary.failed, len(summary.records)) == (1, 1, 4)
+    assert (summary.skipped, summary.failed, len(summary.records)) == (done, 1, 4)
 
 
 def test_a_drive_that_kills_its_worker_each_time_becomes_a_row(fleet, tmp_path, monkeypatch):
@@ -178,7 +179,7 @@ def test_a_drive_that_kills_its_worker_each_time_becomes_a_row(fleet, tmp_path, 
 
     job = make_job(tmp_path / "out", fleet / "mini.toml", retries=2)
     (drive,), _ = find_drives([str(fleet / "drives/d000")])
-    monkeypatch.setattr(worker_module, "run_into_folder", die)
+    monkeypatch.setattr(worker_module, "run_in_folder", die)
     for _ in range(3):
         with pytest.raises(Killed):
             Worker(job, "hash").run(drive)
@@ -191,9 +192,9 @@ def test_any_exception_of_one_drive_leaves_the_others_alone(batch, monkeypatch):
     def sometimes(model, sequence, *arguments, **options):
         if sequence.name == "d001":
             raise ZeroDivisionError("two\nlines")
-        return run_into_folder(model, sequence, *arguments, **options)
+        return run_in_folder(model, sequence, *arguments, **options)
 
-    monkeypatch.setattr(worker_module, "run_into_folder", sometimes)
+    monkeypatch.setattr(worker_module, "run_in_folder", sometimes)
     summary = batch()
     errors = {record["drive"]: record["error"] for record in summary.records}
     assert errors["d000"] == errors["d002"] == ""

@@ -68,8 +68,8 @@ def test_drives_without_boxes_on_one_side_count_too():
 
 def test_matches_of_a_drive_are_the_same_after_a_file(tmp_path):
     before = matches_of(*drive_of(4, 3, 0.5))
-    save_state(tmp_path / "matches.safetensors", before)
-    after = load_state(tmp_path / "matches.safetensors", DriveMatches)
+    save_state(tmp_path / "matches.pt", before)
+    after = load_state(tmp_path / "matches.pt", DriveMatches)
     assert_same(score_jointly([after], CONFIG).detection, score_jointly([before], CONFIG).detection)
 
 
