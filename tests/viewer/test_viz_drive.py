@@ -110,9 +110,9 @@ def test_a_temporary_recording_is_shown_at_the_frame(folder, opened, monkeypatch
     [
         ("mine.json", r"mine\.json: holds boxes .*: show them .*: `bevcli viz DRIVE --boxes mine\.json`"),
         ("run", r"run: holds boxes .*: `bevcli viz DRIVE --boxes run`"),
-        ("x.rrd --boxes mine.json", "x.rrd: is a recording, and `boxes` (`--boxes`) is for a drive"),
-        ("x.rrd --rate all", "x.rrd: is a recording, and `rate_hz` (`--rate`) is for a drive"),
-        ("x.rrd --version v1.0-mini", "x.rrd: is a recording, and `version` (`--version`) is for a drive"),
+        ("x.rrd --boxes mine.json", r"x\.rrd: is a recording, and `boxes` \(`--boxes`\) is for a drive"),
+        ("x.rrd --rate all", r"x\.rrd: is a recording, and `rate_hz` \(`--rate`\) is for a drive"),
+        ("x.rrd --version v1.0-mini", r"x\.rrd: is a recording, and `version` \(`--version`\) is for a drive"),
         ("samples/street --boxes mine.json --boxes mine.json", "have the same name"),
         ("samples/street --boxes samples/street/ground_truth.json", 'boxes have no "score"'),
         ("samples/street --frame 99", "--frame 99: the drive has frames 0 to 2"),
