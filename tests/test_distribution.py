@@ -42,7 +42,7 @@ EXTRAS = "ros,video,onnx,openvino,tensorboard,ray,hub"
 # rosbags, protobuf, PyAV, ONNX and its runtime, and OpenVINO.
 WITH_LOWEST = (
     "geometry/test_cameras.py",
-    "model/test_deformable_attention_backends.py",
+    "model/test_deformable_attention.py",
     "inference/test_tracking.py",
     "sequences/test_map_expansion.py",
     "recording/test_vehicle.py",
