@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bevcli.cli.bridge import FormatValues, InputDrive
+from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
+from bevcli.cli.stop_signals import StopSignals
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import counted, print_note, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
+from bevcli.sequences.format import format_of
 from bevcli.sequences.options import InputOptions
 
 if TYPE_CHECKING:
@@ -59,10 +62,7 @@ def run(
     from bevcli.parsing.documents import without_garbage_collection
 
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
-        from bevcli.cli.stop_signals import StopSignals
         from bevcli.runs.run_into_folder import run_in_folder
-        from bevcli.sequences.format import format_of
         from bevcli.sequences.open import open_sequence
         from bevcli.workshop.checks.standing_check import IMAGES_MOVE, StandingCheck
 
