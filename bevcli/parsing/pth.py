@@ -9,10 +9,11 @@ may be a bomb.
 import pickle
 import pickletools
 import struct
+import threading
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -31,6 +32,8 @@ _ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__impor
 # The exceptions of PyTorch and of Python's zip and pickle readers for a damaged file.
 _DAMAGE = (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, LookupError, AttributeError, TypeError, ValueError,
            ArithmeticError, AssertionError, EOFError, OSError, MemoryError, struct.error)  # fmt: skip
+
+_LOADING = threading.Lock()
 
 
 class Placeholder:
@@ -75,16 +78,32 @@ def read_pth(path: Path) -> PthFile:
     left_out: set[str] = set()
     stand_ins: list[Any] = [(_stand_in(f"{module}.{name}", left_out), f"{module}.{name}") for module, name in names]
     try:
-        with plain_name(path) as name, torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # PyTorch warns of types in the file that it will cease to know
+        with plain_name(path) as name:
             # A mapped storage cannot reach beyond the file, whatever size the pickle states.
-            contents = torch.load(name, map_location="cpu", weights_only=True, mmap=is_zip)
+            contents = load_data(name, stand_ins, mmap=is_zip)
     except _DAMAGE as error:
         raise _damaged(path, error) from None
     for value in (contents, *(dict.values(contents) if isinstance(contents, dict) else ())):
         if isinstance(value, OrderedDict):
             vars(value).clear()  # attributes that the file sets could stand in for its methods
     return PthFile(contents, tuple(sorted(left_out)))
+
+
+def load_data(source: Any, classes: Iterable[Any], **settings: Any) -> Any:
+    """The contents of a PyTorch file: tensors on the CPU, plain values, and objects of these classes alone.
+
+    One thread at a time: the classes that PyTorch allows are global.
+
+    Args:
+        source: a path or an open file.
+        classes: see `torch.serialization.safe_globals`.
+        settings: of `torch.load`.
+
+    Raises what PyTorch raises for a damaged file or another class.
+    """
+    with _LOADING, torch.serialization.safe_globals(list(classes)), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PyTorch warns of types in the file that it will cease to know
+        return torch.load(source, map_location="cpu", weights_only=True, **settings)
 
 
 def _stand_in(name: str, left_out: set[str]) -> type:

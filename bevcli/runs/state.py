@@ -23,6 +23,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.runner import Memory, RunnerState
 from bevcli.model.upload import exchanged, tensors_in
 from bevcli.parsing.files import read_bytes
+from bevcli.parsing.pth import load_data
 from bevcli.recording.writer import RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts
@@ -143,8 +144,7 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
     if hashlib.sha256(content).digest() != written[len(FORMAT) : -len(content)]:
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
     try:
-        with torch.serialization.safe_globals([*NUMPY, *_classes_in(kind, set())]):
-            state = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+        state = load_data(BytesIO(content), [*NUMPY, *_classes_in(kind, set())])
     except (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).rpartition("WeightsUnpickler error: ")[2].split())
         raise InputError(f"{path}: the state cannot be read ({reason:.200})") from None

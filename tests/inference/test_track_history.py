@@ -245,11 +245,10 @@ class Labelled(MemoryDrive):
 
 
 def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
-    def keep(_, compared):
+    def keep(compared):
         scored.extend(frame.boxes.instances.tolist() for frame in compared.pairs.predictions)
-        return {}
 
     scored: list[list[str]] = []
-    monkeypatch.setattr(validation, "score_results", keep)
+    monkeypatch.setattr(validation, "score_tracks", keep)
     validation.validate(Runner(model, CPU, StepOptions(tracker=TrackerConfig())), OneDrive([Labelled(whole[:3])]))
     assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]
