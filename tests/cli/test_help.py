@@ -57,3 +57,14 @@ def test_help_of_a_command_imports_no_other_wing():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["viz formats", "run formats", "bench benchmark formats"]
+
+
+def test_help_of_the_program_loads_nothing_heavy():
+    heavy = ("torch", "numpy", "cv2", "rerun", "scipy", "numba", "msgspec")
+    code = (
+        "import sys\nfrom bevcli.cli.main import app\n"
+        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\n"
+        f"print([module for module in {heavy} if module in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"

@@ -15,7 +15,6 @@ from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError, WeightsError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
-from bevcli.published import NamedWeights, named_weights
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.nuscenes import NuScenesOptions
@@ -23,6 +22,7 @@ from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 
 if TYPE_CHECKING:
+    from bevcli.published import NamedWeights
     from bevcli.workshop.batch.batch import Batch, BatchSummary
 
 
@@ -118,9 +118,10 @@ def reproduce(
     Every scene of the split is run as `bevcli batch` does, here or on Ray. Missing weights are downloaded after a
     question, or with --fetch. Notes tell what makes the numbers differ. Exit code 3: some scenes failed.
     """
+    from bevcli import published
     from bevcli.workshop.batch import batch as work
 
-    named = named_weights(name, model.weights_dir)
+    named = published.named_weights(name, model.weights_dir)
     split = NuScenesOptions(options.version, options.split)
     drives, notes = work.find_drives([str(options.data)], split)
     if any(drive.scene is None for drive in drives):
@@ -156,7 +157,7 @@ def reproduce(
         raise typer.Exit(SOME_FAILED)
 
 
-def _get(named: NamedWeights, model: ModelOptions) -> None:
+def _get(named: "NamedWeights", model: ModelOptions) -> None:
     """Download weights that are not there, if --fetch or the user says so. Raises WeightsError."""
     if named.here is not None:
         return
