@@ -37,7 +37,7 @@ SECTIONS = {
     "Score": ["docs/scoring", "docs/compare", "docs/robustness", "docs/trust"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/containers", "docs/speed", "docs/fleet"],
-    "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
+    "Understand": ["docs/architecture", "docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/service", "docs/extend", "docs/reference"],
     "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG"],
 }
