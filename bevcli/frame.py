@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, SHOWN_SCORE, Color, ObjectClass
@@ -201,6 +201,15 @@ class Frame:
     ground_truth_results: tuple[FrameResult, ...] = ()
     sample_token: str | None = None
     impossible_boxes: int = 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts on missing images and true boxes that were left out; a recording logs its own events."""
+        where = f"frame {self.stamp.index}"
+        texts = [f"{where}: camera {camera} has no image: {why}" for camera, why in self.dropped.items()]
+        if self.impossible_boxes:
+            texts.append(f"{where}: {counted(self.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
+        return texts
 
     def __repr__(self) -> str:
         truth = "" if self.ground_truth is None else f", {len(self.ground_truth)} true boxes"

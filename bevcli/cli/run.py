@@ -13,7 +13,7 @@ from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
-from bevcli.printing import counted, print_note, say
+from bevcli.printing import print_note, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.format import format_of
@@ -22,6 +22,7 @@ from bevcli.sequences.options import InputOptions
 if TYPE_CHECKING:
     from bevcli.frame import Drive, Frame, Prediction
     from bevcli.inference.load import Model
+    from bevcli.workshop.checks.standing_check import StandingCheck
 
 PANEL = "Run"
 PHOTOGRAPHS = "photographs"  # the model in the package that learned from randomised images
@@ -64,23 +65,21 @@ def run(
     with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
         from bevcli.runs.run_into_folder import run_in_folder
         from bevcli.sequences.open import open_sequence
-        from bevcli.workshop.checks.standing_check import IMAGES_MOVE, StandingCheck
-
+        from bevcli.workshop.checks.standing_check import StandingCheck
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
     without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
     if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)
-    reading = source.for_model(loaded.config, temporal=run_options.temporal)
+    source = source.for_model(loaded.config, temporal=run_options.temporal)
     with odometry_bar() as show_steps:
-        drive = open_sequence(sequence, replace(reading, after_step=show_steps), **format_options)
+        drive = open_sequence(sequence, replace(source, after_step=show_steps), **format_options)
     if calibrate:
         from bevcli.workshop.calibration.core_options import corrected
 
         drive = corrected(drive)
-    probes = "--probe" if recording.probes else ""
-    loaded = loaded.in_engine(drive.rig, drive, parts=probes, report=print_note)
+    loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "", report=print_note)
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     live = None
     if output.live:
@@ -93,13 +92,10 @@ def run(
     with StopSignals("frame") as signals, files as running:
         notes = [*running.summary.input_errors, *_run_notes(loaded, drive, live=output.live)]
         with Progress(len(drive.stamps), "frames", notes) as progress:
-            if running.done:
-                progress.skip(running.done)
+            progress.skip(running.done)
             for frame, prediction in running.frames:
-                for warning in _frame_warnings(frame, prediction):
+                for warning in _frame_warnings(frame, prediction, standing):
                     progress.message(f"warning: {warning}")
-                if standing is not None and prediction.started_anew is None and standing.images_move(frame):
-                    progress.message(f"warning: frame {frame.stamp.index}: {IMAGES_MOVE}")
                 progress.advance()
                 if signals.received():
                     break
@@ -140,24 +136,13 @@ def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[st
     return notes
 
 
-def input_warnings(frame: "Frame") -> list[str]:
-    """Warnings on missing images and true boxes that were left out; the recording logs its own events."""
-    from bevcli.geometry.boxes import IMPOSSIBLE
-
-    where = f"frame {frame.stamp.index}"
-    warnings = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
-    if frame.impossible_boxes:
-        warnings.append(f"{where}: {counted(frame.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
-    return warnings
-
-
-def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
-    """Those of the input, and warnings on results that are not finite and gaps in time."""
-    from bevcli.frame import StartReason
-
-    where, warnings = f"frame {frame.stamp.index}", input_warnings(frame)
+def _frame_warnings(frame: "Frame", prediction: "Prediction", standing: "StandingCheck | None") -> list[str]:
+    """Those of the input, and warnings on results that are not finite, gaps in time and images that move."""
+    where, warnings = f"frame {frame.stamp.index}", frame.warnings
     if prediction.failure:
         warnings.append(f"{where}: {prediction.failure}")
-    if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:
+    if prediction.started_anew and prediction.started_anew.reason.name == "GAP":
         warnings.append(f"{where}: no history: {prediction.started_anew}")
+    if standing is not None and prediction.started_anew is None and standing.images_move(frame):
+        warnings.append(f"{where}: {standing.note}")
     return warnings

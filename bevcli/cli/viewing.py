@@ -7,7 +7,6 @@ from pathlib import Path
 
 from bevcli.cli.bridge import FormatValues
 from bevcli.cli.progress import Progress, odometry_bar
-from bevcli.cli.run import input_warnings
 from bevcli.errors import InputError
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
@@ -59,7 +58,7 @@ def record_drive(
                 if isinstance(step, str):
                     progress.message(step)
                     continue
-                for warning in input_warnings(step):
+                for warning in step.warnings:
                     progress.message(f"warning: {warning}")
                 progress.advance()
         if options.out is not None:

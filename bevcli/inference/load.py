@@ -22,9 +22,9 @@ from bevcli.frame import ColorOrder, Drive, Frame, FrameStamp, Prediction, check
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.frames_from_memory import checked_images
-from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions
+from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions, StepOptions
 from bevcli.inference.preprocess import image_for_rig
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes
 from bevcli.model.config import ModelConfig
@@ -116,8 +116,8 @@ class Model:
         dropped = {name: "not given" for name in rig.names if name not in given}
         at = dict.fromkeys(rig.names, pose)
         frame = Frame(FrameStamp(0, "", 0), rig, given, pose, at, AT_REST, dropped)
-        runner = self.in_engine(rig).runner(track=False)
-        return runner.step(None, runner.preparation(runner.preprocessor())(frame))[1]
+        runner = self.in_engine(rig).runner(StepOptions(track=False))
+        return runner.step(None, runner.prepare(frame))[1]
 
     @property
     def config(self) -> ModelConfig:
@@ -223,10 +223,10 @@ class Model:
         assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
 
-    def runner(self, *, track: bool, **asked: Any) -> Runner:
-        """Steps the prepared model. track: give boxes identities over time. asked: the other `StepOptions`."""
-        asked |= {"tracker": self.tracker if track else None, "untrained": self.untrained}
-        return Runner(self.prepared, self.device, StepOptions(takes_pixels=self.is_exported, **asked))
+    def runner(self, options: StepOptions) -> Runner:
+        """Steps the prepared model. Raises InputError, see `Runner`."""
+        network, device, pixels = self.prepared, self.device, self.is_exported
+        return Runner(network, device, options, tracker=self.tracker, pixels=pixels, untrained=self.untrained)
 
 
 def hash_of(tensors: Iterable[tuple[str, Tensor]]) -> str:

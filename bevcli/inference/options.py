@@ -1,10 +1,11 @@
-"""ModelOptions: a model, its weights, and the device that it runs on."""
+"""The options of a model (its weights, and the device that it runs on), and those of its steps."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from bevcli.model.precision import AnyPrecision
-from bevcli.options import option, options
+from bevcli.options import option, options, parse_pairs
 from bevcli.registry import entries, known_models
 
 TORCH = "torch"  # the value of `engine` beside the registered engines
@@ -71,3 +72,36 @@ class ModelOptions:
         metavar="SEQUENCE",
         flag="--int8-drive",
     )
+
+
+@options("Model")
+class StepOptions:
+    """The options of the steps of a model.
+
+    attention: fill in `Prediction.attention`; that of an exported file never is.
+    probes: x, y in metres, bev frame: BEV cells whose sampling points it shows. They imply `attention`.
+    """
+
+    temporal: bool = option(default=True, help="Use the frames before (and after).", flag="--temporal/--no-temporal")
+    track: bool = option(
+        default=True,
+        help="Give boxes identities over time, and write tracks.csv. A UniAD with history gives its own.",
+        flag="--track/--no-track",
+    )
+    cameras: Mapping[str, str] = option(
+        default_factory=dict,
+        help="Use the embedding of MODEL_CAMERA for camera NAME. Repeatable. Default: the model's camera of the same "
+        "name, else the one with the nearest viewing direction.",
+        flag="--camera",
+        metavar="NAME=MODEL_CAMERA",
+        parse=partial(parse_pairs, expected="NAME=MODEL_CAMERA"),
+        repeatable=True,
+    )
+    command: str | None = option(
+        default=None,
+        help="Command of the driver, which marks one of the planned paths of a model that plans: straight, left or "
+        "right, or a file with a command by frame index. Default: none is marked.",
+        metavar="NAME|FILE.json",
+    )
+    attention: bool = False
+    probes: tuple[tuple[float, float], ...] = ()

@@ -19,20 +19,12 @@ from bevcli.inference.frames_from_memory import (
     whole_nanoseconds,
 )
 from bevcli.inference.load import Model
-from bevcli.inference.runner import RunnerState, one_command, read_commands
+from bevcli.inference.options import StepOptions
+from bevcli.inference.runner import RunnerState, one_command
+from bevcli.options import refuse, spread
 
 
-def run(
-    model: Model,
-    sequence: Drive,
-    *,
-    temporal: bool = True,
-    track: bool = True,
-    attention: bool = False,
-    probes: tuple[tuple[float, float], ...] = (),
-    cameras: Mapping[str, str] | None = None,
-    command: str | None = None,
-) -> Iterator[tuple[Frame, Prediction]]:
+def run(model: Model, sequence: Drive, **options: Any) -> Iterator[tuple[Frame, Prediction]]:
     """Runs a model over a sequence, frame by frame; the BEV map of a frame is the history of the next.
 
         for frame, prediction in bevcli.run(model, drive):
@@ -43,15 +35,7 @@ def run(
     Args:
         model: of `load_model`.
         sequence: of `open_sequence`.
-        temporal: whether the previous BEV map is used.
-        track: whether the boxes get identities over time: the columns `instances`, `track_scores` and `duplicates`.
-            With history, those of a UniAD are the model's own.
-        attention: whether `Prediction.attention` is filled in.
-        probes: x, y in metres, bev frame: BEV cells whose sampling points `Prediction.attention` shows. They imply
-            `attention`.
-        cameras: camera of the rig -> camera of the model whose embedding it takes. Default: the camera of the same
-            name, else the one with the nearest viewing direction.
-        command: of the driver, which chooses one of the planned paths, such as "straight"; or a FILE.json.
+        options: those of `StepOptions`: `temporal`, `track`, `attention`, `probes`, `cameras`, `command`.
 
     Raises:
         InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
@@ -60,16 +44,11 @@ def run(
     for argument, given, maker in (("model", model, "load_model"), ("sequence", sequence, "open_sequence")):
         if isinstance(given, str | Path):
             raise InputError(f"`{argument}={given}`: is a text or path: pass what `bevcli.{maker}` returns for it")
-    model = model.in_engine(sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
-    runner = model.runner(
-        track=track,
-        temporal=temporal,
-        commands=read_commands(command, model.config),
-        ask_attention=attention or bool(probes),
-        probes=tuple(probes),
-    )
-    steps = runner.run(sequence, range(len(sequence.stamps)), runner.preprocessor(cameras))
-    return ((frame, prediction) for frame, prediction, _ in steps)
+    chosen, left = spread(options, StepOptions)
+    refuse(left, "run", StepOptions)
+    shows = chosen.attention or chosen.probes
+    runner = model.in_engine(sequence.rig, sequence, parts="attention and probes" if shows else "").runner(chosen)
+    return ((frame, prediction) for frame, prediction, _ in runner.run(sequence))
 
 
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
@@ -108,11 +87,8 @@ class Session:
         rig: CameraRig,
         *,
         color_order: ColorOrder = "bgr",
-        temporal: bool = True,
-        track: bool = True,
-        cameras: Mapping[str, str] | None = None,
-        command: str | None = None,
         name: str = "live",
+        **options: Any,
     ) -> None:
         """Prepare the model for a rig.
 
@@ -120,11 +96,8 @@ class Session:
             model: of `load_model`.
             rig: the cameras; images must have the sizes that it states.
             color_order: of the images: "bgr", as OpenCV decodes them, or "rgb".
-            temporal: whether the previous BEV map is used.
-            track: whether the boxes get identities over time.
-            cameras: camera of the rig -> camera of the model whose embedding it takes; see `run`.
-            command: of the driver, which chooses one of the planned paths; see `run`. `step` may change it.
             name: of the drive, for titles.
+            options: those of `StepOptions`, but for `attention` and `probes`. `step` may change the command.
 
         Raises InputError for a rig without cameras or with two of one name, an unknown camera in `cameras`, color order
         or command, and for a model that needs later frames.
@@ -132,7 +105,9 @@ class Session:
         check_color_order(color_order)
         if not rig.names or len(set(rig.names)) < len(rig.names):
             raise InputError(f"`rig`: expected cameras with different names (found {', '.join(rig.names) or 'none'})")
-        if temporal and model.config.later_frames:
+        chosen, left = spread(options, StepOptions)
+        refuse(left, "Session", StepOptions)
+        if chosen.temporal and model.config.later_frames:
             raise InputError(
                 f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
                 "choose another model, or pass `temporal=False` (`--no-temporal`)"
@@ -141,9 +116,7 @@ class Session:
         self.name, self.rig, self.notes = name, rig, model.training_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
-        commands = read_commands(command, model.config)
-        self._runner = model.runner(track=track, temporal=temporal, commands=commands)
-        self._prepare = self._runner.preparation(self._runner.preprocessor(cameras))
+        self._runner = model.runner(chosen)
         self._state: RunnerState[Any] = RunnerState()
         self._poses = RecentPoses()
         self._meter: Any = None  # of a session without poses
@@ -207,11 +180,10 @@ class Session:
             dropped={name: "not given" for name in self.rig.names if name not in images},
         )
         if command is not None:
-            commands = one_command(command, self._runner.config)
-            self._runner.options = replace(self._runner.options, commands=commands)
+            self._runner.commands = one_command(command, self._runner.config)
         if world_from_ego is None:
             frame = self._measured(frame, kinematics)
-        self._state, prediction = self._runner.step(self._state, self._prepare(frame))
+        self._state, prediction = self._runner.step(self._state, self._runner.prepare(frame))
         self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
         return prediction
 

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -16,6 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, Drive, Frame, FrameResult, FrameStamp, NewStart, Prediction, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
+from bevcli.inference.options import StepOptions
 from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
@@ -49,29 +50,6 @@ class RunnerState(Generic[Memory]):
 
 
 @dataclass(frozen=True)
-class StepOptions:
-    """Options of a step.
-
-    Attributes:
-        temporal: whether history is used.
-        ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
-        probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
-        commands: of the driver, for a model that plans.
-        tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
-        takes_pixels: whether the model is an exported file: see `PreparedFrame.pixels`.
-        untrained: whether the weights are random, which `Prediction.plot` says.
-    """
-
-    temporal: bool = True
-    ask_attention: bool = False
-    probes: tuple[tuple[float, float], ...] = ()
-    commands: Commands = ()
-    tracker: TrackerConfig | None = None
-    takes_pixels: bool = False
-    untrained: bool = False
-
-
-@dataclass(frozen=True)
 class BegunStep:
     """A step that the device may still be computing, see `Runner.begin`.
 
@@ -99,20 +77,53 @@ class BegunStep:
 class Runner:
     """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none.
 
-    Raises InputError for a probe outside the BEV grid.
+    Attributes:
+        tracker: gives boxes their identities, where no model with history gives its own; None for no identities.
+        commands: of the driver, for a model that plans.
+        preprocess: makes the network's input of a frame.
+        prepare: does so and puts its images on the device.
     """
 
-    def __init__(self, model: TemporalModel, device: torch.device, options: StepOptions | None = None) -> None:
+    def __init__(
+        self,
+        model: TemporalModel,
+        device: torch.device,
+        options: StepOptions | None = None,
+        *,
+        tracker: TrackerConfig | None = None,
+        pixels: bool = False,
+        untrained: bool = False,
+    ) -> None:
+        """To make in the thread that runs the model.
+
+        Args:
+            model: ready for inference.
+            device: where it runs.
+            options: of all steps.
+            tracker: used if the options ask for tracks.
+            pixels: the model is an exported file, see `PreparedFrame.pixels`.
+            untrained: the weights are random, which `Prediction.plot` says.
+
+        Raises InputError for a probe outside the BEV grid, and for an unknown camera or command.
+        """
         self.model = model.to(device).eval()
         self.config = model.config
         self.device = device
-        self.options = StepOptions() if options is None else options
+        self.options = options = StepOptions() if options is None else options
+        self.tracker = tracker if options.track else None
+        self.commands = read_commands(options.command, self.config)
         self.clock = StageClock(model, device, model.stages)
+        self.preprocess = Preprocessor(self.config, options.cameras, pixels=pixels)
+        self.prepare: Callable[[Frame], PreparedFrame] = self.preprocess
+        if device.type == "cuda":
+            upload_images = image_uploader(device)
+            self.prepare = lambda frame: upload_images(self.preprocess(frame))
+        self._untrained = untrained
         # The boxes have the identities of the model's own tracks.
-        self._tracks = self.options.tracker is not None and self.options.temporal and self.config.has_tracks
+        self._tracks = self.tracker is not None and options.temporal and self.config.has_tracks
         self._probed: Tensor | None = None
-        if self.options.ask_attention and isinstance(model, Network):
-            self._probed = probe_cells(self.options.probes, self.config.bev_grid).to(device)
+        if (options.attention or options.probes) and isinstance(model, Network):
+            self._probed = probe_cells(options.probes, self.config.bev_grid).to(device)
 
     @property
     def overlap(self) -> int:
@@ -120,12 +131,8 @@ class Runner:
 
         0 on other devices, and where this gains nothing, because more is read of the device than the outputs.
         """
-        reads_more = self.options.ask_attention or self.model.waits_within_step
+        reads_more = self.options.attention or self.options.probes or self.model.waits_within_step
         return int(self.device.type == "cuda" and not reads_more)
-
-    def preprocessor(self, cameras: Mapping[str, str] | None = None) -> Preprocessor:
-        """A preprocessor of frames for this model. cameras: see `Preprocessor`."""
-        return Preprocessor(self.config, cameras, pixels=self.options.takes_pixels)
 
     def step(
         self, state: RunnerState[Any] | None, prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
@@ -184,8 +191,8 @@ class Runner:
                     part = origin(self.model, lambda: self.model.step(prepared, start.memory, begun.upcoming))
                 after, fields = self._restarted(start), {"not_finite": part}
         prediction = self._prediction(prepared, begun.started_anew, **fields)
-        if self.options.tracker is not None and not self._tracks:
-            tracks, prediction = track(self.options.tracker, tracks, prediction)
+        if self.tracker is not None and not self._tracks:
+            tracks, prediction = track(self.tracker, tracks, prediction)
         return replace(after, tracks=tracks), prediction
 
     def _decoded(self, last_layers: ModelOutputs, begun: BegunStep) -> dict[str, Any]:
@@ -201,23 +208,20 @@ class Runner:
                 self.clock.mark("map_merging")
             else:
                 results.append(decoded)
-        shown = with_command(tuple(results), self.options.commands, begun.prepared.frame.stamp.index)
+        shown = with_command(tuple(results), self.commands, begun.prepared.frame.stamp.index)
         return {"boxes": boxes, "results": shown, "segmentation": segmentation}
 
-    def frames(
-        self, sequence: Drive, indices: Sequence[int], preprocessor: Preprocessor
-    ) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
-        """Yields `prepared` and `upcoming` of `step` for these frames of a sequence, read and prepared in advance.
+    def frames(self, drive: Drive, indices: Sequence[int]) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
+        """Yields `prepared` and `upcoming` of `step` for these frames of a drive, read and prepared in advance.
 
         A model that looks ahead sees the later ones of these frames.
         """
         ahead = self.config.later_frames if self.options.temporal else 0
-        prepare = self.preparation(preprocessor)
         if self.device.type == "cuda":
-            depth, threads = frames_ahead(self.config.image, len(sequence.rig.cameras), os.cpu_count() or 1)
-            source = read_ahead(prepare, indices, depth, threads, load=sequence.load)
+            depth, threads = frames_ahead(self.config.image, len(drive.rig.cameras), os.cpu_count() or 1)
+            source = read_ahead(self.prepare, indices, depth, threads, load=drive.load)
         else:  # the processor is busy with the model: one thread for both keeps up
-            source = read_ahead(lambda index: prepare(sequence.load(index)), indices)
+            source = read_ahead(lambda index: self.prepare(drive.load(index)), indices)
         waiting = deque(islice(source, ahead + 1))
         while waiting:
             prepared = waiting.popleft()
@@ -225,13 +229,14 @@ class Runner:
             waiting.extend(islice(source, 1))
 
     def run(
-        self, sequence: Drive, indices: Sequence[int], preprocessor: Preprocessor, state: RunnerState[Any] | None = None
+        self, drive: Drive, indices: Sequence[int] | None = None, state: RunnerState[Any] | None = None
     ) -> Iterator[tuple[Frame, Prediction, RunnerState[Any]]]:
-        """Yields frame, prediction and state after each of these frames of a sequence.
+        """Yields frame, prediction and state after each of these frames of a drive; None: all of them.
 
         The next frame may be launched before a frame is finished, see `overlap`; its errors are raised afterwards.
         """
-        state, frames = state or RunnerState(), self.frames(sequence, indices, preprocessor)
+        indices = range(len(drive.stamps)) if indices is None else indices
+        state, frames = state or RunnerState(), self.frames(drive, indices)
         if self.overlap:
             yield from self._overlapped(frames, state)
             return
@@ -260,13 +265,6 @@ class Runner:
             if error is not None:
                 raise error
             begun, is_last = following, following is None
-
-    def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
-        """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
-        if self.device.type != "cuda":
-            return preprocessor
-        upload_images = image_uploader(self.device)
-        return lambda frame: upload_images(preprocessor(frame))
 
     def _restarted(self, state: RunnerState[Any]) -> RunnerState[Any]:
         """The state before a frame without history: what the model keeps over scenes, and the tracks."""
@@ -310,7 +308,7 @@ class Runner:
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
             object_classes=self.config.object_classes,
             frame=frame,
-            untrained=self.options.untrained,
+            untrained=self._untrained,
             **{"boxes": Boxes3D.empty(), "bev": None, **fields},
         )
 

@@ -1,39 +1,17 @@
 """The options of a run and its files."""
 
-from collections.abc import Mapping
 from dataclasses import field
-from functools import partial
 from pathlib import Path
 
-from bevcli.options import option, options, parse_pairs
+from bevcli.inference.options import StepOptions
+from bevcli.options import option, options
 from bevcli.recording.options import RecordingOptions
 
 
 @options("Model")
-class RunOptions:
-    """The options of a run. recording: content of recording.rrd."""
+class RunOptions(StepOptions):
+    """The options of a run. recording: content of recording.rrd; what it shows decides on `attention` and `probes`."""
 
-    temporal: bool = option(default=True, help="Use the frames before (and after).", flag="--temporal/--no-temporal")
-    track: bool = option(
-        default=True,
-        help="Give boxes identities over time, and write tracks.csv. A UniAD with history gives its own.",
-        flag="--track/--no-track",
-    )
-    cameras: Mapping[str, str] = option(
-        default_factory=dict,
-        help="Use the embedding of MODEL_CAMERA for camera NAME. Repeatable. Default: the model's camera of the same "
-        "name, else the one with the nearest viewing direction.",
-        flag="--camera",
-        metavar="NAME=MODEL_CAMERA",
-        parse=partial(parse_pairs, expected="NAME=MODEL_CAMERA"),
-        repeatable=True,
-    )
-    command: str | None = option(
-        default=None,
-        help="Command of the driver, which marks one of the planned paths of a model that plans: straight, left or "
-        "right, or a file with a command by frame index. Default: none is marked.",
-        metavar="NAME|FILE.json",
-    )
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     save_bev: Path | None = option(
         default=None,

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Drive, Frame, Prediction
 from bevcli.inference.load import Model
 from bevcli.inference.pipeline import write_behind
-from bevcli.inference.runner import read_commands
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.sequence_checks import input_errors
@@ -96,11 +95,12 @@ def run_in_folder(
 
     model: in its engine. source: the path of the drive, for texts. Other arguments and errors: see `run_into_folder`.
     """
-    commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` (`--force`) and `resume` (`--resume`) exclude each other: pass one of them")
+    shown = options.recording
+    runner = model.runner(replace(options, attention=shown.shows_internals, probes=tuple(shown.probes)))
     with RunFolder(out, force=force, resume=resume) as folder:
-        fingerprint = run_fingerprint(model, drive, options) | {"commands": str(commands)}
+        fingerprint = run_fingerprint(model, drive, options) | {"commands": str(runner.commands)}
         state = _state_to_start_from(folder, fingerprint, model, resume)
         done, summary = state.counts.whole.count, RunSummary(model, drive, options, state.counts)
         summary.input_errors = input_errors(drive, source)
@@ -108,15 +108,7 @@ def run_in_folder(
         files = RunFiles(folder, drive, model, options, summary, state, live)
         try:
             with files:
-                runner = model.runner(
-                    track=options.track,
-                    temporal=options.temporal,
-                    commands=commands,
-                    ask_attention=options.recording.shows_internals,
-                    probes=tuple(options.recording.probes),
-                )
-                indices, preprocessor = range(done, len(drive.stamps)), runner.preprocessor(options.cameras)
-                steps = runner.run(drive, indices, preprocessor, state.runner)
+                steps = runner.run(drive, range(done, len(drive.stamps)), state.runner)
                 with contextlib.closing(write_behind(steps, files.write)) as frames:
                     yield FolderRun(frames, done if state.files else 0, summary)
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:

@@ -28,7 +28,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.registry import entries
@@ -79,10 +79,10 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     frame = drive.load(0)
     pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), dtype=np.uint8)
     frame = replace(frame, images={"FRONT": replace(frame.images["FRONT"], pixels_bgr=pixels)})
-    runner, feeds = Runner(exported, torch.device("cpu"), StepOptions(takes_pixels=True)), []
+    runner, feeds = Runner(exported, torch.device("cpu"), pixels=True), []
     run_file = exported.outputs_by_name
     monkeypatch.setattr(exported, "outputs_by_name", lambda feed: feeds.append(feed) or run_file(feed))
-    runner.step(None, (runner.preprocessor() if in_a_run else Preprocessor(exported.config))(frame))
+    runner.step(None, (runner.preprocess if in_a_run else Preprocessor(exported.config))(frame))
     found, tolerance = feeds[0]["images"].numpy(), 0 if in_a_run else 1e-4
     np.testing.assert_allclose(found[0, 0], pixels, atol=tolerance, rtol=0)
     np.testing.assert_allclose(found[0, 1], np.full_like(pixels, 120), atol=tolerance, rtol=0)

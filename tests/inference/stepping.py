@@ -2,7 +2,6 @@
 
 import torch
 
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 
@@ -15,10 +14,10 @@ def run(model, sequence, places=None, state=None, **options):
     The boxes of a model with tracks have its identities.
     """
     tracker = TrackerConfig() if model.config.has_tracks and options.get("temporal", True) else None
-    runner = Runner(model, CPU, StepOptions(**{"tracker": tracker, **options}))
+    runner = Runner(model, CPU, StepOptions(**options), tracker=tracker)
     places = range(len(sequence.stamps)) if places is None else places
     predictions = []
-    for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):
+    for _, prediction, after in runner.run(sequence, places, state):
         predictions.append(prediction)
         state = after
     return predictions, state

@@ -71,7 +71,7 @@ def test_every_frame_of_the_window_matters(window_model):
 def test_the_state_has_a_fixed_length(window_model):
     for frames, lengths in [((-3, -2, -1, 0), [1, 2, 3, 3, 3]), ((-1, 0, 1), [2, 2, 2, 2, 1]), ((0,), [0] * 5)]:
         runner = Runner(window_model(*frames), CPU)
-        steps = runner.run(MemoryDrive(5), range(5), Preprocessor(runner.config))
+        steps = runner.run(MemoryDrive(5))
         assert [len(state.memory.frames) for _, _, state in steps] == lengths
 
 
@@ -88,7 +88,7 @@ def test_a_run_cut_in_two_equals_the_whole(window_model, cut):
 def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
     model, sequence = window_model(-1, 0, 1, 2), MemoryDrive(6)
     whole, _ = run(model, sequence)
-    steps = Runner(model, CPU).run(sequence, range(6), Preprocessor(model.config))
+    steps = Runner(model, CPU).run(sequence)
     for _ in range(3):
         _, _, state = next(steps)
     steps.close()
@@ -157,8 +157,8 @@ def test_a_frame_without_images_passes_the_state_on(window_model):
 def test_a_probe_sees_the_current_frame(window_model):
     model, probes = window_model(-1, 0), ((0.0, 12.0),)
     sequence = MemoryDrive(2)
-    view = run(model, sequence, ask_attention=True, probes=probes)[0][1].attention
-    alone = run(model, sequence, [1], ask_attention=True, probes=probes)[0][0].attention
+    view = run(model, sequence, attention=True, probes=probes)[0][1].attention
+    alone = run(model, sequence, [1], attention=True, probes=probes)[0][0].attention
     assert view.history_weight is None
     assert view.probes[0].cameras["CAM_FRONT"].pixels == pytest.approx(alone.probes[0].cameras["CAM_FRONT"].pixels)
 

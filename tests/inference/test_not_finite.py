@@ -9,14 +9,14 @@ from memory_drive import MemoryDrive
 
 from bevcli.errors import WeightsError
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, RunnerState, StepOptions
+from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.prepare import prepare_for_inference
 
 CPU = torch.device("cpu")
 
 
 def run(model, frames=3):
-    steps = Runner(model, CPU, StepOptions()).run(MemoryDrive(frames), range(frames), Preprocessor(model.config))
+    steps = Runner(model, CPU).run(MemoryDrive(frames))
     return [prediction for _, prediction, _ in steps]
 
 
@@ -63,8 +63,8 @@ def test_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
     finally:
         hook.remove()
     assert [bool(p.not_finite) for p in predictions] == [False, True, False, False]
-    runner = Runner(mini_model, CPU, StepOptions())
-    fresh = [p for _, p, _ in runner.run(sequence, range(2, 4), Preprocessor(mini_model.config))]
+    runner = Runner(mini_model, CPU)
+    fresh = [p for _, p, _ in runner.run(sequence, range(2, 4))]
     for after, expected in zip(predictions[2:], fresh, strict=True):
         assert torch.equal(after.bev, expected.bev)
 
@@ -72,7 +72,7 @@ def test_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
 @pytest.mark.parametrize("prepared_model", [False, True], ids=["plain", "prepared"])
 def test_an_input_that_is_not_finite_is_named(mini_model, prepared_model):
     model = prepare_for_inference(mini_model, CPU) if prepared_model else mini_model
-    runner, preprocessor, sequence = Runner(model, CPU, StepOptions()), Preprocessor(mini_model.config), None
+    runner, preprocessor, sequence = Runner(model, CPU), Preprocessor(mini_model.config), None
     sequence = MemoryDrive(1)
     prepared = preprocessor(sequence.load(0))
     images = prepared.images.clone()

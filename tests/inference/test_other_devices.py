@@ -68,7 +68,7 @@ def frames(config: ModelConfig, *, same_projection: bool = False) -> list[Prepar
 def run(model: Network, device: torch.device, prepared: list[PreparedFrame], waits: list[str]) -> list[Prediction]:
     """Each frame's prediction. The step of the last frame is made three times, so that the last one is a replay of a
     CUDA graph. The device's waits are forgotten before it."""
-    runner = Runner(model, device, StepOptions())
+    runner = Runner(model, device)
     ahead = model.config.later_frames
     state, predictions = None, []
     for place, frame in enumerate(prepared):
@@ -151,7 +151,7 @@ def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
     config = small_version("demo")
     model, (frame, *_) = made_up_model(config), frames(config)
-    options = StepOptions(ask_attention=True, probes=((3.0, 4.0),))
+    options = StepOptions(attention=True, probes=((3.0, 4.0),))
     _, expected = Runner(model, CPU, options).step(None, frame)
     with simulated("cuda:1", monkeypatch, sample_plainly) as device:
         _, found = Runner(prepare_for_inference(model, device.device), device.device, options).step(None, frame)
@@ -190,7 +190,7 @@ def test_a_step_with_a_tensor_on_another_device_is_stopped():
 def test_a_real_gpu_is_waited_for_as_often_as_the_simulated_one(name, monkeypatch):
     """PyTorch reports every wait but those for events, of which the results have one."""
     config, device = small_version(name), torch.device("cuda:0")
-    runner = Runner(prepare_for_inference(made_up_model(config), device), device, StepOptions())
+    runner = Runner(prepare_for_inference(made_up_model(config), device), device)
     *first, last = frames(config)
     state, waits, events, wait = None, [], [], torch.cuda.Event.synchronize
     monkeypatch.setattr(torch.cuda.Event, "synchronize", lambda event: (events.append(event), wait(event)))
@@ -217,6 +217,6 @@ def test_uploading_images_ahead_changes_no_box():
     model, drive = prepare_for_inference(made_up_model(config), device), MemoryDrive(count=FRAMES)
     preprocess = Preprocessor(config)
     in_turn = run(model, device, [preprocess(drive.load(place)) for place in range(FRAMES)], [])
-    ahead = Runner(model, device, StepOptions()).run(drive, range(FRAMES), preprocess)
+    ahead = Runner(model, device).run(drive)
     for expected, (_, prediction, _) in zip(in_turn, ahead, strict=True):
         np.testing.assert_allclose(prediction.boxes.centers, expected.boxes.centers, atol=1e-4)

@@ -12,7 +12,6 @@ from test_other_devices import CPU, sample_plainly, small_version
 
 from bevcli.errors import InputError
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.prepare import prepare_for_inference
@@ -46,14 +45,11 @@ def overlapping(monkeypatch):
 
 def steps_of(model, change=lambda prepared: prepared, broken=FRAMES):
     """The steps of a run, and the message of the error that ended it. change: of each frame before its step."""
-    runner, drive, preprocess = (
-        Runner(model, CPU, StepOptions(tracker=TRACKER)),
-        MadeDrive(),
-        Preprocessor(model.config),
-    )
+    runner, drive = Runner(model, CPU, tracker=TRACKER), MadeDrive()
+    runner.prepare = lambda frame: change(runner.preprocess(frame))
     drive.broken, steps = broken, []
     try:
-        for step in runner.run(drive, range(FRAMES), lambda frame: change(preprocess(frame))):
+        for step in runner.run(drive):
             steps.append(step)
     except (InputError, RuntimeError) as error:
         return steps, str(error)
@@ -160,16 +156,16 @@ def test_an_interrupted_run_on_a_gpu_has_all_frames(mini_model, tmp_path, monkey
 def test_a_gpu_gets_the_next_frame_before_results_are_waited_for(name, monkeypatch):
     """Each frame waits once, for its own results: what the device copies has no numbers before."""
     config, count = small_version(name), 4  # the first ones warm up and are captured
-    model, drive, preprocess = made_up_model(config), MemoryDrive(count), Preprocessor(config)
-    expected = list(Runner(model, CPU, StepOptions(tracker=TRACKER)).run(drive, range(count), preprocess))
+    model, drive = made_up_model(config), MemoryDrive(count)
+    expected = list(Runner(model, CPU, tracker=TRACKER).run(drive))
     with simulated("cuda:1", monkeypatch, sample_plainly) as device:
         fast = prepare_for_inference(model, device.device)
         upload = lambda prepared: replace(prepared, images=device.tensor(prepared.images))  # noqa: E731
         monkeypatch.setattr("bevcli.inference.runner.image_uploader", lambda device: upload)
-        runner = Runner(fast, device.device, StepOptions(tracker=TRACKER))
+        runner = Runner(fast, device.device, tracker=TRACKER)
         begin = runner.begin
         monkeypatch.setattr(runner, "begin", lambda *given: (begin(*given), device.waits.append("launched"))[0])
-        found = list(runner.run(drive, range(count), preprocess))
+        found = list(runner.run(drive))
     order = device.waits[device.waits.index("launched") :]
     assert order == ["launched", *["launched", "event"] * (count - 1), "event"]
     for (_, ours, _), (_, theirs, _) in zip(found, expected, strict=True):
@@ -185,5 +181,5 @@ def test_only_what_gains_by_it_is_overlapped(mini_model):
         runner = SimpleNamespace(model=model, device=cuda, options=StepOptions())
         assert Runner.overlap.fget(runner) == overlaps
         assert Runner.overlap.fget(SimpleNamespace(**{**vars(runner), "device": CPU})) == 0
-    observed = SimpleNamespace(model=mini_model, device=cuda, options=StepOptions(ask_attention=True))
+    observed = SimpleNamespace(model=mini_model, device=cuda, options=StepOptions(attention=True))
     assert Runner.overlap.fget(observed) == 0

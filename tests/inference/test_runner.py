@@ -10,7 +10,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.geometry.transforms import apply
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
@@ -86,7 +86,7 @@ def test_boxes_move_to_the_world_by_the_pose_of_their_frame(mini_model):
 
 
 def test_the_probe_answers_in_pixels_and_shares(mini_model):
-    predictions, _ = run(mini_model, MemoryDrive(2), ask_attention=True, probes=((0.0, 12.0),))
+    predictions, _ = run(mini_model, MemoryDrive(2), attention=True, probes=((0.0, 12.0),))
     view = predictions[1].attention
     assert predictions[0].attention.history_weight is None
     assert view.history_weight.shape == (12, 10)
@@ -100,7 +100,7 @@ def test_the_probe_answers_in_pixels_and_shares(mini_model):
 
 def test_a_probe_outside_the_map_is_a_mistake(mini_model):
     with pytest.raises(InputError, match="outside the BEV map"):
-        run(mini_model, MemoryDrive(1), ask_attention=True, probes=((100.0, 0.0),))
+        run(mini_model, MemoryDrive(1), attention=True, probes=((100.0, 0.0),))
 
 
 def test_every_stage_is_timed(mini_model):
@@ -125,7 +125,7 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
     def keep(module, inputs, output):
         seen["queries"] = output
 
-    runner = Runner(mini_model, CPU, StepOptions())
+    runner = Runner(mini_model, CPU)
     handle = runner.model.encoder.layers[0].spatial_cross_attention.register_forward_hook(keep)
     preprocess = Preprocessor(mini_model.config)
     whole = preprocess(MemoryDrive(1).load(0))
@@ -144,7 +144,7 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
 def test_runners_leave_no_hooks_on_a_model(mini_model):
     """Several runners in turn, as in training, and one whose step fails."""
     for _ in range(3):
-        run(mini_model, MemoryDrive(1), ask_attention=True, probes=((0.0, 12.0),))
+        run(mini_model, MemoryDrive(1), attention=True, probes=((0.0, 12.0),))
     runner = Runner(mini_model, CPU)
     prepared = Preprocessor(mini_model.config)(MemoryDrive(1).load(0))
     with pytest.raises(RuntimeError):

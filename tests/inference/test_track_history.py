@@ -15,7 +15,7 @@ from stepping import CPU, run
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.run import run as run_model
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import prepare_for_inference
@@ -180,7 +180,7 @@ def test_a_scene_that_begins_without_images_keeps_no_identities(model):
 
 
 def test_identities_go_on_after_a_frame_that_is_not_finite(model):
-    runner, preprocessor = Runner(model, CPU, StepOptions(tracker=TrackerConfig())), Preprocessor(model.config)
+    runner, preprocessor = Runner(model, CPU, tracker=TrackerConfig()), Preprocessor(model.config)
     frames = [preprocessor(MemoryDrive(3).load(place)) for place in range(3)]
     state, first = runner.step(None, frames[0])
     spoilt = frames[1].images.clone()
@@ -250,5 +250,5 @@ def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
 
     scored: list[list[str]] = []
     monkeypatch.setattr(validation, "score_tracks", keep)
-    validation.validate(Runner(model, CPU, StepOptions(tracker=TrackerConfig())), OneDrive([Labelled(whole[:3])]))
+    validation.validate(Runner(model, CPU, tracker=TrackerConfig()), OneDrive([Labelled(whole[:3])]))
     assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]

@@ -15,7 +15,6 @@ from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev, level_rig
 from bevcli.geometry.transforms import Array, rigid
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes, weights_facts
 from bevcli.model.config import BevFrameConfig
@@ -77,7 +76,7 @@ def test_boxes_in_ego_do_not_depend_on_the_drives_bev_frame(mini_config, ego_fro
     found = []
     for frame_of_drive in (default_ego_from_bev(), ego_from_bev):
         drive = MemoryDrive(2, rig=replace(make_rig(), ego_from_bev=frame_of_drive))
-        results = [prediction for _, prediction, _ in runner.run(drive, range(2), Preprocessor(config))]
+        results = [prediction for _, prediction, _ in runner.run(drive, range(2))]
         found.append(results[-1].boxes_ego)
     np.testing.assert_allclose(found[0].centers, found[1].centers, atol=1e-4)
     np.testing.assert_allclose(found[0].yaws, found[1].yaws, atol=1e-4)

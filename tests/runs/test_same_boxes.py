@@ -9,7 +9,6 @@ import pytest
 import torch
 from bags import drive_messages, write_mcap
 
-from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
@@ -18,7 +17,7 @@ from bevcli.sequences.open import open_sequence
 def world_boxes(model, path, count):
     runner = Runner(model, torch.device("cpu"))
     sequence = open_sequence(path, frames=slice(0, count))
-    steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
+    steps = runner.run(sequence)
     return [prediction.boxes_world for _, prediction, _ in steps]
 
 

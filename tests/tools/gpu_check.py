@@ -37,7 +37,7 @@ from bevcli.inference.load import choose_device
 from bevcli.inference.machine import describe_machine
 from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.model.network import Network
 from bevcli.model.precision import Precision
 from bevcli.model.prepare import methods_on_device, prepare_for_inference
@@ -309,7 +309,7 @@ class BareVersion(Version):
 
     def __init__(self, model: TemporalModel, device: torch.device, drive: MadeUpDrive) -> None:
         super().__init__(model, device)
-        self.runner = Runner(model, device, StepOptions())
+        self.runner = Runner(model, device)
         self.drive = drive
 
     def _keep(self, *_: object) -> None:

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.inference.load import load_model
+from bevcli.inference.options import StepOptions
 from bevcli.printing import say
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
@@ -189,7 +190,7 @@ class OpenDrives:
 def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iterator[str]:
     """A line each for a model's scores with the right and with the measured motion, and their ratio."""
     loaded = load_model(model)
-    options, runner = InputOptions(every=1, classes=loaded.config.classes), loaded.runner(track=False, temporal=True)
+    options, runner = InputOptions(every=1, classes=loaded.config.classes), loaded.runner(StepOptions(track=False))
     right = [open_sequence(path, options) for path in paths]
     measured_drives = [
         DriveView(drive, motions=dict.fromkeys((stamp.scene for stamp in drive.stamps), motion.ego_motion))

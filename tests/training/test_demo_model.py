@@ -13,7 +13,7 @@ from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
 from bevcli.frame import Drive
 from bevcli.inference.load import load_model
-from bevcli.inference.runner import Runner, StepOptions
+from bevcli.inference.runner import Runner
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.sequences.view import select_range
 from bevcli.workshop.synth.drives import FolderDrives
@@ -87,7 +87,7 @@ def test_it_finds_cars_and_road_in_the_sample_street() -> None:
     """Thresholds far below the model card's scores, but far above those of random weights."""
     model = load_model(device="cpu")
     drives = EightFrames([STREET], model.config)
-    scores = validate(Runner(model.prepared, model.device, StepOptions(tracker=model.tracker)), drives)
+    scores = validate(Runner(model.prepared, model.device, tracker=model.tracker), drives)
     assert scores.detection.overall.classes["car"].mean_ap > 0.2
     assert scores.segmentation.iou["drivable_road"] > 0.6
     cars = scores.tracking.classes["car"].metrics

@@ -216,7 +216,6 @@ def run_benchmark(
 
 def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) -> dict[str, tuple[float, ...]]:
     """Seconds of each stage of the timed frames, after a warm-up from frame `first` on; no two stages run together."""
-    preprocessor = fast.runner.preprocessor()
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
         for index in range(first, timed.stop):
@@ -228,7 +227,7 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
             began = time.perf_counter()
             frame = drive.load(index)
             loaded = time.perf_counter()
-            prepared = preprocessor(frame)
+            prepared = fast.runner.preprocess(frame)
             before = {"decode": loaded - began, "preprocess": time.perf_counter() - loaded}
             prediction = fast.step(prepared)
             recording_began = time.perf_counter()
@@ -252,20 +251,17 @@ def time_runs(
     frame_s = median(fast.seconds)
     frames = max(frames, min(RUN_FRAMES, round(turns_s / RUNS / 2 / frame_s)))
     runs = max(1, min(RUNS, round(turns_s / (2 * frames * frame_s))))
-    preprocessor = fast.runner.preprocessor()
     fast.seconds = []
     in_runs: list[float] = []
     with _recording(drive, fast) as recording:
         for first in range(index, index + 2 * frames * runs, 2 * frames):
             for alone in range(first, first + frames):
-                fast.step(preprocessor(drive.load(alone)))
-            in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), preprocessor, recording)
+                fast.step(fast.runner.preprocess(drive.load(alone)))
+            in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), recording)
     return median(in_runs), median(in_runs) / median(fast.seconds)
 
 
-def _time_run(
-    fast: Version, drive: MadeUpDrive, places: range, preprocessor: Preprocessor, recording: Recording
-) -> list[float]:
+def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recording) -> list[float]:
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
@@ -274,7 +270,7 @@ def _time_run(
         recording.log(*step[:2])
         fast.state = step[2]
 
-    for _ in write_behind(fast.runner.run(drive, places, preprocessor, fast.state), record):
+    for _ in write_behind(fast.runner.run(drive, places, fast.state), record):
         pass
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 

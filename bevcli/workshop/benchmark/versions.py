@@ -16,7 +16,7 @@ from bevcli.inference.load import Model, installed_engines
 from bevcli.inference.machine import describe_machine, keep_freed_memory, return_freed_memory
 from bevcli.inference.options import TORCH
 from bevcli.inference.pipeline import StageClock
-from bevcli.inference.runner import Runner, RunnerState, StepOptions
+from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
@@ -59,7 +59,7 @@ class Version:
     """
 
     def __init__(self, model: TemporalModel, device: torch.device, *, takes_pixels: bool = False) -> None:
-        self.runner = Runner(model, device, StepOptions(takes_pixels=takes_pixels))
+        self.runner = Runner(model, device, pixels=takes_pixels)
         self.runner.clock = StageClock(model, device, *fine_stages(model))
         self.seconds: list[float] = []
         self.queries: QueryResults = (torch.empty(0), torch.empty(0))
@@ -266,12 +266,11 @@ def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], No
             versions[engine, precision] = Version(model.prepared, CPU, takes_pixels=model.is_exported)
     first = config.past_frames
     drive = MadeUpDrive(first + WARM_UP_FRAMES + frames)
-    preprocessors = {name: version.runner.preprocessor() for name, version in versions.items()}
     differences: dict[tuple[str, Any], list[tuple[Tensor, Tensor]]] = {name: [] for name in versions}
     for index in range(first, len(drive.stamps)):
         frame = drive.load(index)
         for name, version in versions.items():
-            version.step(preprocessors[name](frame))
+            version.step(version.runner.preprocess(frame))
             if index == first:
                 version.fill_past(drive)
             if index >= first + WARM_UP_FRAMES:

@@ -33,9 +33,8 @@ def measure_speed() -> dict[str, str]:
                 rows[f"{model} {precision}"] = "not measured: the minute is over"
                 continue
             version = Version(prepare_for_inference(network, device, precision), device)
-            preprocessor = version.runner.preprocessor()
             for index in range(len(drive.stamps)):
-                version.step(preprocessor(drive.load(index)))
+                version.step(version.runner.preprocess(drive.load(index)))
                 timed = version.seconds[WARM_UP_FRAMES:]
                 if timed and (sum(timed) > ROW_S or time.perf_counter() - began > BUDGET_S):
                     break

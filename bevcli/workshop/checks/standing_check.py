@@ -24,19 +24,18 @@ NOISE_GAIN = 6 * 0.6745  # of the median of what the mask shows
 MOVING = 0.3  # share of the corners that stay, below which the images move
 
 
-IMAGES_MOVE = (
-    'the images move as if the vehicle drove, but `ego_motion="static"` (`--static`) says that it stands, so the '
-    "history is wrong and boxes are missed: pass `odometry=True` (`--odometry`) in its place, which measures the "
-    "motion, or `temporal=False` (`--no-temporal`)"
-)
-
-
 class StandingCheck:
     """Compares the images of the frames that it is called with, in order.
 
     It compares frames 0 and 1, 1 and 2, 3 and 4, 7 and 8 and so on, in the two cameras that look most differently.
     A pair takes about 6 ms.
     """
+
+    note = (
+        'the images move as if the vehicle drove, but `ego_motion="static"` (`--static`) says that it stands, so the '
+        "history is wrong and boxes are missed: pass `odometry=True` (`--odometry`) in its place, which measures the "
+        "motion, or `temporal=False` (`--no-temporal`)"
+    )
 
     def __init__(self) -> None:
         self._number = -1

@@ -15,6 +15,7 @@ from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
+from bevcli.inference.options import StepOptions
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
@@ -237,7 +238,7 @@ class StressTest:
             left = [condition for condition in self._conditions if (condition.name, condition.severity) not in finished]
             done = self._kept_frames(left) + (len(self._conditions) - len(left)) * sum(map(_length, self._scenes))
             yield done
-            runner = self._model.runner(track=False, temporal=self._options.temporal)
+            runner = self._model.runner(StepOptions(track=False, temporal=self._options.temporal))
             try:
                 for condition in left:
                     for index in range(len(self._scenes)):
@@ -287,7 +288,7 @@ class StressTest:
         boxes: list[tuple[Boxes3D, Boxes3D]] = []
         for changed in condition.sequences(scene, options.seed, options.lost_images):
             drive = _calibrated(changed) if options.calibrate else changed
-            for frame, prediction, _ in runner.run(drive, range(len(drive.stamps)), runner.preprocessor()):
+            for frame, prediction, _ in runner.run(drive):
                 if frame.ground_truth is not None:
                     predicted = prediction.boxes_ego  # the model has no attributes: they follow from the speed
                     predicted = replace(predicted, attributes=attributes_by_speed(predicted, self._metrics.classes))

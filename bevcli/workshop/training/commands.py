@@ -11,7 +11,7 @@ from bevcli.cli.bridge import Json, Part, model_option
 from bevcli.cli.progress import Progress, odometry_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.printing import counted, print_note, say
 from bevcli.runs.options import RunOptions
 from bevcli.workshop.synth.options import DriveOptions
@@ -127,7 +127,7 @@ def validate(
     if options.reference is not None:
         raise InputError("--reference is for drives without ground truth: remove it")
     with Progress(total, "frames", notes) as progress:
-        runner = loaded.runner(track=options.tracking, temporal=run_options.temporal)
+        runner = loaded.runner(StepOptions(track=options.tracking, temporal=run_options.temporal))
         frames = progress.each(validation.run_drives(runner, drives))
         scores = validation.score_frames(frames, runner, drives, options.max_range, each_drive=options.each)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.inference.load import Model, choose_device, load_model
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.options import refuse, spread
 from bevcli.workshop.synth.drives import Drives, count_frames as count_frames, scored_drives
 from bevcli.workshop.synth.options import DriveOptions
@@ -96,7 +96,7 @@ def validate(
     scored, notes, loaded = drives_to_score(loaded, name, drives, chosen, report)
     for note in notes:
         report(note)
-    runner = loaded.runner(track=chosen.tracking, temporal=temporal)
+    runner = loaded.runner(StepOptions(track=chosen.tracking, temporal=temporal))
     return validate_runner(runner, scored, chosen.max_range, each_drive=chosen.each)
 
 

@@ -198,7 +198,7 @@ def run_drives(runner: Runner, drives: Drives) -> Iterator[ScoredFrame]:
     """Run every frame of the drives."""
     for index in range(len(drives)):
         drive = drives.open(index)
-        for frame, prediction, _ in runner.run(drive, range(len(drive.stamps)), runner.preprocessor()):
+        for frame, prediction, _ in runner.run(drive):
             yield index, frame, prediction
 
 
@@ -227,7 +227,7 @@ def score_frames(
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     classes = runner.config.object_classes
     config = DetectionConfig.of(classes).cut_at(range_m)
-    tracked = runner.options.tracker is not None
+    tracked = runner.tracker is not None
     boxes: list[list[tuple[Boxes3D, Boxes3D]]] = [[] for _ in range(len(drives))]
     maps = []
     tracks: list[tuple[FrameBoxes, FrameBoxes]] = []

@@ -22,6 +22,7 @@ from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.load import Model
+from bevcli.inference.options import StepOptions
 from bevcli.inference.preprocess import image_for_rig, network_scale
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ImageConfig
@@ -86,7 +87,7 @@ def boxes_of(model: Model, shot: Shot, after_frame: Callable[[], None] = lambda:
     if path.exists():
         with suppress(InputError):  # damaged, or of another version
             return load_state(path, RigBoxes)
-    runner, assets, boxes = model.runner(track=False), Assets.build(), []
+    runner, assets, boxes = model.runner(StepOptions(track=False)), Assets.build(), []
     for seed in STREETS:
         street = _Street(seed, shot, model.config.image, model.config.rate_hz, assets)
         for pair in _run(runner, street):
@@ -99,7 +100,7 @@ def boxes_of(model: Model, shot: Shot, after_frame: Callable[[], None] = lambda:
 
 
 def _run(runner: Runner, street: Drive) -> Iterator[tuple[Boxes3D, Boxes3D]]:
-    for frame, prediction, _ in runner.run(street, range(len(street.stamps)), runner.preprocessor()):
+    for frame, prediction, _ in runner.run(street):
         assert frame.ground_truth is not None
         yield prediction.boxes_ego, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
