@@ -14,6 +14,7 @@ from pathlib import Path
 
 from bevcli.errors import OutputError
 
+PARTIAL = ".partial"  # ends the name of a file while it is written
 NO_HOME = Path("/nonexistent")  # as in the passwd of Debian; caches that cannot be written are done without
 
 
@@ -112,3 +113,8 @@ def user_folder(variable: str, below_home: str) -> Path:
         return Path(os.environ.get(variable) or Path.home() / below_home) / "bevcli"
     except RuntimeError:  # no HOME, and no entry in the system's list of users
         return NO_HOME / below_home / "bevcli"
+
+
+def partial_path(path: Path) -> Path:
+    """The name of a file while it is written."""
+    return path.with_name(path.name + PARTIAL)

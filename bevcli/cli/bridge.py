@@ -18,6 +18,7 @@ from bevcli.options import Option, Reads, defaults
 from bevcli.printing import did_you_mean
 from bevcli.registry import is_of_hub
 from bevcli.sequences.format import option_classes
+from bevcli.writing import partial_path
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _UNIONS = (Union, types.UnionType)
@@ -172,8 +173,6 @@ def _require(value: Any, flag: _Flag) -> None:
             Path(text).stat()
             continue
         except (FileNotFoundError, NotADirectoryError, ValueError):
-            from bevcli.sequences.files.incremental_json import partial_path
-
             if Path(text).name and partial_path(Path(text)).exists():
                 continue
         except OSError:

@@ -1,7 +1,6 @@
 """The short commands of the core: `bevcli samples`, `viz` and `project-debug`."""
 
 import shutil
-import textwrap
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -126,9 +125,7 @@ def project_debug(
 
     Exit code: 0 without errors, 3 with findings of severity error.
     """
-    from bevcli import config
-    from bevcli.inference import training_rigs
-    from bevcli.rig.check_calibration import INDENT, WIDTH
+    from bevcli.rig.check_calibration import model_notes
 
     given = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in given:
@@ -156,10 +153,7 @@ def project_debug(
     if as_json:
         say(check.to_json())
     else:
-        notes = [
-            textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
-            for note in training_rigs.training_rig_notes(check.rig, config.load_config(model))
-        ]
+        notes = model_notes(check.rig, model)
         if gap is not None:
             notes.append(f"{gap.text()}\n")
         elif options.model is not None or options.against is not None:

@@ -117,13 +117,12 @@ class Progress:
 
 
 def _bar(stream: TextIO) -> "rich.progress.Progress":
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich import console, progress
 
-    return Progress(
-        BarColumn(),
-        TextColumn("{task.fields[state]}", markup=False),
-        console=Console(file=stream),
+    return progress.Progress(
+        progress.BarColumn(),
+        progress.TextColumn("{task.fields[state]}", markup=False),
+        console=console.Console(file=stream),
         redirect_stdout=False,  # a command's results may be piped
     )
 

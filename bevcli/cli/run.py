@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive
 from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
 from bevcli.cli.stop_signals import StopSignals
@@ -60,12 +61,11 @@ def run(
     map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
-    from bevcli.parsing.documents import without_garbage_collection
+    gc.disable()  # a fifth faster: of the million objects of the packages, hardly any is garbage
+    from bevcli.runs.run_into_folder import run_in_folder
+    from bevcli.workshop.checks.standing_check import StandingCheck
 
-    with without_garbage_collection():  # a fifth faster: of the million objects of the packages, hardly any is garbage
-        from bevcli.runs.run_into_folder import run_in_folder
-        from bevcli.sequences.open import open_sequence
-        from bevcli.workshop.checks.standing_check import StandingCheck
+    gc.enable()
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
     loaded = load_with_bar(model)
@@ -74,7 +74,7 @@ def run(
         run_options = replace(run_options, temporal=False)
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     with odometry_bar() as show_steps:
-        drive = open_sequence(sequence, replace(source, after_step=show_steps), **format_options)
+        drive = bevcli.open_sequence(sequence, replace(source, after_step=show_steps), **format_options)
     if calibrate:
         from bevcli.workshop.calibration.core_options import corrected
 
@@ -102,10 +102,10 @@ def run(
     summary = running.summary
     say(summary.table())
     if score_without_labels:
-        from bevcli.workshop.trust.estimate import estimate_of_run
-        from bevcli.workshop.trust.faults import find_faults
+        from bevcli.workshop.trust import estimate
 
-        say(estimate_of_run(loaded, out, drive.rig).with_faults(find_faults(loaded, drive)).table())
+        faults = estimate.find_faults(loaded, drive)
+        say(estimate.estimate_of_run(loaded, out, drive.rig).with_faults(faults).table())
     if signals.received() and not summary.is_complete:
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)

@@ -1,16 +1,9 @@
-"""The machine: settings of memory allocator and threads for the whole process, name of the processor, memory used.
+"""The machine: settings of memory allocator and threads for the whole process.
 
 The command line makes the settings at its start, before it imports PyTorch.
 """
 
 import ctypes
-import platform
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import torch
 
 # Libraries read these variables when they are loaded.
 THREAD_SETTINGS = {
@@ -58,30 +51,3 @@ def _call_glibc(name: str, *arguments: int) -> None:
     function = getattr(ctypes.CDLL(None), name, None)
     if function is not None:
         function(*arguments)
-
-
-def describe_machine(device: "torch.device") -> str:
-    """Name of the processor or GPU, number of threads and PyTorch's version."""
-    import torch
-
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-
-
-def peak_memory(device: "torch.device") -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU. 0 on Windows, which does not tell."""
-    if device.type == "cuda":
-        import torch
-
-        return torch.cuda.max_memory_allocated(device)
-    try:
-        import resource
-    except ImportError:
-        return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.config import load_config
 from bevcli.errors import InputError
 from bevcli.findings import SEVERITIES, Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.inference.training_rigs import training_rig_notes
 from bevcli.options import defaults, gather
 from bevcli.printing import aligned, counted
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
@@ -311,6 +313,12 @@ def _cameras(rig: CameraRig, coverage: Coverage) -> str:
         position = (f"{mounting.x:.2f}", f"{mounting.y:.2f}", f"{mounting.height:.2f} m")
         rows.append((camera.name, size, fov, *angles, *position, lens, seen))
     return aligned([header, *rows], left=(0, 9))
+
+
+def model_notes(rig: CameraRig, model: str) -> list[str]:
+    """Paragraphs on where a rig lies outside the training of a model. model: a name, or a FILE.toml."""
+    notes = training_rig_notes(rig, load_config(model))
+    return [textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n" for note in notes]
 
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:

@@ -26,10 +26,10 @@ from bevcli.runs.summary import RunSummary
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.boxes_table import CsvWriter
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
-from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
+from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
-from bevcli.writing import whole_file, write_whole
+from bevcli.writing import partial_path, whole_file, write_whole
 
 if TYPE_CHECKING:
     from bevcli.sequences.files.submission import SubmissionWriter

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from bevcli.errors import OutputError
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
-from bevcli.writing import lock, output_errors
+from bevcli.sequences.files.incremental_json import GrowingFile
+from bevcli.writing import lock, output_errors, partial_path
 
 OWN = ".bevcli"
 SUMMARY = "summary.json"

@@ -15,9 +15,8 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
-from bevcli.writing import output_errors
+from bevcli.writing import PARTIAL, output_errors, partial_path
 
-PARTIAL = ".partial"
 LARGEST_BYTES = 4 << 30
 
 
@@ -69,11 +68,6 @@ class GrowingFile:
     def is_deleted(self) -> bool:
         """True if somebody has deleted the file while it is written."""
         return os.fstat(self._file.fileno()).st_nlink == 0
-
-
-def partial_path(path: Path) -> Path:
-    """The name of a file while it is written."""
-    return path.with_name(path.name + PARTIAL)
 
 
 def existing(path: Path) -> Path:

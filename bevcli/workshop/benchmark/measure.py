@@ -16,8 +16,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.load import Model
-from bevcli.inference.machine import describe_machine, peak_memory
+from bevcli.inference.load import Model, describe_machine, peak_memory
 from bevcli.inference.pipeline import write_behind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState

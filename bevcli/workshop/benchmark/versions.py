@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
 from bevcli.frame import Prediction
-from bevcli.inference.load import Model, installed_engines
-from bevcli.inference.machine import describe_machine, keep_freed_memory, return_freed_memory
+from bevcli.inference.load import Model, describe_machine, installed_engines
+from bevcli.inference.machine import keep_freed_memory, return_freed_memory
 from bevcli.inference.options import TORCH
 from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState

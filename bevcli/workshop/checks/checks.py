@@ -103,7 +103,7 @@ def processor() -> Facts:
     """Name, cores, memory, and what multiplies bfloat16."""
     import torch
 
-    from bevcli.inference.machine import describe_machine
+    from bevcli.inference.load import describe_machine
     from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
 
     affinity = getattr(os, "sched_getaffinity", None)

@@ -22,7 +22,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
-from bevcli.inference.machine import peak_memory
+from bevcli.inference.load import peak_memory
 from bevcli.inference.training_rigs import fov_deg, tilt_deg
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted, duration
