@@ -18,9 +18,8 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.writing import user_cache, user_folder, write_whole
+from bevcli.writing import user_folder, weights_folder, write_whole
 
-FOLDER_VARIABLE = "BEVCLI_WEIGHTS_DIR"
 HASHES = "hashes.json"
 
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
@@ -199,12 +198,6 @@ def read_sources() -> dict[str, Source]:
             except msgspec.ValidationError as error:
                 raise ConfigError(f"{file}: [{name}]: {error}") from None
     return sources
-
-
-def weights_folder(chosen: Path | None = None) -> Path:
-    """The folder of downloaded weights: the chosen one, $BEVCLI_WEIGHTS_DIR, or ~/.cache/bevcli/weights."""
-    named = os.environ.get(FOLDER_VARIABLE)
-    return chosen or (Path(named) if named else user_cache() / "weights")
 
 
 def all_weights(folder: Path | None = None) -> dict[str, NamedWeights]:

@@ -118,3 +118,9 @@ def user_folder(variable: str, below_home: str) -> Path:
 def partial_path(path: Path) -> Path:
     """The name of a file while it is written."""
     return path.with_name(path.name + PARTIAL)
+
+
+def weights_folder(chosen: Path | None = None) -> Path:
+    """The folder of downloaded weights: the chosen one, $BEVCLI_WEIGHTS_DIR, or ~/.cache/bevcli/weights."""
+    named = os.environ.get("BEVCLI_WEIGHTS_DIR")
+    return chosen or (Path(named) if named else user_cache() / "weights")

@@ -34,10 +34,11 @@ from bevcli.model.precision import AnyPrecision
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
-from bevcli.published import NamedWeights, all_weights, hub_model, named_weights, weights_folder
+from bevcli.published import NamedWeights, all_weights, hub_model, named_weights
 from bevcli.registry import entries, is_of_hub, load
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import AT_REST
+from bevcli.writing import weights_folder
 
 try:
     import resource

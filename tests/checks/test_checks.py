@@ -10,7 +10,7 @@ from command_line import MINI_TOML, command
 
 from bevcli._version import __version__
 from bevcli.workshop.benchmark import made_up, measure
-from bevcli.workshop.checks import checks, speed
+from bevcli.workshop.checks import checks, speed, torch_checks
 
 
 def test_the_text_fits_a_screen_and_names_no_user(tmp_path, monkeypatch):
@@ -41,6 +41,8 @@ def test_each_line_tells_its_own_failure(tmp_path, monkeypatch):
         raise OSError(5, "Input/output error", str(tmp_path))
 
     monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, torch_checks.__name__)
+    monkeypatch.delattr("bevcli.workshop.checks.torch_checks")
     monkeypatch.setitem(checks.CHECKS, "viewer", fails)
     done = command(tmp_path, "checks", "--json")
     assert done.returncode == 0
@@ -78,11 +80,11 @@ def test_the_kernels_are_those_that_a_model_gets(monkeypatch):
         pytest.skip("the processor has no instructions for bfloat16")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: True)
-    found = checks.kernels()
+    found = torch_checks.kernels()
     assert "CompiledSampling" in found["attention"]
     assert found["bf16"] == "for images and products of encoder and decoder (AMX)"
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
-    assert checks.kernels()["bf16"] == "for images only (no AMX)"
+    assert torch_checks.kernels()["bf16"] == "for images only (no AMX)"
 
 
 def test_speed_measures_each_model_until_the_time_is_over(tmp_path, monkeypatch):

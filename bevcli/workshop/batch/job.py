@@ -26,7 +26,6 @@ from bevcli.inference.load import Model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, hash_of_file, hash_of_values, read_text
-from bevcli.published import weights_folder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
@@ -35,7 +34,7 @@ from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, InputOptions
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
-from bevcli.writing import user_cache
+from bevcli.writing import user_cache, weights_folder
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
 LONGEST_NAME = 80

@@ -8,17 +8,19 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from bevcli._version import __version__
 from bevcli.printing import one_line, reason_of
-from bevcli.writing import user_cache
+from bevcli.writing import user_cache, weights_folder
 
 Facts = str | dict[str, str]
 WIDTH, INDENT = 80, 11
 TIED = "\xa0"  # a space where no line ends
 SHORT = 16  # characters; a fact whose texts are no longer stands on one line
+LOOPS = Path(__file__).parents[2] / "model/kernels/__pycache__"  # where numba keeps what it has compiled
 MOST_FILES = 100_000  # of a cache that are counted
 # Extras that a user of bevcli installs; the others are for its developers.
 NOT_FOR_USERS = ("dev", "docs")
@@ -99,77 +101,12 @@ def packages() -> Facts:
     return found | {name: installed(name) for name in of_extras if installed(name)}
 
 
-def processor() -> Facts:
-    """Name, cores, memory, and what multiplies bfloat16."""
-    import torch
+def _of_torch(name: str) -> Facts:
+    """A check that needs PyTorch: where that is broken, each of them says so."""
+    from bevcli.workshop.checks import torch_checks
 
-    from bevcli.inference.load import describe_machine
-    from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
-
-    affinity = getattr(os, "sched_getaffinity", None)
-    cores = f"{len(affinity(0)) if affinity else os.cpu_count()} of {os.cpu_count()} cores"
-    meminfo = Path("/proc/meminfo")
-    total = re.match(r"MemTotal:\s*(\d+) kB", meminfo.read_text(encoding="utf-8")) if meminfo.is_file() else None
-    memory = f", {int(total[1]) / 2**20:.0f} GiB" if total else ""
-    rounds = "instructions for bfloat16" if has_onednn(torch.bfloat16) else "no instructions for bfloat16"
-    amx = "AMX" if has_matrix_unit() else "no AMX"
-    return f"{describe_machine(torch.device('cpu'))}; {cores}{memory}; {rounds}, {amx}"
-
-
-def gpu() -> Facts:
-    """The GPUs that PyTorch sees, and the CUDA that it was built for."""
-    import torch
-
-    if not torch.cuda.is_available():
-        build = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a build without CUDA"
-        mps = "; an Apple GPU is there (mps)" if torch.backends.mps.is_available() else ""
-        return f"none that PyTorch sees ({build}){mps}"
-    found = {}
-    for index in range(torch.cuda.device_count()):
-        device = torch.cuda.get_device_properties(index)
-        capability = f"compute capability {device.major}.{device.minor}"
-        found[f"cuda:{index}"] = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, {capability}"
-    return found | {"CUDA": f"{torch.version.cuda} of PyTorch"}
-
-
-def kernels() -> Facts:
-    """The faster parts that a model gets on the default device, and why these."""
-    import torch
-
-    from bevcli.config import load_config
-    from bevcli.inference.load import choose_device
-    from bevcli.model.kernels.choose import choose_kernels, has_triton
-    from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
-    from bevcli.model.network import build_network
-
-    device = choose_device("auto")
-    with torch.device("meta"):
-        network = build_network(load_config("demo")).eval()
-    choose_kernels(network, device)
-    kinds = {type(part) for part in network.modules()}
-    kinds |= {type(sampling) for part in network.modules() if (sampling := getattr(part, "sampling", None)) is not None}
-    chosen = sorted(kind.__name__ for kind in kinds if kind.__module__.startswith("bevcli.model.kernels"))
-    if device.type == "cpu":
-        why = "loops compiled by numba, as no GPU is there"
-        products = "oneDNN" if has_onednn(torch.float32) else "plain PyTorch, as this build lacks operators of oneDNN"
-    else:
-        why = "Triton" if has_triton(device) else "plain PyTorch, as Triton is not installed or the GPU is not of CUDA"
-        products = "PyTorch, replayed as CUDA graphs" if device.type == "cuda" else "PyTorch"
-    found = {"attention": f"{', '.join(chosen) or 'as in the paper'} ({why})", "convolutions": products}
-    if device.type == "cpu":
-        parts = "images and products of encoder and decoder (AMX)" if has_matrix_unit() else "images only (no AMX)"
-        found["bf16"] = (
-            f"for {parts}" if has_onednn(torch.bfloat16) else "slow: the processor lacks instructions for it"
-        )
-    return found
-
-
-def engines() -> Facts:
-    """The other engines that are installed, and INT8."""
-    from bevcli.inference.load import installed_engines
-
-    found = ", ".join(installed_engines())
-    return f"torch, {found}; INT8 runs in {found.partition(',')[0]}" if found else "torch only, so no INT8"
+    check: Callable[[], Facts] = getattr(torch_checks, name)
+    return check()
 
 
 def viewer() -> Facts:
@@ -207,12 +144,9 @@ def video() -> Facts:
 
 def caches() -> Facts:
     """The folders that keep files from run to run, with their sizes."""
-    from bevcli.model.kernels.loops import __file__ as loops
-    from bevcli.published import weights_folder
-
     home = Path.home()
     hub = os.environ.get("HF_HUB_CACHE") or Path(os.environ.get("HF_HOME") or home / ".cache/huggingface", "hub")
-    folders = [user_cache(), Path(hub), Path(os.environ.get("NUMBA_CACHE_DIR") or Path(loops).parent / "__pycache__")]
+    folders = [user_cache(), Path(hub), Path(os.environ.get("NUMBA_CACHE_DIR") or LOOPS)]
     if not weights_folder().is_relative_to(user_cache()):
         folders.append(weights_folder())
     names = {
@@ -225,10 +159,10 @@ def _size(folder: Path) -> str:
     if not folder.is_dir():
         return "none"
     total = count = 0
-    for place, _, files in os.walk(folder):
+    for parent, _, files in os.walk(folder):
         for file in files:
             with suppress(OSError):  # it is gone
-                total += os.lstat(os.path.join(place, file)).st_size
+                total += os.lstat(os.path.join(parent, file)).st_size
             count += 1
         if count > MOST_FILES:
             return f"over {total / 1e6:.0f} MB"
@@ -249,10 +183,10 @@ def missing() -> Facts:
 CHECKS: dict[str, Callable[[], Facts]] = {
     "bevcli": versions,
     "packages": packages,
-    "processor": processor,
-    "GPU": gpu,
-    "kernels": kernels,
-    "engines": engines,
+    "processor": partial(_of_torch, "processor"),
+    "GPU": partial(_of_torch, "gpu"),
+    "kernels": partial(_of_torch, "kernels"),
+    "engines": partial(_of_torch, "engines"),
     "viewer": viewer,
     "video": video,
     "caches": caches,
