@@ -1,6 +1,8 @@
 """A batch in this process: same bytes as single runs, failed drives become rows, and `resume` does what is left."""
 
+import contextlib
 import csv
+import itertools
 import json
 import os
 import shutil
@@ -49,14 +51,15 @@ def model(fleet):
 def batch(fleet, model, tmp_path):
     """Runs the fleet, or other drives, into tmp_path/out."""
 
-    def run(texts=None, out=None, options=None, should_stop=lambda: False, ran=None, **arguments):
+    def run(texts=None, out=None, options=None, frames=None, ran=None, **arguments):
         job = make_job(tmp_path / "out" if out is None else out, fleet / "mini.toml", **(options or {}))
         drives, _ = find_drives(texts or [str(fleet / "drives/*")])
         started = Batch(job, model, drives, **arguments)
-        skipped, *records = started.run(should_stop)
+        with contextlib.closing(started.run()) as running:  # of which the first `frames` steps are taken
+            skipped, *steps = itertools.islice(running, frames)
         assert started.summary.skipped == skipped
         if ran is not None:
-            ran.extend(records)
+            ran.extend(record for record in steps if record is not None)
         return started.summary
 
     return run
@@ -160,11 +163,10 @@ def test_a_wrong_mesh_of_a_class_ends_a_batch_before_it_starts(fleet, tmp_path):
 
 
 def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
-    answers = iter([False] * 5)
-    stopped = batch(should_stop=lambda: next(answers, True))
+    stopped = batch(frames=1 + 4 + 2)  # the second drive is stopped after its second frame
     assert stopped.stopped
     done = len(results_of(tmp_path / "out"))
-    assert done in (1, 2)  # the second drive was stopped after its second frame, and had computed the rest or not
+    assert done == 1
     assert not [path for path in (tmp_path / "out/.bevcli/attempts").iterdir() if path.suffix == ".run"]
     summary = batch(resume=True)
     assert (summary.skipped, summary.failed, len(summary.records)) == (done, 1, 4)
@@ -182,8 +184,8 @@ def test_a_drive_that_kills_its_worker_each_time_becomes_a_row(fleet, tmp_path, 
     monkeypatch.setattr(worker_module, "run_in_folder", die)
     for _ in range(3):
         with pytest.raises(Killed):
-            Worker(job, "hash").run(drive)
-    record = Worker(job, "hash").run(drive)
+            next(Worker(job, "hash").run(drive))
+    (record,) = Worker(job, "hash").run(drive)
     assert record["attempts"] == 3
     assert record["error"] == "the worker died in attempt 3 of 3 (out of memory, or a crash)"
 

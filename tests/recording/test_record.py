@@ -11,7 +11,7 @@ from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, Frame
+from bevcli.frame import BevMap, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid
 from bevcli.recording import entities
@@ -21,7 +21,7 @@ from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
-from bevcli.workshop.scores.record import names_of, record
+from bevcli.workshop.scores.record import names_of, record, record_steps
 from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
 
 CAR = (255, 158, 44)
@@ -56,14 +56,19 @@ def color(frame: RecordedFrame, entity: str, component: str = "Boxes3D:colors") 
     return {tuple(packed.to_bytes(4, "big")[:3]) for packed in frame.integers(entity, component)}
 
 
+def lines_of(drive: Drive, boxes: Path | None, path: Path) -> list[str]:
+    """The lines for the user of a recording that is written."""
+    return [step for step in record_steps(drive, boxes, path) if isinstance(step, str)]
+
+
 def numbers_of(value) -> list:
     """The numbers and texts in lists of lists."""
     return [number for each in value for number in numbers_of(each)] if isinstance(value, list) else [value]
 
 
 def test_labels_alone_are_boxes_in_their_colours(tmp_path):
-    lines: list[str] = []
-    first, _ = frames_of(record(Labelled(2), path=tmp_path / "r.rrd", report=lines.append))
+    lines = lines_of(Labelled(2), None, tmp_path / "r.rrd")
+    first, _ = frames_of(tmp_path / "r.rrd")
     assert first.texts(entities.BOXES, "name") == ["car", "bicycle"]
     in_image = color(first, entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:colors")
     assert CAR in in_image
@@ -108,9 +113,10 @@ def test_beyond_the_range_of_its_class_nothing_is_missed(tmp_path):
 
 def test_frames_of_a_submission_are_matched_by_token(tmp_path):
     """Of a frame that the file lacks, no label is missed, and no trail of the frame before stays."""
-    drive, lines = Labelled(3), list[str]()
+    drive = Labelled(3)
     write_submission(boxes_file(drive, range(2)), tmp_path / "results_nusc.json")
-    first, _, last = frames_of(record(drive, tmp_path / "results_nusc.json", tmp_path / "r.rrd", report=lines.append))
+    lines = lines_of(drive, tmp_path / "results_nusc.json", tmp_path / "r.rrd")
+    first, _, last = frames_of(tmp_path / "r.rrd")
     assert lines == ["results_nusc: has boxes of 2 of 3 frames, matched by sample_token"]
     assert first.texts(entities.MISSED, "name") == ["bicycle"]
     assert first.texts(entities.BOXES, "name") == ["car", "pedestrian"]  # the bus is below the score
@@ -120,12 +126,12 @@ def test_frames_of_a_submission_are_matched_by_token(tmp_path):
 
 
 def test_boxes_of_another_drive_are_told(tmp_path):
-    drive, lines = Labelled(1), list[str]()
+    drive = Labelled(1)
     file = boxes_file(drive, range(1))
     stamp = replace(drive.stamps[0], scene="b", timestamp_ns=7)
     far = file.frames[0].boxes.transformed(rigid((0, -2000, 0)))
     write_boxes(BoxesFile("world", (FrameBoxes(stamp, drive.pose(0), far),)), tmp_path / "a.json")
-    record(drive, tmp_path / "a.json", tmp_path / "r.rrd", report=lines.append)
+    lines = lines_of(drive, tmp_path / "a.json", tmp_path / "r.rrd")
     assert lines[0] == "a: has boxes of 1 of 1 frame, matched by frame index, as scenes or times differ"
     assert re.fullmatch(r"warning: a: the nearest box is 19\d\d m from the vehicle: is it of this drive\?", lines[1])
 

@@ -3,7 +3,7 @@
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +32,7 @@ from bevcli.workshop.batch.job import (
     with_absolute_paths,
 )
 from bevcli.workshop.batch.report import METRICS as METRICS, write_results
-from bevcli.workshop.batch.worker import StoppedError, Worker, run_on_ray, use_threads
+from bevcli.workshop.batch.worker import Worker, run_on_ray, use_threads
 
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 OF_EXPORT = "the first drive of each number of cameras and image size exports the model, and waits for it"
@@ -41,8 +41,6 @@ OF_EXPORT = "the first drive of each number of cameras and image size exports th
 def batch(
     drives: str | Path | Iterable[str | Path],
     out: str | Path,
-    *,
-    report: Callable[[str], None] = lambda note: None,
     **options: Any,
 ) -> "BatchSummary":
     """Run a model on many drives, each as `run_into_folder` does, here or on Ray, as `bevcli batch` does.
@@ -51,12 +49,11 @@ def batch(
         print(summary.table(), summary.failed)
 
     A drive that fails after all retries has its error in `summary.records`, and the others go on.
-    `Batch` gives the loop.
+    `Batch` gives the loop; `summary.notes` has what `bevcli batch` prints at its start.
 
     Args:
         drives: sequence folders, nuScenes roots, folders of drives, patterns or URLs.
         out: folder or URL of the batch.
-        report: called with notes.
         options: those of `BatchOptions` (`resume`, `evaluate`, …), `Workers` (`count`, `gpus`, …), `ModelOptions`,
             `RunOptions`, `RecordingOptions` and `InputOptions`, and those of the formats.
 
@@ -75,8 +72,6 @@ def batch(
     job = job_of(chosen, workers, model, run_options)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
     prepared = prepare_batch(job, loaded, list(map(str, texts)), chosen, workers, source, own)
-    for note in prepared.notes:
-        report(note)
     for _ in prepared.run():
         pass
     return prepared.summary
@@ -132,6 +127,7 @@ class BatchSummary:
         records: of all drives that are done or have failed, in the order of the drives.
         drives: number of drives of the batch.
         skipped: number of drives that were done or had failed before.
+        notes: for the user.
         stopped: before its end.
         files: paths or URLs of the files of the batch.
     """
@@ -141,6 +137,7 @@ class BatchSummary:
     skipped: int
     stopped: bool
     files: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def failed(self) -> int:
@@ -207,10 +204,10 @@ class Batch:
         self._job, self._model, self.drives, self.workers, self.notes = job, model, drives, workers, notes
         self._resume, self._retry_failed = resume, retry_failed
 
-    def run(self, should_stop: Callable[[], bool] = lambda: False) -> Generator[Record | int]:
+    def run(self) -> Generator[Record | int | None]:
         """Run the drives; yield first the number of those that are skipped, then the record of each other one.
 
-        should_stop: asked after each frame in this process; True ends the batch. KeyboardInterrupt ends it too.
+        And None after each frame in this process. Closing it, and KeyboardInterrupt, stop the batch.
 
         Raises:
             OutputError: the folder has a batch already, is in use by another one, or cannot be written.
@@ -220,38 +217,37 @@ class Batch:
         with folder_lock(out.path) if isinstance(out, storage.LocalFolder) else contextlib.nullcontext():
             _check_folder(out, self._resume)
             out.write(DESCRIPTION, json.dumps({"format": "bevcli-batch/1", "model": self._model.name}).encode())
-            known = _known_records(out, self.drives, job_hash, self._retry_failed)
-            yield len(known)
-            for left in [name for name in out.names(storage.ATTEMPTS) if name.endswith(".run")]:  # of dead workers
-                out.remove(f"{storage.ATTEMPTS}/{left}")
-            pending = [drive for drive in self.drives if drive.result(job_hash) not in known]
+            records = _earlier_records(out, self.drives, job_hash, self._retry_failed)
+            skipped, stopped = len(records), False
+            for name in [name for name in out.names(storage.ATTEMPTS) if name.endswith(".run")]:  # of dead workers
+                out.remove(f"{storage.ATTEMPTS}/{name}")
+            pending = [drive for drive in self.drives if drive.result(job_hash) not in records]
             if self._retry_failed:
                 for drive in pending:
                     out.remove(f"{storage.ATTEMPTS}/{drive.result(job_hash)}.json")
-            records, stopped = dict(known), False
             try:
-                with contextlib.closing(self._run(job_hash, pending, should_stop)) as running:
+                yield skipped
+                with contextlib.closing(self._run(job_hash, pending)) as running:
                     for record in running:
-                        records[record["result"]] = record
+                        if record is not None:
+                            records[record["result"]] = record
                         yield record
-            except (KeyboardInterrupt, StoppedError):
+            except (KeyboardInterrupt, GeneratorExit):
                 stopped = True
                 for name in out.names(storage.ATTEMPTS):  # an attempt that the user ended does not count
                     out.remove(f"{storage.ATTEMPTS}/{name}")
             results = [drive.result(job_hash) for drive in self.drives]
             ordered = tuple(records[result] for result in results if result in records)
             files = write_results(out, ordered, self._model)
-        self.summary = BatchSummary(ordered, len(self.drives), len(known), stopped, files)
+        self.summary = BatchSummary(ordered, len(self.drives), skipped, stopped, files, self.notes)
 
-    def _run(self, job_hash: str, drives: Sequence[BatchDrive], should_stop: Callable[[], bool]) -> Generator[Record]:
+    def _run(self, job_hash: str, drives: Sequence[BatchDrive]) -> Generator[Record | None]:
         if drives and not self.workers.in_this_process:
             yield from run_on_ray(self._job, job_hash, drives, self.workers)
         elif drives:
             worker = Worker(self._job, job_hash, self._model)
             for drive in drives:
-                yield worker.run(drive, should_stop)
-                if should_stop():
-                    raise StoppedError
+                yield from worker.run(drive)
 
 
 def _check_folder(out: storage.Storage, resume: bool) -> None:
@@ -267,7 +263,7 @@ def _check_folder(out: storage.Storage, resume: bool) -> None:
         )
 
 
-def _known_records(
+def _earlier_records(
     out: storage.Storage, drives: Sequence[BatchDrive], job_hash: str, retry_failed: bool
 ) -> dict[str, Record]:
     """The records of drives that are done or have failed, by the name of their results."""

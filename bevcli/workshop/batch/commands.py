@@ -1,5 +1,6 @@
 """`bevcli batch` runs many drives, with tables and a report; `bevcli reproduce` compares scores with published ones."""
 
+import contextlib
 import json
 import sys
 from collections.abc import Mapping
@@ -75,16 +76,22 @@ def _run(batch: "Batch") -> "BatchSummary":
     alone, notes = batch.workers.in_this_process, batch.notes
     if alone and batch.workers.count is None:
         notes = (*notes, "Ray is not installed: one worker (pip install 'bevcli[ray]' for several)")
-    with Progress(len(batch.drives), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:
-        for record in batch.run(signals.received):
+    with (
+        Progress(len(batch.drives), "drives", notes) as progress,
+        StopSignals("frame", at_once=not alone) as signals,
+        contextlib.closing(batch.run()) as running,
+    ):
+        for record in running:
             if isinstance(record, int):
                 progress.skip(record)
-                continue
-            if record.get("error"):
-                progress.message(f"failed: {record['drive']}: {record['error']}")
-            if record.get("input_errors"):
-                progress.message(f"warning: {record['drive']}: {record['input_errors']}")
-            progress.advance()
+            elif record is not None:
+                if record.get("error"):
+                    progress.message(f"failed: {record['drive']}: {record['error']}")
+                if record.get("input_errors"):
+                    progress.message(f"warning: {record['drive']}: {record['input_errors']}")
+                progress.advance()
+            if signals.received():
+                break
     if batch.summary.stopped:
         say(batch.summary.table())
         say("stopped; `--resume` goes on with the drives that are left", err=True)

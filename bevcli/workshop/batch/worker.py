@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,10 +44,6 @@ from bevcli.workshop.trust.estimate import estimate_of_run, fits
 _SCRATCH = "bevcli-batch-"
 
 
-class StoppedError(Exception):
-    """The batch was stopped while a drive was running."""
-
-
 class Worker:
     """Runs drives with a model that is loaded once. Raises BevcliError where the model or `out` cannot be used."""
 
@@ -57,17 +53,18 @@ class Worker:
         self._model = job.load_model() if model is None else model
         _remove_scratch_of_dead_workers()
 
-    def run(self, drive: BatchDrive, should_stop: Callable[[], bool] = lambda: False) -> Record:
-        """Run a drive until it is done or has failed too often, and returns its record, which is also stored.
+    def run(self, drive: BatchDrive) -> Iterator[Record | None]:
+        """Run a drive until it is done or has failed too often: yield None after each frame, then its stored record.
 
         An attempt is counted before it starts, so that a drive that kills its worker is not tried for ever.
 
-        Raises StoppedError if `should_stop` says so after a frame; OutputError if the batch's folder cannot be written.
+        Raises OutputError if the batch's folder cannot be written.
         """
         result = drive.result(self._job_hash)
         done = read_record(self._out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result)
         if done is not None:  # Ray runs a drive again if it lost the answer of a worker
-            return done
+            yield done
+            return
         marker = f"{storage.ATTEMPTS}/{result}.json"
         attempt, error = _read_marker(self._out.read(marker))
         while attempt <= self._job.retries:
@@ -75,10 +72,7 @@ class Worker:
             died = f"the worker died in attempt {attempt} of {self._job.retries + 1} (out of memory, or a crash)"
             self._out.write(marker, msgspec.json.encode((attempt, died)))
             try:
-                record = self._attempt(drive, result, attempt, should_stop)
-            except StoppedError:
-                self._out.remove(marker)
-                raise
+                record = yield from self._attempt(drive, result, attempt)
             except BevcliError as failure:
                 error = str(failure)
             except Exception as failure:  # whatever one drive raises, the others go on
@@ -87,13 +81,14 @@ class Worker:
                 self._check_device()
             else:
                 self._out.remove(marker)
-                return record
+                yield record
+                return
         record = {**_about(drive, result), "attempts": attempt, "error": valid_text(error)}
         self._out.write(f"{storage.FAILED}/{result}.json", json.dumps(record).encode())
         self._out.remove(marker)
-        return record
+        yield record
 
-    def _attempt(self, drive: BatchDrive, result: str, attempt: int, should_stop: Callable[[], bool]) -> Record:
+    def _attempt(self, drive: BatchDrive, result: str, attempt: int) -> Generator[None, None, Record]:
         if drive.problem:
             raise BevcliError(drive.problem)
         job, began = self._job, time.perf_counter()
@@ -111,13 +106,10 @@ class Worker:
                         shown = prediction.boxes.scored(job.run.recording.score).scores
                         if shown is not None:
                             histogram += np.histogram(shown, SCORE_BINS, (0, 1))[0]
-                        if should_stop():
-                            break
+                        yield
                 summary = running.summary
             except BevcliError as error:
                 raise BevcliError(_with_final_paths(str(error), (path, drive.source), (aside, result))) from None
-            if not summary.is_complete:
-                raise StoppedError
             seconds = time.perf_counter() - fetched
             scores, why_not = self._score(drive, path, aside)
             record = {
@@ -330,7 +322,10 @@ class _RayWorker:
         """See `Worker.run`; None only loads the model."""
         try:  # not above: an exception there would make Ray start the worker again and again
             self._worker = self._worker or self._make_worker()
-            return None if drive is None else self._worker.run(drive)
+            for record in () if drive is None else self._worker.run(drive):
+                if record is not None:
+                    return record
+            return None
         except BevcliError as error:
             return {"problem": str(error)}
 

@@ -49,13 +49,12 @@ def bench(
     The peak throughput is the rate of matrix products and of copying memory, measured in the same run. Nothing else
     should run on the machine at the same time.
     """
-    from bevcli.config import load_config
     from bevcli.workshop.benchmark import made_up, measure, versions
 
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("--engines compares all of them on the CPU: leave out other options")
-        table = versions.compare_engines(load_config(options.model), options.frames, print_note)
+        table = versions.compare_engines(options.model, options.frames)
         say(json.dumps(table.as_data(), indent=1) if as_json else table.text())
         return
     model = made_up.model_to_time(options.model, model_options)

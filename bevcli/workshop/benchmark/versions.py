@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from bevcli.config import load_config
 from bevcli.errors import BevcliError
 from bevcli.frame import Prediction
 from bevcli.inference.load import Model, describe_machine, installed_engines
@@ -17,11 +18,11 @@ from bevcli.inference.machine import keep_freed_memory, return_freed_memory
 from bevcli.inference.options import TORCH
 from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState
-from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, LevelShapes, sample_maps
 from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
+from bevcli.printing import print_note
 from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.engines.engine import CALIBRATION_FRAMES
 from bevcli.workshop.engines.exported import NEAR_M
@@ -239,16 +240,16 @@ class EngineTable:
         return "\n".join(lines)
 
 
-def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], None]) -> EngineTable:
+def compare_engines(model: str, frames: int) -> EngineTable:
     """Time a step of PyTorch and of every installed engine on the same frames, in turn, and compare their boxes.
 
     Nothing else should run on the machine.
 
     Args:
-        config: of the model, which gets made-up weights.
+        model: its name or file; it gets made-up weights.
         frames: number of timed frames.
-        report: see `Model.in_engine`.
     """
+    config = load_config(model)
     versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []
     network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
@@ -257,13 +258,13 @@ def compare_engines(config: ModelConfig, frames: int, report: Callable[[str], No
         (engine, precision) for engine, known in ({TORCH: ("fp32", "bf16")} | kinds).items() for precision in known
     )
     for engine, precision in pairs:
-        model = Model(network, engine=engine, precision=precision)
+        loaded = Model(network, engine=engine, precision=precision)
         try:
-            model = model.in_engine(drive.rig, drive, report=report)
+            loaded = loaded.in_engine(drive.rig, drive, report=print_note)
         except BevcliError as error:
             failed.append(EngineRow(engine, precision, problem=str(error)))
         else:
-            versions[engine, precision] = Version(model.prepared, CPU, takes_pixels=model.is_exported)
+            versions[engine, precision] = Version(loaded.prepared, CPU, takes_pixels=loaded.is_exported)
     first = config.past_frames
     drive = MadeUpDrive(first + WARM_UP_FRAMES + frames)
     differences: dict[tuple[str, Any], list[tuple[Tensor, Tensor]]] = {name: [] for name in versions}

@@ -15,6 +15,7 @@ from bevcli.workshop.scores.detection import ScoreTable
 from bevcli.workshop.scores.evaluate import Scores, finite, read, score
 from bevcli.workshop.scores.inputs import Compared
 from bevcli.workshop.scores.options import ResultOptions
+from bevcli.workshop.scores.plots import write_comparison
 from bevcli.workshop.scores.worst_frames import MODELS, WorstFrames, find_worst_frames
 
 CONFIDENCE = 0.95
@@ -110,8 +111,6 @@ class Comparison:
 
         Returns its path, in a list.
         """
-        from bevcli.workshop.scores.plots import write_comparison
-
         tables = [scores.detection.overall for scores in self.scores]
         return write_comparison(tables, self.files, Path(folder))
 

@@ -22,6 +22,7 @@ from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.scores import inputs
 from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
 from bevcli.workshop.scores.options import ResultOptions
+from bevcli.workshop.scores.plots import write_plots
 from bevcli.workshop.scores.tracking import TrackingScores, score_tracks
 from bevcli.workshop.scores.worst_frames import WorstFrames, find_worst_frames
 
@@ -115,8 +116,6 @@ class Scores(FrameScores):
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
-        from bevcli.workshop.scores.plots import write_plots
-
         return write_plots(self.detection, self.pairs, Path(folder))
 
 

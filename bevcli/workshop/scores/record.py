@@ -1,7 +1,7 @@
 """`record`: writes a drive with its labels, and boxes of one or two models against them, into a recording."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +31,6 @@ def record(
     *,
     score: float | None = None,
     class_map: Mapping[str, str] | None = None,
-    report: Callable[[str], object] = lambda line: None,
-    on_frame: Callable[[Frame], object] = lambda frame: None,
 ) -> Path:
     """Write a drive and its labels, without a model, into a recording, which `bevcli viz` and `bevcli.show` open.
 
@@ -47,22 +45,17 @@ def record(
         path: the .rrd file to write; an existing one is replaced.
         score: boxes scored below this are left out; None for 0.25.
         class_map: class names in the files -> the classes of the labels.
-        report: called with lines that say which frames were matched, and how, or that there are no labels.
-        on_frame: called with each frame after it was written.
 
     Returns:
-        The path.
+        The path. `record_steps` gives the loop, with its frames and notes.
 
     Raises:
         InputError: a file is missing or wrong, or has no frame of the drive.
         OutputError: the recording cannot be written.
     """
     drive = open_sequence(drive, class_map=class_map or {}) if isinstance(drive, str | Path) else drive
-    for step in record_steps(drive, boxes, path, score, class_map):
-        if isinstance(step, Frame):
-            on_frame(step)
-        else:
-            report(step)
+    for _ in record_steps(drive, boxes, path, score, class_map):
+        pass
     return Path(path)
 
 
@@ -73,7 +66,10 @@ def record_steps(
     score: float | None = None,
     class_map: Mapping[str, str] | None = None,
 ) -> Iterator[Frame | str]:
-    """As `record`, step by step: each frame after it was written, and each line for the user."""
+    """As `record`, step by step: each frame after it was written, and lines for the user.
+
+    The lines say which frames were matched, and how, or that there are no labels.
+    """
     sources = dict(boxes) if isinstance(boxes, Mapping) else {} if boxes is None else {_name_of(boxes): boxes}
     if len(sources) > MOST:
         raise InputError(

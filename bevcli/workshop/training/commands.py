@@ -119,10 +119,15 @@ def validate(
     loaded = bevcli.load_model(model, options=model_options)
     with odometry_bar() as show_steps:
         name = model or loaded.name
-        drives, notes, loaded = work.drives_to_score(loaded, name, drive_options, options, print_note, show_steps)
+        drives, notes = work.drives_to_score(loaded.config, name, drive_options, options, show_steps)
+        if loaded.needs_export:
+            loaded = loaded.in_engine(drives.open(0).rig, drives.open(0), report=print_note)
+            notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
         total = work.count_frames(drives)
     if not work.has_ground_truth(drives):
-        _estimate(loaded, drives, options, as_json=as_json, temporal=run_options.temporal)
+        beside = work.FolderDrives(() if options.reference is None else (options.reference,), loaded.config)
+        total += work.count_frames(beside)
+        _estimate(loaded, [drives, beside], total, options, as_json=as_json, temporal=run_options.temporal)
         return
     if options.reference is not None:
         raise InputError("--reference is for drives without ground truth: remove it")
@@ -133,22 +138,25 @@ def validate(
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
 
 
-def _estimate(model: "Model", drives: "Drives", options: ValidationOptions, *, as_json: bool, temporal: bool) -> None:
-    """Print the estimated score of each drive; none of them has ground truth."""
-    from bevcli.workshop.synth.drives import FolderDrives, count_frames
+def _estimate(
+    model: "Model", drives: "list[Drives]", frames: int, options: ValidationOptions, *, as_json: bool, temporal: bool
+) -> None:
+    """Print the estimated score of each drive; none of them has ground truth.
+
+    drives: with those of a reference as the second item. frames: of all of them.
+    """
     from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
 
-    for name, given in (("--max-range", options.max_range is not None), ("--tracking", options.tracking)):
-        if given:
+    for name, is_set in (("--max-range", options.max_range is not None), ("--tracking", options.tracking)):
+        if is_set:
             raise InputError(f"{name}: needs ground truth, which no drive has: remove it")
-    beside = FolderDrives(() if options.reference is None else (options.reference,), model.config)
     scores: list[tuple[str, EstimatedScore]] = []
     notes = ("no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",)
-    with Progress(count_frames(drives) + count_frames(beside), "frames", notes) as progress:
-        for drive in (each.open(index) for each in (drives, beside) for index in range(len(each))):
+    with Progress(frames, "frames", notes) as progress:
+        for drive in (some.open(index) for some in drives for index in range(len(some))):
             score = estimate_score(model, drive, temporal=temporal, after_frame=progress.advance)
             scores.append((drive.name, score))
-    reference = scores.pop()[1] if len(beside) else None
+    reference = None if options.reference is None else scores.pop()[1]
     if as_json:
         say(json.dumps(as_document(scores, reference), indent=1))
         return

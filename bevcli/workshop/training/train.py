@@ -2,34 +2,39 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bevcli.inference.load import Model, choose_device, load_model
 from bevcli.inference.options import ModelOptions, StepOptions
+from bevcli.model.config import ModelConfig
 from bevcli.options import refuse, spread
-from bevcli.workshop.synth.drives import Drives, count_frames as count_frames, scored_drives
+from bevcli.workshop.synth.drives import (
+    Drives,
+    FolderDrives as FolderDrives,
+    count_frames as count_frames,
+    scored_drives,
+)
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.job import prepare_training, rig_for_drives
 from bevcli.workshop.training.options import TrainOptions, ValidationOptions
 from bevcli.workshop.training.trainer import WEIGHTS, Trainer
 from bevcli.workshop.training.validation import Validation, check_scored_drives, validate as validate_runner
 
-Report = Callable[[str], None]
 
-
-def train(model: str | Path, *, device: str = "auto", report: Report = lambda note: None, **options: Any) -> Path:
+def train(model: str | Path, *, device: str = "auto", **options: Any) -> Path:
     """Train a model as `bevcli train` does; return the file of its weights.
 
         weights = bevcli.train("my.toml", data=["drives/a", "drives/b"], out="runs/mine", steps=2000)
         model = bevcli.load_model("my.toml", weights=weights)
 
-    `training` gives the loop, to follow it or to end it early.
+    `training` gives the loop, to follow it or to end it early, and the notes on the drives and on what is loaded of
+    earlier weights.
 
     Args:
         model: a model name or a FILE.toml, whose training table holds the settings.
         device: "auto", "cpu", "cuda" and so on.
-        report: called with notes on the drives, and with what is loaded of earlier weights.
         options: those of `TrainOptions` (`out`, `steps`, `weights`, `resume`, …) and of `DriveOptions` (`data`,
             `rendered`, `split`, `class_map`).
 
@@ -41,12 +46,9 @@ def train(model: str | Path, *, device: str = "auto", report: Report = lambda no
     chosen, drives, left = spread(options, TrainOptions, DriveOptions)
     refuse(left, "train", TrainOptions, DriveOptions)
     with training(str(model), drives, chosen, device) as trainer:
-        job = trainer.job
-        for note in (*job.notes, *job.changed_settings(), *(start.table() for start in job.warm_starts)):
-            report(note)
         for _ in trainer.run():
             pass
-    return job.out / WEIGHTS
+    return trainer.job.out / WEIGHTS
 
 
 @contextlib.contextmanager
@@ -71,7 +73,6 @@ def validate(
     model: Model | str | Path | None = None,
     *,
     temporal: bool = True,
-    report: Report = lambda note: None,
     **options: Any,
 ) -> Validation:
     """Score a model on drives with ground truth, all drives together, as `bevcli validate` does.
@@ -82,7 +83,6 @@ def validate(
     Args:
         model: a `Model`, or what `load_model` takes.
         temporal: use the frames before (and after).
-        report: called with notes on the drives.
         options: those of `DriveOptions` (`data`, `rendered`, …) and `ValidationOptions` (`rig`, `max_range`,
             `tracking`, `each`); and of `ModelOptions` (`weights`, `device`, `engine`, …), where `model` is no `Model`.
 
@@ -93,35 +93,29 @@ def validate(
     refuse(left, "validate", DriveOptions, ValidationOptions, *of_model)
     loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
     name = loaded.name if model is None or isinstance(model, Model) else str(model)
-    scored, notes, loaded = drives_to_score(loaded, name, drives, chosen, report)
-    for note in notes:
-        report(note)
+    scored, notes = drives_to_score(loaded.config, name, drives, chosen)
+    if loaded.needs_export:
+        loaded = loaded.in_engine(scored.open(0).rig, scored.open(0))
     runner = loaded.runner(StepOptions(track=chosen.tracking, temporal=temporal))
-    return validate_runner(runner, scored, chosen.max_range, each_drive=chosen.each)
+    return replace(validate_runner(runner, scored, chosen.max_range, each_drive=chosen.each), notes=notes)
 
 
 def drives_to_score(
-    model: Model,
+    config: ModelConfig,
     name: str,
     drive_options: DriveOptions,
     options: ValidationOptions,
-    report: Report,
     after_step: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Drives, tuple[str, ...], Model]:
-    """The drives of a validation, notes on them, and the model in its engine.
+) -> tuple[Drives, tuple[str, ...]]:
+    """The drives of a validation, and notes on them.
 
     name: of the model, or its file. after_step: called after each step that `odometry` measures, see `InputOptions`.
     """
     rig = None if options.rig is None else rig_for_drives(options.rig, name)
-    drives = scored_drives(drive_options, model.config, rig)
+    drives = scored_drives(drive_options, config, rig)
     if options.odometry:
         drives.measure_motion(after_step)
-    notes = check_scored_drives(drive_options, drives, model.config)
-    if model.needs_export:
-        drive = drives.open(0)
-        model = model.in_engine(drive.rig, drive, report=report)
-        notes = (*notes, model.engine_note) if model.engine_note else notes
-    return drives, notes, model
+    return drives, check_scored_drives(drive_options, drives, config)
 
 
 def has_ground_truth(drives: Drives) -> bool:

@@ -16,6 +16,7 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import MAP_CLASSES, Drive, Frame, Prediction
@@ -326,8 +327,6 @@ class LearningCurve:
 
 def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
     """Writes a PNG: smoothed losses on the left, scores on the right."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))

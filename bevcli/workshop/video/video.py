@@ -289,9 +289,7 @@ def _rotation(frame: RecordedFrame, entity: str) -> Array:
     return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns
 
 
-def video(
-    recording: str | Path, video: str | Path, *, on_frame: Callable[[], None] = lambda: None
-) -> tuple[int, float]:
+def video(recording: str | Path, video: str | Path) -> tuple[int, float]:
     """Write a video of a recording with all cameras and the map from above; return its frames, and those a second.
 
         bevcli.video("street.rrd", "street.mp4")
@@ -301,7 +299,6 @@ def video(
     Args:
         recording: a recording, or the folder of a run.
         video: the .mp4 or .webm file to write.
-        on_frame: called after each frame.
 
     Raises:
         InputError: there is no such recording, it has no frames, or the video has another ending.
@@ -310,7 +307,7 @@ def video(
     with open_recording(Path(recording)) as file:
         count, rate = frame_rate(file)
         for _ in write_video(file, Path(video), count, rate):
-            on_frame()
+            pass
     return count, rate
 
 
