@@ -26,11 +26,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_convert_returns_what_was_written(folder: Path, tmp_path: Path) -> None:
-    frames: list[bevcli.Frame] = []
     source = folder / "drives/d000"
-    converted = bevcli.convert(source, tmp_path / "copy", on_frame=frames.append)
+    converted = bevcli.convert(source, tmp_path / "copy")
     assert str(converted) == f"{tmp_path / 'copy'}: 3 frames, 6 cameras"
-    assert (converted.missing, converted.notes, len(frames)) == (0, (), 3)
+    assert (converted.frames, converted.missing, converted.notes) == (3, 0, ())
     copy, original = bevcli.open_sequence(tmp_path / "copy").load(1), bevcli.open_sequence(source).load(1)
     assert np.array_equal(copy.images["CAM_BACK"].pixels_bgr, original.images["CAM_BACK"].pixels_bgr)
     with pytest.raises(OutputError, match="exists already"):

@@ -3,9 +3,10 @@
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, TextIO, TypeVar
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import typer
 
@@ -15,8 +16,10 @@ from bevcli.printing import duration, one_line, say
 if TYPE_CHECKING:
     import rich.progress
 
+    from bevcli.frame import Drive
     from bevcli.inference.load import Model
     from bevcli.published import NamedWeights
+    from bevcli.sequences.options import InputOptions
     from bevcli.weights.fetch import FetchedWeights
 
 T = TypeVar("T")
@@ -127,20 +130,26 @@ def _bar(stream: TextIO) -> "rich.progress.Progress":
     )
 
 
-@contextmanager
-def odometry_bar() -> Iterator[Callable[[int, int], None]]:
-    """Shows the steps that the option `odometry` measures, one bar a drive: those that are done, and of how many."""
-    with ExitStack() as shown:
-        bar: Progress | None = None
+def open_with_bar(path: Path, options: "InputOptions", format_options: Mapping[str, Any]) -> "Drive":
+    """Open a drive, with a bar where the option `odometry` measures its motion."""
+    from bevcli.sequences.open import open_steps
 
-        def show(done: int, total: int) -> None:
-            nonlocal bar
+    return last_of_steps(open_steps(path, options, **format_options))
+
+
+def last_of_steps(steps: Iterable[tuple[int, int] | T]) -> T:
+    """The last of some items. Those before it are shown: steps of the ego-motion that are measured, and of how many."""
+    bar: Progress | None = None
+    with ExitStack() as shown:
+        for step in steps:
+            if not isinstance(step, tuple):
+                return step
+            done, total = step
             if bar is None or done == 0:
                 shown.close()
                 bar = shown.enter_context(Progress(total, "steps of the ego-motion"))
             bar.reach(done)
-
-        yield show
+    raise AssertionError("steps end with what they lead to")
 
 
 def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive
-from bevcli.cli.progress import Progress, load_with_bar, odometry_bar
+from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.inference.options import ModelOptions
 from bevcli.options import Option
@@ -73,8 +72,7 @@ def run(
     if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)
     source = source.for_model(loaded.config, temporal=run_options.temporal)
-    with odometry_bar() as show_steps:
-        drive = bevcli.open_sequence(sequence, replace(source, after_step=show_steps), **format_options)
+    drive = open_with_bar(sequence, source, format_options)
     if calibrate:
         from bevcli.workshop.calibration.core_options import corrected
 

@@ -2,15 +2,13 @@
 
 import shlex
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 from bevcli.cli.bridge import FormatValues
-from bevcli.cli.progress import Progress, odometry_bar
+from bevcli.cli.progress import Progress, open_with_bar
 from bevcli.errors import InputError
 from bevcli.printing import counted, say
 from bevcli.recording.options import RecordingOptions
-from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer.native import display_is_there, show_window, take_screenshot
 from bevcli.viewer.options import ViewOptions
@@ -46,8 +44,7 @@ def record_drive(
     if options.out is not None and options.out.suffix.lower() != ".rrd":
         raise InputError(f"{options.out}: the file must end in .rrd")
     boxes = names_of(options.boxes)
-    with odometry_bar() as show_steps:
-        drive = open_sequence(path, replace(source, after_step=show_steps), **format_options)
+    drive = open_with_bar(path, source, format_options)
     indices = [stamp.index for stamp in drive.stamps]
     if options.frame is not None and options.frame not in indices:
         raise InputError(f"--frame {options.frame}: the drive has frames {min(indices)} to {max(indices)}")

@@ -12,7 +12,7 @@ from bevcli.frame import CameraImage, CameraSamples
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
 from bevcli.recording.components import Components, components, log, ui_points
 

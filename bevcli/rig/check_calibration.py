@@ -23,10 +23,11 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.training_rigs import training_rig_notes
 from bevcli.options import defaults, gather
 from bevcli.printing import aligned, counted
+from bevcli.rig import drawings
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.sequence_checks import check_scenes, rig_findings
-from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_of, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FORMAT as NATIVE, FolderOptions
 from bevcli.sequences.native.folder import FolderDrive, read_frames_table
@@ -92,9 +93,6 @@ class CalibrationCheck:
         Existing files are overwritten. Without any camera there is only findings.json. Returns the files' paths. Raises
         OutputError where a file cannot be written.
         """
-        # Only writing draws: matplotlib and rerun take a second to load.
-        from bevcli.rig import drawings
-
         folder = Path(folder)
         write_whole(folder / "findings.json", f"{self.to_json()}\n".encode(), parents=True)
         if not self.rig.cameras:
@@ -151,7 +149,7 @@ def check_calibration(
     path, folder = Path(path), None if sequence is None else Path(sequence)
     of_rig = {name: options[name] for name in defaults(RigOptions).keys() - NAMES if name in options}
     if folder is None and is_drive(path):
-        beside = gather(RigOptions, None, of_rig).draft(path)
+        beside = draft_of(gather(RigOptions, None, of_rig), path)
         if beside is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
             return _check_other_sequence(path, frame, options)
         if beside is not None and _is_other_drive(path):

@@ -25,7 +25,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.components import log

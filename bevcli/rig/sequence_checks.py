@@ -14,7 +14,7 @@ from bevcli.frame import Drive, FrameStamp
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig import rig_checks
+from bevcli.rig import mistakes, rig_checks
 
 BEV_ASSUMED = Finding(
     "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
@@ -61,8 +61,6 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     wrong = {finding.camera for finding in errors_of(found_before)}
     cameras = [camera for camera in rig.cameras if camera.name not in wrong]
     if any(map(rig_checks.pose_defects, cameras)):
-        from bevcli.rig import mistakes  # which few rigs need
-
         poses = mistakes.pose_errors(cameras)
         # Swapped names of cameras whose poses share another mistake, such as all inverted, are seen once it is undone.
         swapped = [
@@ -76,8 +74,6 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
         if rig_checks.is_plausible_bev_frame(rig.ego_from_bev):
             bev = rig_checks.bev_warnings(rig.ego_from_bev)
         else:
-            from bevcli.rig import mistakes
-
             bev = [mistakes.bev_frame_error(rig.ego_from_bev)]
     if rig.ego_from_bev_assumed:
         bev.append(BEV_ASSUMED)

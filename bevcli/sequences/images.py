@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -18,12 +18,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.files import MIB, decode_image, media_type_of, read_bytes, size_of_image
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.options import InputOptions
-
-if TYPE_CHECKING:
-    from bevcli.sequences.videos import VideoReader
+from bevcli.sequences.videos import VideoReader
 
 DECODING_THREADS = 6
 READING_TIMEOUT_S = 120.0
@@ -177,8 +176,6 @@ class ImageReader:
         return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
     def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
-        from bevcli.sequences.videos import VideoReader
-
         reader = self._videos.get(camera)
         if reader is None or reader.path != source.path:
             reader = self._videos[camera] = VideoReader(source.path)

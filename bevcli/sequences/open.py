@@ -1,5 +1,7 @@
 """`open_sequence`: opens an input of any format as a drive, and selects a scene, a range of frames, a frame rate."""
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -31,8 +33,8 @@ def open_sequence(path: str | Path, options: InputOptions | None = None, **chang
         drive = open_sequence("nuscenes", version="v1.0-mini", scene="scene-0103")
         drive = open_sequence("ddad_train_val", scene="000150")  # a folder of drives
         drive = open_sequence("dash.mp4", fov_deg=70, height=1.4, odometry=True)  # poses measured from the images
-        for place, stamp in enumerate(drive.stamps):
-            frame = drive.load(place)
+        for index in range(len(drive.stamps)):
+            frame = drive.load(index)
 
     Only calibration, times and poses are read here, and with `odometry` all images. `load` decodes those of a frame.
 
@@ -44,6 +46,17 @@ def open_sequence(path: str | Path, options: InputOptions | None = None, **chang
 
     Raises InputError if the path has no known format, a file is missing or invalid, the format does not have an option,
     or no frame is left; TypeError for an option that no format has.
+    """
+    drive: Drive = deque[Any](open_steps(path, options, **changes), maxlen=1).pop()
+    return drive
+
+
+def open_steps(
+    path: str | Path, options: InputOptions | None = None, **changes: Any
+) -> Iterator[tuple[int, int] | Drive]:
+    """Open a drive as `open_sequence`: the drive at the end.
+
+    Before it, with `odometry`, the number of steps that are measured and of all, scene by scene.
     """
     path, common = Path(path), defaults(InputOptions)
     options = gather(InputOptions, options, {name: changes.pop(name) for name in common if name in changes})
@@ -75,11 +88,12 @@ def open_sequence(path: str | Path, options: InputOptions | None = None, **chang
         drive = select_rate(drive, rate_hz)
     if options.frames is not None:
         drive = select_range(drive, options.frames)
-    if not options.odometry:
-        return drive
-    from bevcli.workshop.odometry.drives import with_measured_motion
+    if options.odometry:
+        from bevcli.workshop.odometry.drives import with_measured_motion
 
-    return with_measured_motion(drive, whole, options.after_step)
+        yield from with_measured_motion(drive, whole)
+    else:
+        yield drive
 
 
 def _drive_of(root: Path, name: str) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -12,9 +12,7 @@ from bevcli.errors import InputError
 from bevcli.options import option, options, parse_pairs
 
 if TYPE_CHECKING:
-    from bevcli.geometry.cameras import CameraRig
     from bevcli.model.config import ModelConfig
-    from bevcli.sequences.files.calibration_file import RigDraft
 
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
 # static: the vehicle stands, and the ego-motion is not read. measured: as optional, and `odometry` replaces it.
@@ -110,9 +108,6 @@ class InputOptions(ClassOptions):
     )
     classes: tuple[str, ...] | None = option(
         default=None, help="The classes of a model. Default: nuScenes' ten.", hidden=True
-    )
-    after_step: Callable[[int, int], None] | None = option(
-        default=None, help="Called with the steps that --odometry has measured, and the number of all.", hidden=True
     )
 
     def __post_init__(self) -> None:
@@ -231,26 +226,3 @@ class RigOptions(FormatOptions):
         help='Camera whose poses --ego-motion has, or "vehicle". Default: vehicle, and camera 0 for KITTI.',
         metavar="CAMERA|vehicle",
     )
-
-    def rig(self, drive: Path | None = None) -> CameraRig | None:
-        """The rig of the given files or numbers; None if none is given. drive: its images state missing sizes.
-
-        Raises InputError.
-        """
-        draft = self.draft(drive)
-        return None if draft is None else draft.rig
-
-    def draft(self, drive: Path | None = None) -> RigDraft | None:
-        """The rig, and how it was understood; as `rig`."""
-        if self.calibration is not None and self.intrinsics is not None:
-            raise InputError(
-                "`calibration` (`--calibration`) and `intrinsics` (`--intrinsics`) are the same: pass one of them"
-            )
-        names = ("extrinsics", "transform", "fov_deg", "height", "yaw_deg")
-        how = {name: value for name in names if (value := getattr(self, name)) is not None}
-        path = self.intrinsics if self.calibration is None else self.calibration
-        if path is None and not how:
-            return None
-        from bevcli.sequences.files.calibration_file import draft_rig
-
-        return draft_rig(path, drive, **how).checked(path or Path())

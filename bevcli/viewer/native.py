@@ -19,7 +19,7 @@ import numpy as np
 import rerun_cli  # type: ignore[import-untyped]
 
 from bevcli.errors import InputError, OutputError, WaitError
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
 from bevcli.writing import write_whole
 

@@ -23,7 +23,8 @@ class Reader:
 
 
 def _open(folder: Path, **options: object) -> None:
-    from bevcli.sequences.open import open_sequence
+    from bevcli.sequences.files.calibration_file import draft_of
+from bevcli.sequences.open import open_sequence
 
     sequence = open_sequence(folder, **options)
     for place in range(min(3, len(sequence.stamps))):
@@ -75,7 +76,7 @@ def _rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         from bevcli.sequences.options import RigOptions
 
-        RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json").rig()
+        draft_of(RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json"))
 
     return read
 
@@ -84,7 +85,7 @@ def _other_rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         from bevcli.sequences.options import RigOptions
 
-        RigOptions(calibration=folder / "rig" / name).rig(folder / "drive")
+        draft_of(RigOptions(calibration=folder / "rig" / name), folder / "drive")
 
     return read
 

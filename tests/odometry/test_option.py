@@ -16,6 +16,7 @@ import bevcli
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.open import open_steps
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.batch.job import Job
@@ -53,8 +54,7 @@ def measuring(monkeypatch, true_motion):
 
 
 def test_a_drive_without_poses_gets_those_that_are_measured(folder, measuring):
-    calls = []
-    drive = bevcli.open_sequence(folder, odometry=True, after_step=lambda *steps: calls.append(steps))
+    *steps, drive = open_steps(folder, odometry=True)
     stated = bevcli.open_sequence(STREET)
     assert drive.has_ego_motion
     assert drive.facts.motion_measured
@@ -64,7 +64,7 @@ def test_a_drive_without_poses_gets_those_that_are_measured(folder, measuring):
         assert frame.world_from_ego.matrix == pytest.approx(first @ other.world_from_ego.matrix, abs=1e-6)
         assert set(frame.world_from_ego_at) == set(drive.rig.names)
     assert drive.load(2).kinematics.velocity[0] > 1
-    assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert steps == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert [note for note in drive.notes if "measured from the images" in note]
     assert not [note for note in drive.notes if "ego frame" in note]
 
@@ -103,7 +103,7 @@ def test_a_fast_drive_is_thinned(folder):
 def test_scenes_have_motions_of_their_own(monkeypatch):
     drive = MemoryDrive(5, scenes="aabbb")
     monkeypatch.setattr(drives, "measure_steps", lambda scene: iter(motion_of(scene).steps))
-    found = with_measured_motion(drive, drive)
+    *_, found = with_measured_motion(drive, drive)
     assert found.has_ego_motion
     assert len(found.notes) == 2
     for place, first in ((0, 0), (1, 0), (2, 2), (4, 2)):

@@ -13,8 +13,7 @@ import zstandard
 
 from bevcli.errors import InputError
 from bevcli.workshop.formats import is_ros_bag
-from bevcli.workshop.formats.ros.messages import Topic, decoder, decompressed
-from bevcli.workshop.formats.ros.storage import SqliteFile
+from bevcli.workshop.formats.ros.storage import SqliteFile, Topic, decoder, decompressed
 
 COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
 

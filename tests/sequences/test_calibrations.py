@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import bevcli
 from bevcli.errors import InputError
+from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.synth.rig import RigDistribution, draw_rig
 
@@ -42,7 +43,7 @@ def four(name):
 
 
 def read(path, drive=STREET, **how):
-    return RigOptions(calibration=path, **how).draft(drive)
+    return draft_of(RigOptions(calibration=path, **how), drive)
 
 
 def written(folder, content, name="rig.yaml"):
@@ -292,7 +293,7 @@ def lines_of(rows):
 
 def test_a_field_of_view_a_height_and_a_yaw_make_a_rig(tmp_path):
     yaws = {name: 60.0 * place for place, name in enumerate(NAMES)}
-    rig = RigOptions(fov_deg=90, height=dict.fromkeys(NAMES, 1.5), yaw_deg=yaws).rig(STREET)
+    rig = draft_of(RigOptions(fov_deg=90, height=dict.fromkeys(NAMES, 1.5), yaw_deg=yaws), STREET).rig
     for name in NAMES:
         camera, angle = rig[name], np.radians(yaws[name])
         ahead = camera.ego_from_camera[:3, 3] + [10 * np.cos(angle), 10 * np.sin(angle), 0]
@@ -417,7 +418,7 @@ def test_a_mistake_is_one_line_that_names_file_and_camera(tmp_path, mistake):
 )
 def test_numbers_that_are_missing_or_wrong_are_named(how, expected):
     with pytest.raises(InputError, match=expected):
-        RigOptions(**how).rig(STREET)
+        draft_of(RigOptions(**how), STREET)
 
 
 def test_a_size_that_nothing_states_is_missing(tmp_path):
@@ -434,7 +435,7 @@ def test_cameras_and_sizes_are_found_where_the_images_lie(tmp_path):
         file.write_bytes(image)
     (tmp_path / "c/frames.csv").write_text("frame,timestamp_ns,front\n0,1,\n1,2,rgb/7.jpg\n")
     for folder in "abc":
-        [camera] = RigOptions(fov_deg=90, height=1.5).rig(tmp_path / folder).cameras
+        [camera] = draft_of(RigOptions(fov_deg=90, height=1.5), tmp_path / folder).rig.cameras
         assert (camera.name, camera.width, camera.height) == ("front", 64, 36)
         np.testing.assert_allclose(camera.intrinsics, [[32, 0, 31.5], [0, 32, 17.5], [0, 0, 1]])
 

@@ -30,6 +30,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.transforms import Pose
 from bevcli.options import option, options
+from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.format import Format
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.native import FolderOptions
@@ -47,9 +48,10 @@ class Strip(Sequence):
     has_ego_motion = False
 
     def __init__(self, path, common, own):
-        self.name, self.rig = path.stem, own.rig()
-        if self.rig is None:
+        draft = draft_of(own)
+        if draft is None:
             raise InputError(f"{path}: states no calibration: pass `calibration`")
+        self.name, self.rig = path.stem, draft.rig
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
         self.images = np.split(pixels, len(pixels) // self.rig.cameras[0].height)
         self.stamps = tuple(FrameStamp(i, "", int(i * 1e9 / own.images_per_second)) for i in range(len(self.images)))

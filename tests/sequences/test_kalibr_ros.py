@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
+from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.options import RigOptions
 
 KALIBR = """
@@ -49,7 +50,7 @@ POSE = {"translation": [1.5, 0.0, 1.4], "rotation_wxyz": [0.5, -0.5, 0.5, -0.5]}
 
 
 def read_rig(intrinsics, extrinsics):
-    return RigOptions(intrinsics=intrinsics, extrinsics=extrinsics).rig()
+    return draft_of(RigOptions(intrinsics=intrinsics, extrinsics=extrinsics)).rig
 
 
 def write(folder, text, poses, name="intrinsics.yaml", **more):
@@ -140,7 +141,7 @@ def test_distortion_with_zero_coefficients_is_none(tmp_path):
 
 
 def test_without_files_there_is_no_rig():
-    assert RigOptions().rig() is None
+    assert draft_of(RigOptions()) is None
 
 
 @pytest.mark.parametrize(

@@ -778,7 +778,7 @@ def test_without_the_extra_the_error_names_it(
     tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
-    monkeypatch.setattr("bevcli.workshop.formats.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
+    monkeypatch.setattr("bevcli.workshop.formats.BAG_PACKAGES", ("rosbags", "a_package.that_is_missing"))
     with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):
         open_sequence(path)
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.parsing.files import decode_image, size_of_image
+from bevcli.parsing.images import decode_image, size_of_image
 from bevcli.rig import drawings
 from bevcli.sequences.open import open_sequence
 

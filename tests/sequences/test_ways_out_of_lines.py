@@ -8,7 +8,7 @@ from memory_drive import MemoryDrive
 
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.convert import DRIVE_FORMATS, open_writer
+from bevcli.workshop.formats.convert import open_writer, truth_left_out
 from bevcli.workshop.formats.map_lines import MapLines
 
 LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
@@ -34,4 +34,4 @@ def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
 
 @pytest.mark.parametrize(("form", "expected"), [("native", set()), ("nuscenes", {"lines of the map"})])
 def test_a_format_names_the_truth_that_it_leaves_out(form, expected):
-    assert DRIVE_FORMATS[form].left_out(with_lines(MemoryDrive(1), 0)) == expected
+    assert truth_left_out(with_lines(MemoryDrive(1), 0), form) == expected

@@ -92,6 +92,21 @@ def draft_rig(path: Path | None, drive: Path | None = None, **how: Any) -> RigDr
     return draft_calibration(file)
 
 
+def draft_of(options: RigOptions, drive: Path | None = None) -> RigDraft | None:
+    """The rig of the files or numbers of the options, and how it was understood; None if none is given.
+
+    drive: its images state missing sizes. Raises InputError.
+    """
+    if options.calibration is not None and options.intrinsics is not None:
+        raise InputError(
+            "`calibration` (`--calibration`) and `intrinsics` (`--intrinsics`) are the same: pass one of them"
+        )
+    names = ("extrinsics", "transform", "fov_deg", "height", "yaw_deg")
+    how = {name: value for name in names if (value := getattr(options, name)) is not None}
+    path = options.intrinsics if options.calibration is None else options.calibration
+    return None if path is None and not how else draft_rig(path, drive, **how).checked(path or Path())
+
+
 def _own_file(path: Path) -> Path | None:
     """The calibration.json that a path is or contains; None for a calibration of another program."""
     if path.is_dir():

@@ -11,7 +11,8 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.parsing.documents import read_json
-from bevcli.parsing.files import decode_image, encode_image, read_bytes
+from bevcli.parsing.files import read_bytes
+from bevcli.parsing.images import decode_image, encode_image
 from bevcli.writing import write_whole
 
 FORMAT = "bevcli-map/1"

@@ -17,7 +17,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
-from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_rig
+from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_of, draft_rig
 from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_poses
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
@@ -25,6 +25,7 @@ from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.options import EgoMotionUse, InputOptions
+from bevcli.sequences.videos import rotation_notes
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -51,7 +52,7 @@ class FolderDrive(ListedDrive):
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
         if rig is None:
-            given = own.draft(path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
+            given = draft_of(own, path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
         else:
             given = RigDraft(rig, ())
         rig, facts = given.rig, given.facts
@@ -80,10 +81,7 @@ class FolderDrive(ListedDrive):
         videos = sorted({source.path for source in sources if source.video_index is not None})
         assumed = ("the calibration",) if given.notes else ()
         notes = (*given.notes, *bev_frame_notes(rig, *assumed), *filter(None, [self.understood]), *poses.notes)
-        if videos:
-            from bevcli.sequences.videos import rotation_notes
-
-            notes = (*notes, *rotation_notes(videos))
+        notes += tuple(rotation_notes(videos))
         super().__init__(path, common, rig, entries, poses.motion, notes=notes)
         self.facts = replace(facts, geo_origin=facts.geo_origin or poses.geo_origin)
 

@@ -17,7 +17,7 @@ from bevcli.inference.load import Model, choose_engine, load_model
 from bevcli.inference.options import EXPORTED_SUFFIX, ModelOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network, build_network
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.sequences.images import ImageReader, MessageSource
 from bevcli.workshop.engines.engine import CALIBRATION_FRAMES as CALIBRATION_FRAMES
 

@@ -3,17 +3,24 @@
 Here is what recognises a drive of each format, and all options; a reader is imported when it is chosen.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+from bevcli.errors import InputError
 from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.sequences.format import Format
 from bevcli.sequences.native import FolderOptions
-from bevcli.sequences.options import FormatOptions, RigOptions
+from bevcli.sequences.options import FormatOptions, InputOptions, RigOptions
+
+if TYPE_CHECKING:
+    from bevcli.frame import Drive
 
 # Any of these makes a folder a log of Argoverse 2, so that an incomplete one gets an error that names the missing file.
 ARGOVERSE2_FILES = (
@@ -27,6 +34,7 @@ AXLE_HEIGHT_M = 0.33
 BAG_SUFFIXES = (".mcap", ".db3")
 PACKED = (".zst", ".zstd", ".lz4", ".gz", ".xz", ".bz2")
 BAG_METADATA = "metadata.yaml"
+BAG_PACKAGES = ("mcap", "rosbags", "google.protobuf")
 UnlistedFrames = Literal["empty", "unlabelled"]
 
 
@@ -149,6 +157,19 @@ def is_ros_bag(path: Path) -> bool:
         return b"rosbag2_bagfile_information" in file.read(4096)
 
 
+def open_bag(path: Path, common: InputOptions, own: BagOptions) -> Drive:
+    """A bag as a drive. Raises InputError where the packages of the extra `ros` are not installed."""
+    try:
+        installed = all(map(find_spec, BAG_PACKAGES))
+    except ModuleNotFoundError:  # the package around one of them
+        installed = False
+    if not installed:
+        raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
+    from bevcli.workshop.formats.ros import sequence
+
+    return sequence.open_bag(path, common, own)
+
+
 ARGOVERSE2 = Format(
     name="an Argoverse 2 log",
     expected="city_SE3_egovehicle.feather",
@@ -168,7 +189,7 @@ ROS = Format(
     name="a ROS bag",
     expected=".mcap or .db3 files",
     recognises=lambda path: is_ros_bag(path) or path.suffix == ".bag",
-    opener="bevcli.workshop.formats.ros.sequence:open_bag",
+    opener=open_bag,
     options=BagOptions,
     precedence=10,
 )

@@ -1,18 +1,13 @@
 """`bevcli convert` and `export`: write drives and boxes in other formats."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Part, argument
-from bevcli.cli.progress import Progress, odometry_bar
+from bevcli.cli.progress import Progress, open_with_bar
 from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
-
-if TYPE_CHECKING:
-    from bevcli.frame import Frame
 
 PANEL = {"convert": "Start", "export": "Score"}
 CONVERTED = ("strict", "scene", "ground_truth", "allow_outside", "class_map", "odometry")
@@ -31,22 +26,21 @@ def convert(
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
-    from bevcli.workshop.formats.convert import drive_to_convert, write_drive
+    from bevcli.workshop.formats.convert import Converted, to_convert, write_drive
+    from bevcli.workshop.formats.labels import with_labels
 
-    with odometry_bar() as show_steps:
-        reading = replace(options, after_step=show_steps)
-        sequence = drive_to_convert(input, out, reading, labels, format_options)
-
-    def show(frame: "Frame") -> None:
-        for camera, reason in frame.dropped.items():
-            progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
-        progress.advance()
-
-    with Progress(len(sequence.stamps), "frames", sequence.notes) as progress:
-        converted = write_drive(sequence, out, written, show)
-    for note in converted.notes:
+    drive = with_labels(open_with_bar(input, to_convert(input, out, options), format_options), labels)
+    with Progress(len(drive.stamps), "frames", drive.notes) as progress:
+        for step in write_drive(drive, out, written):
+            if isinstance(step, Converted):
+                break
+            for camera, reason in step.dropped.items():
+                progress.message(f"warning: frame {step.stamp.index}: camera {camera}: {reason}")
+            progress.advance()
+    assert isinstance(step, Converted)
+    for note in step.notes:
         say(f"note: {note}", err=True)
-    say(str(converted))
+    say(str(step))
 
 
 def export(
@@ -61,5 +55,9 @@ def export(
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    target, what = bevcli.export(predictions, options, report=print_note)
+    from bevcli.workshop.formats.export import export_boxes
+
+    target, what, note = export_boxes(predictions, options)
+    if note:
+        print_note(note)
     say(f"{target}: {what}")

@@ -1,12 +1,14 @@
 """`convert`: write any input as a drive of another format."""
 
+import importlib.util
 import os
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import IMPOSSIBLE
 from bevcli.options import spread
@@ -14,15 +16,12 @@ from bevcli.printing import counted
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats import LabelOptions, WriteOptions, mcap_writer, nuscenes_writer
-from bevcli.workshop.formats.labels import WithLabels
-from bevcli.workshop.formats.output import NATIVE, DriveWriter, OutputFormat
+from bevcli.workshop.formats import LabelOptions, WriteOptions
+from bevcli.workshop.formats.labels import with_labels
+from bevcli.workshop.formats.nuscenes_writer import NuScenesWriter
+from bevcli.workshop.formats.output import DriveWriter, NativeWriter
 
-DRIVE_FORMATS: dict[str, OutputFormat] = {
-    "mcap": mcap_writer.OUTPUT,
-    "native": NATIVE,
-    "nuscenes": nuscenes_writer.OUTPUT,
-}
+NAMES = {"mcap": "an MCAP file", "native": "a sequence folder", "nuscenes": "a nuScenes root"}
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,7 @@ class Converted:
         return f"{self.out}: {counted(self.frames, 'frames')}, {counted(self.cameras, 'cameras')}{missing}"
 
 
-def convert(
-    source: str | Path, out: str | Path, *, on_frame: Callable[[Frame], None] = lambda frame: None, **options: Any
-) -> Converted:
+def convert(source: str | Path, out: str | Path, **options: Any) -> Converted:
     """Write any input as a native sequence folder, or as a drive of another format, as `bevcli convert` does.
 
         bevcli.convert("drive.mcap", "drive", calibration="calibration.json")
@@ -59,7 +56,6 @@ def convert(
     Args:
         source: an input of `open_sequence`.
         out: the folder or file to write.
-        on_frame: called after each frame.
         options: those of `WriteOptions` (`form`, `force`, …), of `LabelOptions`, and of `open_sequence`.
 
     Raises:
@@ -67,50 +63,61 @@ def convert(
         OutputError: something is there already, or it cannot be written.
     """
     common, labels, written, own = spread(options, InputOptions, LabelOptions, WriteOptions)
-    sequence = drive_to_convert(Path(source), Path(out), common, labels, own)
-    return write_drive(sequence, Path(out), written, on_frame)
+    drive = open_sequence(source, to_convert(Path(source), Path(out), common), **own)
+    converted: Converted = deque[Any](write_drive(with_labels(drive, labels), Path(out), written), maxlen=1).pop()
+    return converted
 
 
-def drive_to_convert(source: Path, out: Path, common: InputOptions, labels: LabelOptions, own: dict[str, Any]) -> Drive:
-    """The drive that is to be written, with its labels. own: options of its format by name."""
+def to_convert(source: Path, out: Path, options: InputOptions) -> InputOptions:
+    """The options of a drive that is written. Raises OutputError where it would be written over its input."""
     if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
         raise OutputError(f"{out}: contains the input: choose another path")
-    sequence = open_sequence(source, replace(common, ego_motion="optional"), **own)
-    return sequence if labels.labels is None else WithLabels(sequence, labels.labels, labels)
+    return replace(options, ego_motion="optional")
 
 
-def open_writer(path: Path, sequence: Drive, options: WriteOptions) -> DriveWriter:
+def open_writer(path: Path, drive: Drive, options: WriteOptions) -> DriveWriter:
     """The writer of a path in the format `options.form`.
 
     Raises InputError for an unknown format, an option of another format or a drive that the format cannot hold, and
     OutputError where the path cannot be written.
     """
-    if options.form not in DRIVE_FORMATS:
-        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(DRIVE_FORMATS)})")
-    chosen = DRIVE_FORMATS[options.form]
-    if options.boxes is not None and not chosen.takes_boxes:
-        raise InputError(f"`boxes` (`--boxes`): {chosen.name} takes no boxes of a run: remove the option")
-    return chosen.opener(path, sequence, options)
+    if options.form not in NAMES:
+        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(NAMES)})")
+    if options.boxes is not None and options.form != "mcap":
+        raise InputError(f"`boxes` (`--boxes`): {NAMES[options.form]} takes no boxes of a run: remove the option")
+    if options.form == "native":
+        return NativeWriter(path, with_ego_motion=drive.has_ego_motion, force=options.force, facts=drive.facts)
+    if options.form == "nuscenes":
+        return NuScenesWriter(path, drive, options)
+    if not all(importlib.util.find_spec(name) for name in ("mcap", "rosbags")):
+        raise BevcliError('`form="mcap"` (`--format mcap`): needs mcap and rosbags: pip install "bevcli[ros]"')
+    from bevcli.workshop.formats.mcap_writer import McapWriter
+
+    return McapWriter(path, drive, options)
 
 
-def write_drive(
-    sequence: Drive, out: Path, written: WriteOptions, on_frame: Callable[[Frame], None] = lambda frame: None
-) -> Converted:
-    """Write a drive, see `convert`."""
-    gaps, images, boxes = 0, 0, 0
+def write_drive(drive: Drive, out: Path, options: WriteOptions) -> Iterator[Frame | Converted]:
+    """Write a drive, see `convert`: each frame that is written; at the end, what was."""
+    missing, images, boxes = 0, 0, 0
     left_out, reasons = set[str](), dict[str, str]()
-    with open_writer(out, sequence, written) as writer:
-        form = DRIVE_FORMATS[written.form]
-        for place in range(len(sequence.stamps)):
-            frame = sequence.load(place)
-            gaps, reasons = gaps + len(frame.dropped), reasons | dict(frame.dropped)
+    with open_writer(out, drive, options) as writer:
+        for index in range(len(drive.stamps)):
+            frame = drive.load(index)
+            missing, reasons = missing + len(frame.dropped), reasons | dict(frame.dropped)
             images, boxes = images + len(frame.images), boxes + frame.impossible_boxes
             writer.write(frame)
-            left_out |= form.left_out(frame)
-            on_frame(frame)
+            left_out |= truth_left_out(frame, options.form)
+            yield frame
         if not images:
-            raise no_image_error(sequence.name, reasons.items())
+            raise no_image_error(drive.name, reasons.items())
     notes = [f"{counted(boxes, 'boxes')} of the ground truth {IMPOSSIBLE}"] if boxes else []
     if left_out:
-        notes.append(f"{form.name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out")
-    return Converted(out, len(sequence.stamps), len(frame.rig.cameras), gaps, tuple(notes))
+        name = NAMES[options.form]
+        notes.append(f"{name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out")
+    yield Converted(out, len(drive.stamps), len(frame.rig.cameras), missing, tuple(notes))
+
+
+def truth_left_out(frame: Frame, form: str) -> set[str]:
+    """The ground truth of a frame that a format cannot hold, in words: sequence folders keep maps and lines."""
+    maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_results or None}
+    return set() if form == "native" else {name for name, value in maps.items() if value is not None}

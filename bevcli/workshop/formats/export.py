@@ -44,13 +44,7 @@ BOX_FORMATS = {
 }
 
 
-def export(
-    predictions: str | Path,
-    options: ExportOptions | None = None,
-    *,
-    report: Callable[[str], None] = lambda note: None,
-    **changes: Any,
-) -> tuple[Path, str]:
+def export(predictions: str | Path, options: ExportOptions | None = None, **changes: Any) -> tuple[Path, str]:
     """Write boxes as a table, a boxes file, KITTI labels or a nuScenes submission, as `bevcli export` does.
 
         bevcli.export("runs/first", form="csv")
@@ -59,7 +53,6 @@ def export(
         predictions: predictions.json, ground_truth.json, the folder of a run, or a recording, whose shown boxes are
             written.
         options: see `ExportOptions`; or as keywords.
-        report: called with a note where a recording is incomplete.
         changes: the options as keywords: `form` ("csv", "json", "kitti", "nuscenes", "nuscenes-tracking"), `out`,
             `score`, `calibration` and `camera`.
 
@@ -67,23 +60,26 @@ def export(
 
     Raises InputError for predictions that cannot be read or that the format cannot hold, and OutputError.
     """
-    given = Path(predictions)
-    chosen = gather(ExportOptions, options, changes)
+    target, what, _ = export_boxes(Path(predictions), gather(ExportOptions, options, changes))
+    return target, what
+
+
+def export_boxes(predictions: Path, chosen: ExportOptions) -> tuple[Path, str, str]:
+    """Write boxes, see `export`: the file, what was written, and a note where a recording is incomplete, or ""."""
     if chosen.form not in BOX_FORMATS:
         raise InputError(f"`form={chosen.form}` (`--format`): unknown format (expected {', '.join(BOX_FORMATS)})")
     form = BOX_FORMATS[chosen.form]
-    file = given / "predictions.json" if given.is_dir() else given
+    file = predictions / "predictions.json" if predictions.is_dir() else predictions
     target = chosen.out or file.parent / form.target
     check_output(target, file)
-    boxes = above_score(_boxes_of(file, report), chosen.score)
-    return target, form.write(boxes, target, chosen, file)
+    boxes, note = _boxes_of(file)
+    return target, form.write(above_score(boxes, chosen.score), target, chosen, file), note
 
 
-def _boxes_of(file: Path, report: Callable[[str], None]) -> BoxesFile:
-    """The boxes of a boxes file or of a recording."""
+def _boxes_of(file: Path) -> tuple[BoxesFile, str]:
+    """The boxes of a boxes file or of a recording, and a note."""
     if file.suffix.lower() != ".rrd":
-        return read_boxes(file)
+        return read_boxes(file), ""
     with open_recording(file) as whole:
-        if whole != file:
-            report(f"{file} is incomplete (its run was stopped or is still going)")
-        return read_recording(whole)
+        note = "" if whole == file else f"{file} is incomplete (its run was stopped or is still going)"
+        return read_recording(whole), note

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from bevcli.errors import InputError
 from bevcli.parsing.documents import CSV_BYTES, name_of
-from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text, size_of_image
+from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text
+from bevcli.parsing.images import size_of_image
 from bevcli.sequences.videos import size_of_video
 from bevcli.workshop.formats.camera_names import match_names
 

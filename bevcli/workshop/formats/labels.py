@@ -47,6 +47,11 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     return replace(labels, frames=frames, notes=(*labels.notes, *note))
 
 
+def with_labels(drive: Drive, options: LabelOptions) -> Drive:
+    """The drive with the boxes of the file of labels, if one is given. Raises InputError as `WithLabels`."""
+    return drive if options.labels is None else WithLabels(drive, options.labels, options)
+
+
 class WithLabels(DerivedDrive):
     """A drive whose boxes are those of a file of labels; a map of the drive is kept.
 

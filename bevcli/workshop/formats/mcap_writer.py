@@ -1,14 +1,15 @@
 """Writes a drive as an MCAP file of ROS 2 messages, with boxes as Foxglove scenes."""
 
-import importlib.util
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
@@ -17,7 +18,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording.entities import GROUND_TRUTH_COLOR, OTHER_COLOR, class_colors
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import OutputFormat, image_file
+from bevcli.workshop.formats.output import image_file
 from bevcli.writing import check_output, whole_file
 
 # The fields of foxglove_msgs as they stand in a CDR message; POSE, COLOR and POINTS are short for their types.
@@ -61,8 +62,6 @@ class Messages:
     """Encodes messages. Types are named as "sensor_msgs/CameraInfo"."""
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         for name, fields in FOXGLOVE.items():
             text = "\n".join(_long(field) for field in fields.split(", "))
@@ -115,9 +114,7 @@ class McapWriter:
     """
 
     def __init__(self, path: Path, sequence: Drive, options: WriteOptions) -> None:
-        """See `OutputFormat`."""
-        if not all(importlib.util.find_spec(name) for name in ("mcap", "rosbags")):
-            raise BevcliError('`form="mcap"` (`--format mcap`): needs mcap and rosbags: pip install "bevcli[ros]"')
+        """Raises InputError for boxes of another drive, and OutputError."""
         if path.exists() and not options.force:
             raise OutputError(
                 f"{path}: exists already: choose another file, or pass `force=True` (`--force`) to replace it"
@@ -134,8 +131,6 @@ class McapWriter:
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
-        from mcap.writer import Writer
-
         self._messages = Messages()
         file = self._open.enter_context(whole_file(self.path, parents=True))
         self._writer = Writer(self._open.enter_context(file.open("wb")))
@@ -313,6 +308,3 @@ def _xyz(values: Any) -> Fields:
 
 def _wxyz(values: Any) -> Fields:
     return dict(zip("wxyz", map(float, values), strict=True))
-
-
-OUTPUT = OutputFormat("an MCAP file", McapWriter, takes_boxes=True)

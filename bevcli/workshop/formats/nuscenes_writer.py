@@ -14,14 +14,14 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
 from bevcli.sequences.nuscenes.sequence import NuScenesDrive
 from bevcli.sequences.nuscenes.tables import Row
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import FolderWriter, OutputFormat, same_rig
+from bevcli.workshop.formats.output import FolderWriter, same_rig
 from bevcli.writing import write_whole
 
 VERSION = "v1.0-custom"
@@ -52,7 +52,7 @@ class NuScenesWriter(FolderWriter):
     """
 
     def __init__(self, root: Path, sequence: Drive, options: WriteOptions) -> None:
-        """See `OutputFormat`."""
+        """Raises InputError for a drive without poses, and OutputError."""
         if not sequence.has_ego_motion:
             raise InputError(f"{sequence.name}: has no ego-motion, which a nuScenes root must have: add it")
         super().__init__(root, PARTS, force=options.force, can_replace={*versions_in(root)} <= {VERSION})
@@ -240,6 +240,3 @@ def _visibility(fraction: float | None) -> str:
 
 def _pose_of(pose: Pose) -> Row:
     return {"rotation": pose.quaternion.tolist(), "translation": pose.translation.tolist()}
-
-
-OUTPUT = OutputFormat("a nuScenes root", NuScenesWriter)

@@ -1,11 +1,10 @@
-"""OutputFormat: a format that drives are written in; native folders."""
+"""Writers of drives frame by frame: what those of all formats share, and that of native folders."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,20 +12,19 @@ from typing import Any, Protocol
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import CameraImage, Drive, DriveFacts, Frame, FrameResult, Ground
+from bevcli.frame import CameraImage, DriveFacts, Frame, FrameResult, Ground
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import cell_of
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, LINES_FILE, MAPS_FOLDER, FolderDrive
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats import WriteOptions
 from bevcli.writing import output_errors, remove_parts, whole_file, write_whole
 
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
@@ -118,29 +116,6 @@ def image_file(image: CameraImage) -> tuple[bytes, str]:
     if image.encoded is None or form is None:
         return encode_image(image.pixels_bgr, ".png"), "png"
     return image.encoded, form
-
-
-@dataclass(frozen=True)
-class OutputFormat:
-    """A format that drives are written in.
-
-    Attributes:
-        name: with an article, for messages: "a nuScenes root".
-        opener: makes the writer of a path for a sequence. Raises OutputError, and InputError for a drive that the
-            format cannot hold.
-        takes_boxes: the option `boxes` is for this format.
-        keeps_maps: maps and lines of the ground truth are written; otherwise they are left out.
-    """
-
-    name: str
-    opener: Callable[[Path, Drive, WriteOptions], DriveWriter]
-    takes_boxes: bool = False
-    keeps_maps: bool = False
-
-    def left_out(self, frame: Frame) -> set[str]:
-        """What the format cannot hold of a frame, in words."""
-        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_results or None}
-        return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
@@ -294,10 +269,3 @@ def write_ego_motion(path: Path, motion: EgoMotion) -> None:
         writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
         for time, row in zip(motion.timestamps_ns, numbers, strict=True):
             writer.writerow([int(time), *(repr(float(value)) for value in row)])
-
-
-def _native_writer(folder: Path, sequence: Drive, options: WriteOptions) -> NativeWriter:
-    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
-
-
-NATIVE = OutputFormat("a sequence folder", _native_writer, keeps_maps=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.printing import counted
+from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
 from bevcli.sequences.images import FrameEntry, ListedDrive, bev_frame_notes
 from bevcli.sequences.native import FolderOptions
@@ -19,7 +20,7 @@ from bevcli.workshop.formats.unlisted import covered, video_images
 def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDrive:
     """A video as a `Drive`. Raises InputError."""
     video = video_images(path, own.start_ns or 0, own.image_rate_hz)
-    given = own.draft(path)
+    given = draft_of(own, path)
     if given is None:
         raise InputError(
             f"{path}: a video does not state its camera: pass `fov_deg=70` (`--fov 70`) and `height=1.5` (`--height "

@@ -1,6 +1,6 @@
 """The option `odometry` of `open_sequence`: a drive with the motion that its images show."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -14,31 +14,31 @@ MOST_RATE_HZ = 10.0  # a faster drive is measured at this rate: shorter steps co
 FASTER = 1.5  # times this rate is thinned to it
 
 
-def with_measured_motion(drive: Drive, whole: Drive, after_step: Callable[[int, int], None] | None = None) -> DriveView:
-    """The drive with its measured motion, which a note of each scene states.
+def with_measured_motion(drive: Drive, whole: Drive) -> Iterator[tuple[int, int] | DriveView]:
+    """The number of steps that are measured and of all, scene by scene; at the end, the drive with that motion.
+
+    A note of each scene states the motion.
 
     Args:
         drive: the frames that are used.
         whole: a drive with further frames: those between the first and the last one of a scene are measured too.
-        after_step: called with the number of steps that are done, and of all, scene by scene.
 
     Raises InputError where not one step of a scene can be measured.
     """
     motions, notes = dict[str, EgoMotion](), list[str]()
     for scene in dict.fromkeys(stamp.scene for stamp in drive.stamps):
-        part = at_most_rate(frames_between(drive, whole, scene))
-        steps, total = list[MeasuredStep](), len(part.stamps) - 1
-        if after_step is not None and total:
-            after_step(0, total)
-        for step in measure_steps(part):
+        between = at_most_rate(frames_between(drive, whole, scene))
+        steps, total = list[MeasuredStep](), len(between.stamps) - 1
+        if total:
+            yield 0, total
+        for step in measure_steps(between):
             steps.append(step)
-            if after_step is not None:
-                after_step(len(steps), total)
-        motion = MeasuredMotion.of(part, steps)
+            yield len(steps), total
+        motion = MeasuredMotion.of(between, steps)
         check_measured(motion)
         motions[scene] = motion.ego_motion
         notes.append(measured_note(motion))
-    return DriveView(drive, motions=motions, notes=tuple(notes))
+    yield DriveView(drive, motions=motions, notes=tuple(notes))
 
 
 def frames_between(drive: Drive, whole: Drive, scene: str) -> Drive:

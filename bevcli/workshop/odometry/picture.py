@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.workshop.correspondence.road import sampled
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg

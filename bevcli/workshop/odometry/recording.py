@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.parsing.files import encode_image
+from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
 from bevcli.workshop.odometry.measure import MeasuredMotion

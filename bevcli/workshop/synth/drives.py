@@ -10,7 +10,7 @@ import os
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,7 +22,7 @@ from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlarg
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.open import open_sequence, open_steps
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive
@@ -63,9 +63,15 @@ class FolderDrives:
         self._options = InputOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
         self._of_thread = threading.local()  # a Drive must be read from one thread
 
-    def measure_motion(self, after_step: Callable[[int, int], None]) -> None:
-        """Open every drive with the motion that its images show. after_step: of `InputOptions`."""
-        self._options = replace(self._options, odometry=True, after_step=after_step)
+    def measure_motion(self) -> Iterator[tuple[int, int]]:
+        """Open every drive with the motion that its images show: the number of steps that are measured, and of all."""
+        self._options = replace(self._options, odometry=True)
+        for index in range(len(self)):
+            for step in open_steps(self._folder(index), self._options):
+                if isinstance(step, tuple):
+                    yield step
+                else:
+                    self._opened[index] = step
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what belongs to this process, so that other processes can open the drives."""
@@ -79,10 +85,19 @@ class FolderDrives:
 
     def open(self, index: int) -> Drive:
         """The drive at an index, thinned to the model's frame rate. Raises InputError."""
+        if index not in self._opened:
+            self._opened[index] = open_sequence(self._folder(index), self._options)
+        return self._opened[index]
+
+    @property
+    def _opened(self) -> dict[int, Drive]:
+        """The drives that this thread has opened."""
         opened: dict[int, Drive] = vars(self._of_thread).setdefault("opened", {})
-        if index not in opened:
-            opened[index] = open_sequence(self.folders[index], self._options)
-        return opened[index]
+        return opened
+
+    def _folder(self, index: int) -> Path:
+        """The folder of a drive, which is there."""
+        return self.folders[index]
 
 
 class RenderedDrives(FolderDrives):
@@ -129,13 +144,13 @@ class RenderedDrives(FolderDrives):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_rendering": threading.Lock()})
 
-    def open(self, index: int) -> Drive:
-        """The drive at an index. It is rendered first, which takes seconds, if the cache does not hold it."""
+    def _folder(self, index: int) -> Path:
+        """The folder of a drive. It is rendered first, which takes seconds, if the cache does not hold it."""
         folder = self.folders[index]
         with self._rendering:
             if not folder.exists():
                 self._render(self._seeds[index], self._rigs[index], folder)
-        return super().open(index)
+        return folder
 
     def _render(self, seed: int, drawn: DrawnRig, folder: Path) -> None:
         """Writes to a temporary folder and renames it, so that an interrupted process leaves no partial drive."""

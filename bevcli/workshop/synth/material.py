@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import decode_image, read_bytes
+from bevcli.parsing.files import read_bytes
+from bevcli.parsing.images import decode_image
 from bevcli.workshop.synth.catalog import COLORS, Variant
 from bevcli.workshop.synth.looks import Looks, Weather
 from bevcli.workshop.synth.mesh import Material, Mesh, TriangleSoup, linear

@@ -8,7 +8,7 @@ import typer
 
 import bevcli
 from bevcli.cli.bridge import Json, Part, model_option
-from bevcli.cli.progress import Progress, odometry_bar
+from bevcli.cli.progress import Progress, last_of_steps
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions, StepOptions
@@ -117,13 +117,12 @@ def validate(
     from bevcli.workshop.training import train as work, validation
 
     loaded = bevcli.load_model(model, options=model_options)
-    with odometry_bar() as show_steps:
-        name = model or loaded.name
-        drives, notes = work.drives_to_score(loaded.config, name, drive_options, options, show_steps)
-        if loaded.needs_export:
-            loaded = loaded.in_engine(drives.open(0).rig, drives.open(0), report=print_note)
-            notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
-        total = work.count_frames(drives)
+    drives = last_of_steps(work.drives_to_score(loaded.config, model or loaded.name, drive_options, options))
+    notes = validation.check_scored_drives(drive_options, drives, loaded.config)
+    if loaded.needs_export:
+        loaded = loaded.in_engine(drives.open(0).rig, drives.open(0), report=print_note)
+        notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
+    total = work.count_frames(drives)
     if not work.has_ground_truth(drives):
         beside = work.FolderDrives(() if options.reference is None else (options.reference,), loaded.config)
         total += work.count_frames(beside)

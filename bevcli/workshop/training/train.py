@@ -1,6 +1,7 @@
 """`train` and `validate` as functions with the options of the commands as keywords."""
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +94,8 @@ def validate(
     refuse(left, "validate", DriveOptions, ValidationOptions, *of_model)
     loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
     name = loaded.name if model is None or isinstance(model, Model) else str(model)
-    scored, notes = drives_to_score(loaded.config, name, drives, chosen)
+    scored: Drives = deque[Any](drives_to_score(loaded.config, name, drives, chosen), maxlen=1).pop()
+    notes = check_scored_drives(drives, scored, loaded.config)
     if loaded.needs_export:
         loaded = loaded.in_engine(scored.open(0).rig, scored.open(0))
     runner = loaded.runner(StepOptions(track=chosen.tracking, temporal=temporal))
@@ -105,17 +107,16 @@ def drives_to_score(
     name: str,
     drive_options: DriveOptions,
     options: ValidationOptions,
-    after_step: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Drives, tuple[str, ...]]:
-    """The drives of a validation, and notes on them.
+) -> Iterator[tuple[int, int] | Drives]:
+    """The drives of a validation at the end; before, the steps that `odometry` measures, see `open_steps`.
 
-    name: of the model, or its file. after_step: called after each step that `odometry` measures, see `InputOptions`.
+    name: of the model, or its file.
     """
     rig = None if options.rig is None else rig_for_drives(options.rig, name)
     drives = scored_drives(drive_options, config, rig)
     if options.odometry:
-        drives.measure_motion(after_step)
-    return drives, check_scored_drives(drive_options, drives, config)
+        yield from drives.measure_motion()
+    yield drives
 
 
 def has_ground_truth(drives: Drives) -> bool:

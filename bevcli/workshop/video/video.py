@@ -20,7 +20,8 @@ from bevcli.errors import InputError
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, color_of_hex
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import decode_image, plain_name
+from bevcli.parsing.files import plain_name
+from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.entities import Color, class_colors, map_colors
 from bevcli.recording.options import has_av, require_av

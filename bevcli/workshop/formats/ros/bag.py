@@ -12,7 +12,6 @@ CAM_FRONT = "/sensing/camera/camera0/camera_info"
 CAM_FRONT = "camera0/camera_optical_link"
 """
 
-import importlib.util
 import re
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence as Indices
@@ -20,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +30,12 @@ from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import aligned, counted, reason_of
 from bevcli.workshop.formats import BAG_METADATA, BAG_SUFFIXES, is_packed_bag
 from bevcli.workshop.formats.markup import read_yaml
-from bevcli.workshop.formats.ros.messages import KINDS, Kind, decoder, decompressed, frame_of
-
-if TYPE_CHECKING:
-    from bevcli.workshop.formats.ros.storage import McapFile, SqliteFile
+from bevcli.workshop.formats.ros.messages import KINDS, Kind, frame_of
+from bevcli.workshop.formats.ros.storage import McapFile, SqliteFile, decoder, decompressed
 
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 MOST_INVALID = 1000  # messages of a topic before the first valid one
-PACKAGES = ("mcap", "rosbags", "google.protobuf")
 _Value = TypeVar("_Value")
 # Parts of a topic's name that do not name a camera.
 GENERIC = re.compile(
@@ -170,15 +166,7 @@ def _metadata(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _open_file(path: Path) -> "McapFile | SqliteFile":
-    try:
-        installed = all(map(importlib.util.find_spec, PACKAGES))
-    except ModuleNotFoundError:  # the package around one of them
-        installed = False
-    if not installed:
-        raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
-    from bevcli.workshop.formats.ros.storage import McapFile, SqliteFile
-
+def _open_file(path: Path) -> McapFile | SqliteFile:
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty")
     return McapFile(path) if path.suffix == ".mcap" else SqliteFile(path)

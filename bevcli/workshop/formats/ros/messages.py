@@ -1,13 +1,12 @@
-"""The bytes of a message (ROS 2's CDR, JSON, Protobuf) -> its fields -> this package's types.
+"""The fields of a decoded message -> this package's types.
 
 ROS messages and Foxglove's schemas (in CDR, JSON or Protobuf) name the same things differently; this is the one place
 that knows the names.
 """
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, Pose, rigid
-from bevcli.parsing.documents import LARGEST_INTEGER, parse_json
+from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.sequences.files.calibration_file import parse_camera
 from bevcli.sequences.files.json_fields import require, transform_to_json
 from bevcli.workshop.formats.named_calibration import lens_fields
@@ -42,82 +41,6 @@ KINDS: dict[str, Kind] = {
     "geometry_msgs/PoseStamped": "pose",
 }
 FARTHEST = 1e12  # of a coordinate in metres, as in calibration.json
-Decode = Callable[[bytes], Any]
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag.
-
-    Attributes:
-        name: such as "/camera/front/image_raw".
-        type_name: as the bag writes it, such as "sensor_msgs/msg/Image".
-        encoding: of its messages: "cdr", "json" or "protobuf".
-        schema: encoding of the definition: "ros2msg", "ros2idl", "jsonschema", "protobuf"; "" if there is none.
-        definition: the definition of the type, empty if there is none.
-    """
-
-    name: str
-    type_name: str
-    encoding: str
-    schema: str = ""
-    definition: bytes = b""
-
-    @property
-    def short_type(self) -> str:
-        """The name of the type as in KINDS: "sensor_msgs/msg/Image" -> "sensor_msgs/Image"."""
-        name = self.type_name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove/")
-        return name.replace("foxglove.", "foxglove/")
-
-
-def decoder(topic: Topic) -> Decode:
-    """The function that decodes a topic's messages. Nested messages are objects with attributes, too.
-
-    Raises InputError if the encoding is not supported, or the definition is broken.
-    """
-    makers = {"cdr": _cdr, "json": _json, "protobuf": _protobuf}
-    make = makers.get(topic.encoding)
-    if make is None:
-        hint = ": convert the .bag of ROS 1 with rosbags-convert" if topic.encoding == "ros1" else ""
-        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)}){hint}")
-    return make(topic)
-
-
-def _cdr(topic: Topic) -> Decode:
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    from rosbags.typesys.store import TypesysError
-
-    name = topic.type_name if "/msg/" in topic.type_name else topic.type_name.replace("/", "/msg/")
-    text = topic.definition.decode(errors="replace")
-    try:
-        store = get_typestore(Stores.EMPTY if text else Stores.LATEST)
-        if text:
-            is_idl = topic.schema == "ros2idl"
-            store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
-        store.get_msgdef(name)
-    except (TypesysError, KeyError, ValueError) as error:
-        found = "its definition cannot be read" if text else "the bag has no definition of it, and it is not a ROS type"
-        raise InputError(f"{topic.name}: type {name}: {found} ({error})") from None
-    return lambda data: store.deserialize_cdr(data, name)
-
-
-def _json(topic: Topic) -> Decode:
-    # Objects with attributes in place of dicts.
-    return lambda data: parse_json(data, Path(topic.name), pairs=lambda pairs: SimpleNamespace(**dict(pairs)))
-
-
-def _protobuf(topic: Topic) -> Decode:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-    from google.protobuf.message import DecodeError
-
-    pool = descriptor_pool.DescriptorPool()
-    try:
-        files = descriptor_pb2.FileDescriptorSet.FromString(topic.definition)
-        message_factory.GetMessages(files.file, pool)  # adds each file after those that it imports
-        message = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type_name))
-    except (DecodeError, KeyError, TypeError) as error:
-        raise InputError(f"{topic.name}: the definition of {topic.type_name} cannot be read ({error})") from None
-    return message.FromString
 
 
 @dataclass(frozen=True)
@@ -232,36 +155,3 @@ def _first(owner: Any, *names: str) -> Any:
         if hasattr(owner, name):
             return getattr(owner, name)
     raise ValueError(f"the field {names[0]} is missing")
-
-
-def decompressed(kind: str, data: bytes, largest: int) -> bytes:
-    """The bytes of compressed data.
-
-    kind: "zstd", "lz4", or "" for data that is not compressed.
-    Raises ValueError for another kind, damaged data, or more than `largest` bytes. Data that is cut off may give less.
-    """
-    kinds = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
-    if kind not in kinds:
-        raise ValueError(f'unknown compression "{kind:.20}" (expected zstd, lz4 or none)')
-    found = kinds[kind](data, largest + 1)
-    if len(found) > largest:
-        raise ValueError(f"has more than {largest} bytes when it is decompressed")
-    return found
-
-
-def _from_zstd(data: bytes, largest: int) -> bytes:
-    import zstandard
-
-    try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(largest)
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None
-
-
-def _from_lz4(data: bytes, largest: int) -> bytes:
-    import lz4.frame  # type: ignore[import-not-found,import-untyped,unused-ignore]
-
-    try:
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, largest))
-    except (RuntimeError, EOFError) as error:
-        raise ValueError(str(error)) from None

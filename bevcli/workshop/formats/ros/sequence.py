@@ -21,11 +21,12 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DriveFacts, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, nearest
-from bevcli.parsing.files import decode_image, is_there, media_type_of, size_of_image
+from bevcli.parsing.files import is_there
+from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences import images
-from bevcli.sequences.files.calibration_file import CALIBRATION, draft_rig
-from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_of, draft_rig
+from bevcli.sequences.files.ego_motion_file import DrivePoses
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
@@ -215,7 +216,7 @@ def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.Listed
     if path.is_file() and is_packed_bag(path):
         raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
     stated = read_topics_file(own.topics_file, own.topics)
-    draft = own.draft(path)
+    draft = draft_of(own, path)
     rig = None if draft is None else draft.rig
     bag = Bag(path)
     rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
@@ -224,8 +225,8 @@ def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.Listed
     used_rig = reader.rig() if rig is None else rig
     entries = _entries(bag, finder.cameras)
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    given = None if file is None else partial(read_poses, file, DrivePoses(used_rig, own, frame_times))
-    motion, source, motion_notes = reader.motion(common.ego_motion, given)
+    drive_poses = DrivePoses(used_rig, own, frame_times)
+    motion, source, motion_notes = reader.motion(common.ego_motion, file, drive_poses)
     geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
     entries, gaps = _covered(entries, motion, path)
     notes = (

@@ -1,9 +1,10 @@
 """The vehicle of a bag: its rig, its poses from a topic or from transforms, its place on Earth; the times of images."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial, reduce
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
-from bevcli.sequences.files.ego_motion_file import ReadPoses
+from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
 from bevcli.sequences.options import EgoMotionUse
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, spread
 from bevcli.workshop.formats.ros.messages import Transform, camera_of, frame_of, pose_of, timestamp_ns, transforms_of
@@ -101,7 +102,7 @@ def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
 
 def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> tuple[EgoMotion, list[str]]:
     """Poses of a topic with Odometry or poses, and notes. child_from_ego: (4, 4), None: the poses are the vehicle's."""
-    return _motion_from(bag, [topic], [topic], lambda transform: topic, child_from_ego)
+    return _motion_from(bag, [topic], [topic], None, child_from_ego)
 
 
 def motion_from_transforms(
@@ -114,17 +115,20 @@ def motion_from_transforms(
     """
     links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
     by_child = dict(zip(frames[1:], links, strict=True))
-    return _motion_from(bag, topics, links, lambda transform: by_child.get(transform.child), child_from_ego)
+    return _motion_from(bag, topics, links, by_child, child_from_ego)
 
 
 def _motion_from(
     bag: Bag,
     topics: Sequence[str],
     links: Sequence[str],
-    link_of: Callable[[Transform], str | None],
+    by_child: Mapping[str, str] | None,
     child_from_ego: Array | None,
 ) -> tuple[EgoMotion, list[str]]:
-    """Poses along links, which are multiplied, and notes. link_of: the link of a transform, None for none of them."""
+    """Poses along links, which are multiplied, and notes.
+
+    by_child: child frame of a transform -> its link; None where all are of the single link.
+    """
     samples: dict[str, dict[int, Pose]] = {link: {} for link in links}
     are_valid: list[bool] = []
     for time, topic, number in _in_order(bag, {topic: range(len(bag.times(topic))) for topic in topics}):
@@ -134,7 +138,7 @@ def _motion_from(
             are_valid.append(False)
             continue
         for transform in transforms:
-            link = link_of(transform)
+            link = links[0] if by_child is None else by_child.get(transform.child)
             if link is None:
                 continue
             are_valid.append(transform.parent_from_child is not None)
@@ -315,18 +319,18 @@ class VehicleReader:
         return found
 
     def motion(
-        self, use: EgoMotionUse, given: Callable[[], ReadPoses] | None
+        self, use: EgoMotionUse, file: Path | None, drive: DrivePoses
     ) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
         """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
 
-        given: reads a file in place of what the bag has.
+        file: of poses in place of what the bag has. drive: what its reader needs to know.
 
         Raises InputError if poses are required and not found.
         """
         if use == "static":
             return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
-        if given is not None:
-            poses = given()
+        if file is not None:
+            poses = read_poses(file, drive)
             return poses.motion, "", poses.notes
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
