@@ -23,8 +23,7 @@ class Reader:
 
 
 def _open(folder: Path, **options: object) -> None:
-    from bevcli.sequences.files.calibration_file import draft_of
-from bevcli.sequences.open import open_sequence
+    from bevcli.sequences.open import open_sequence
 
     sequence = open_sequence(folder, **options)
     for place in range(min(3, len(sequence.stamps))):
@@ -74,6 +73,7 @@ def _model(folder: Path) -> None:
 
 def _rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
+        from bevcli.sequences.files.calibration_file import draft_of
         from bevcli.sequences.options import RigOptions
 
         draft_of(RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json"))
@@ -83,6 +83,7 @@ def _rig(name: str) -> Callable[[Path], None]:
 
 def _other_rig(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
+        from bevcli.sequences.files.calibration_file import draft_of
         from bevcli.sequences.options import RigOptions
 
         draft_of(RigOptions(calibration=folder / "rig" / name), folder / "drive")
