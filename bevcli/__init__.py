@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.synth.drive import render as render
     from bevcli.workshop.training.train import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
-    from bevcli.workshop.video.video import video as video
+    from bevcli.workshop.video import video as video
 
 
 @cache

@@ -66,7 +66,7 @@ def record_drive(
 
 def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: Path) -> None:
     """Write what the options name. read_from: the recording, or a repaired copy of it. name: for texts."""
-    from bevcli.workshop.video.video import frame_rate, write_video
+    from bevcli.workshop.video import frame_rate, write_video
 
     if options.summary:
         say(summarise(recording, read_from).replace(str(recording), str(name), 1))

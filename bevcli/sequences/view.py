@@ -1,7 +1,8 @@
 """DriveView: frames of a drive, with other class names, another rig or other poses; and the choice of frames."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -57,12 +58,11 @@ class DriveView(DerivedDrive):
             self.has_ego_motion, self.ego_motion = True, next(iter(motions.values())) if len(motions) == 1 else None
             self.facts = replace(drive.facts, geo_origin=None, motion_measured=True)
 
-    @property
+    @cached_property
     def class_counts(self) -> Mapping[str, int]:
         counts = self.drive.class_counts if self._has_truth else {}
         if counts and len(self._indices) < len(self.drive.stamps):
-            truths = (self.drive.ground_truth_frame(index).ground_truth for index in self._indices)
-            counts = count_classes(boxes for boxes in truths if boxes is not None)
+            counts = count_labels(self.drive, self._indices)
         return counts if self._names is None else self._names.counts(counts)
 
     def image_files(self, index: int) -> tuple[Path, ...]:
@@ -85,6 +85,14 @@ class DriveView(DerivedDrive):
         if self._rig is not None:
             frame = replace(frame, rig=self._rig)
         return _moved(frame, self._motions[frame.stamp.scene]) if self._motions else frame
+
+
+def count_labels(drive: Drive, indices: Iterable[int] | None = None) -> Mapping[str, int]:
+    """Number of ground-truth boxes by class in some frames of a drive, or in all: of its table where it has one."""
+    if indices is None and drive.class_counts:
+        return drive.class_counts
+    truths = (drive.ground_truth_frame(index).ground_truth for index in indices or range(len(drive.stamps)))
+    return count_classes(boxes for boxes in truths if boxes is not None)
 
 
 def _moved(frame: Frame, motion: EgoMotion) -> Frame:

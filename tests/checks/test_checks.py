@@ -10,7 +10,7 @@ from command_line import MINI_TOML, command
 
 from bevcli._version import __version__
 from bevcli.workshop.benchmark import made_up, measure
-from bevcli.workshop.checks import checks, speed, torch_checks
+from bevcli.workshop.checks import commands as checks, speed, torch_checks
 
 
 def test_the_text_fits_a_screen_and_names_no_user(tmp_path, monkeypatch):

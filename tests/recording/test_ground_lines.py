@@ -18,7 +18,7 @@ from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
-from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 TIMES = np.array([0.5, 1.0])
 LINES = MapLines(

@@ -22,7 +22,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
 from bevcli.workshop.scores.record import names_of, record, record_steps
-from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS

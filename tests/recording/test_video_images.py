@@ -10,7 +10,7 @@ from bevcli.errors import BevcliError
 from bevcli.recording import entities, options
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video.video import RecordedImages
+from bevcli.workshop.video import RecordedImages
 
 if options.has_av():
     from bevcli.recording.av1 import KEYFRAME_EVERY, Av1Decoder, Av1Encoder

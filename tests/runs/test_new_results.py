@@ -19,7 +19,7 @@ from bevcli.recording import entities
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 RED = (255, 0, 0)
 

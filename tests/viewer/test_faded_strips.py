@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bevcli.workshop.video.video import draw_faded_strips
+from bevcli.workshop.video import draw_faded_strips
 
 GREEN = 0x00FF0000  # RGB, without opacity
 

@@ -16,7 +16,7 @@ from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
-from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 
 @pytest.fixture(scope="module")

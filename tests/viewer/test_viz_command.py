@@ -18,8 +18,8 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.boxes_table import COLUMNS
-from bevcli.workshop.video import video
-from bevcli.workshop.video.video import write_video
+from bevcli.workshop import video
+from bevcli.workshop.video import write_video
 
 
 @pytest.fixture(scope="module")

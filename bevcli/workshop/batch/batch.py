@@ -60,10 +60,12 @@ def batch(
     Raises BevcliError: see `Batch`.
     """
     kinds = (BatchOptions, Workers, ModelOptions, RunOptions, RecordingOptions, InputOptions)
-    chosen, workers, model, run_options, recording, source, own = spread(options | {"out": str(out)}, *kinds)
+    chosen, workers, model, run_options, recording, input_options, format_values = spread(
+        options | {"out": str(out)}, *kinds
+    )
     names = {name for kind in option_classes() for name in kind.__dataclass_fields__}
-    if own.keys() - names:
-        raise TypeError(f"batch() has no option {min(own.keys() - names)}")
+    if format_values.keys() - names:
+        raise TypeError(f"batch() has no option {min(format_values.keys() - names)}")
     if chosen.retry_failed and not chosen.resume:
         raise InputError("`retry_failed` (`--retry-failed`): is for `resume=True` (`--resume`)")
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
@@ -71,7 +73,7 @@ def batch(
         run_options = replace(run_options, recording=recording)
     job = job_of(chosen, workers, model, run_options)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
-    prepared = prepare_batch(job, loaded, list(map(str, texts)), chosen, workers, source, own)
+    prepared = prepare_batch(job, loaded, list(map(str, texts)), chosen, workers, input_options, format_values)
     for _ in prepared.run():
         pass
     return prepared.summary
@@ -105,17 +107,17 @@ def prepare_batch(
     texts: list[str],
     options: BatchOptions,
     workers: Workers,
-    source: InputOptions,
-    own: dict[str, Any],
+    input_options: InputOptions,
+    format_values: dict[str, Any],
 ) -> "Batch":
-    """The batch of a job with its drives. own: options of formats by name. Raises InputError."""
+    """The batch of a job with its drives. format_values: options of formats by name. Raises InputError."""
     texts = [*texts, *(read_list(options.listed) if options.listed else ())]
-    others = {name: value for name, value in own.items() if name != "split"}
-    drives, notes = find_drives(texts, NuScenesOptions(own.get("version"), own.get("split")))
+    others = {name: value for name, value in format_values.items() if name != "split"}
+    drives, notes = find_drives(texts, NuScenesOptions(format_values.get("version"), format_values.get("split")))
     if model.needs_export:
         notes = (*notes, OF_EXPORT)
-    source = source.for_model(model.config, temporal=job.run.temporal)
-    job = replace(job, source=source, own=all_own_options(others))
+    input_options = input_options.for_model(model.config, temporal=job.run.temporal)
+    job = replace(job, source=input_options, own=all_own_options(others))
     return Batch(job, model, drives, workers, notes, resume=options.resume, retry_failed=options.retry_failed)
 
 
@@ -279,5 +281,5 @@ def _earlier_records(
 
     results = [drive.result(job_hash) for drive in drives]
     with ThreadPoolExecutor(storage.READING_THREADS) as pool:
-        found = zip(results, pool.map(find, results), strict=True)
-        return {result: record for result, record in found if record is not None}
+        pairs = zip(results, pool.map(find, results), strict=True)
+        return {result: record for result, record in pairs if record is not None}

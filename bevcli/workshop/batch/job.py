@@ -68,10 +68,10 @@ class BatchDrive:
 def read_list(path: Path) -> list[str]:
     """The drives in a text file: one path, URL or pattern per line; "#" starts a comment. Raises InputError."""
     lines = (line.strip() for line in read_text(path, 256 * MIB).splitlines())
-    found = [line for line in lines if line and not line.startswith("#")]
-    if not found:
+    drives = [line for line in lines if line and not line.startswith("#")]
+    if not drives:
         raise InputError(f"{path}: contains no drive (expected one path or URL per line)")
-    return found
+    return drives
 
 
 def find_drives(
@@ -90,7 +90,7 @@ def find_drives(
     """
     sources = dict.fromkeys(source.rstrip("/") or source for text in texts for source in expand(text))
     with ThreadPoolExecutor(LISTING_THREADS) as pool:
-        drives = [drive for found in pool.map(lambda s: list(_drives_of(s, options)), sources) for drive in found]
+        drives = [drive for inside in pool.map(lambda s: list(_drives_of(s, options)), sources) for drive in inside]
     if not drives:
         raise InputError("there are no drives (expected paths, URLs or patterns, or `listed` (`--list FILE`))")
     return _without_copies(drives)
@@ -105,8 +105,8 @@ def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterato
         if _versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
             yield from _scenes(drive, options)
         elif not is_url(path) and not is_drive(Path(path)) and (inside := drives_in(Path(path))):
-            for name, one in inside.items():
-                yield from _drives_of(str(one), options, name.replace("/", "-"))
+            for name, path_inside in inside.items():
+                yield from _drives_of(str(path_inside), options, name.replace("/", "-"))
         else:
             yield replace(drive, input_hash=_hash(drive.name, None, storage.files()))
     except BevcliError as error:
@@ -160,11 +160,10 @@ def _copy_tables(url: str, version: str | None) -> tuple[Path, list[StoredFile]]
 
     Raises InputError if the version is missing, or the choice is not unique.
     """
-    chosen = choose_version(url, _versions_at(RemoteFolder(url)), version)
-    storage = RemoteFolder(f"{url}/{chosen}")
+    version_name = choose_version(url, _versions_at(RemoteFolder(url)), version)
+    storage = RemoteFolder(f"{url}/{version_name}")
     files = storage.files()
-    facts = repr((url, [tuple(file) for file in files]))
-    tables = user_cache() / "nuscenes-tables" / hashlib.sha256(facts.encode()).hexdigest()[:16] / chosen
+    tables = user_cache() / "nuscenes-tables" / hash_of_values([url, files])[:16] / version_name
     if not tables.is_dir():
         unfinished = tables.parent / f"{uuid.uuid4().hex[:8]}.new"
         try:
@@ -228,7 +227,7 @@ class Job:
 
     def own_of(self, kind: type[Own]) -> Own:
         """The own options of a format. kind: their dataclass."""
-        return next((each for each in self.own if type(each) is kind), kind())
+        return next((options for options in self.own if type(options) is kind), kind())
 
     def open(self, path: Path, scene: str | None) -> Drive:
         """A drive, or a scene of it. Raises InputError."""
@@ -239,36 +238,39 @@ class Job:
         """Raise InputError for an option that no format of the drives has. One at a URL may have any format."""
         if any(is_url(drive.source) for drive in drives):
             return
-        found = set()
+        formats = set()
         for drive in drives:
             with contextlib.suppress(InputError):  # a drive that cannot be opened becomes a row with its error
-                found.add(format_of(Path(drive.source)))
-        if found:
-            given = {name: value for own in self.own for name, value in vars(own).items()}
-            check_options(given, found, "the drives of the batch")
+                formats.add(format_of(Path(drive.source)))
+        if formats:
+            values = {name: value for options in self.own for name, value in vars(options).items()}
+            check_options(values, formats, "the drives of the batch")
 
     def hash(self, model: Model) -> str:
         """SHA-256 of what the results of a drive depend on, its input excepted. model: of `load_model`, any device."""
-        reading = {name: _fact(value) for part in (self.source, *self.own) for name, value in vars(part).items()}
-        facts = {
+        input_values = {
+            name: _fact(value) for options in (self.source, *self.own) for name, value in vars(options).items()
+        }
+        fingerprint = {
             "version": __version__,
             "model": model.config_hash,
             "weights": model.weights_hash,
             "device": self.model.device,
             "precision": self.model.precision,
             "engine": (self.model.engine, _fact(self.model.calibrate_with)),
-            "reading": reading,
+            "reading": input_values,
             "run": {name: _fact(value) for name, value in vars(self.run).items()},
             "evaluate": self.evaluate,
         }
-        return hash_of_values(facts)
+        return hash_of_values(fingerprint)
 
 
 def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
     """The own options of every format, from the options of all formats by name. Relative paths become absolute."""
-    given = {name: value.absolute() if isinstance(value, Path) else value for name, value in values.items()}
+    absolute = {name: value.absolute() if isinstance(value, Path) else value for name, value in values.items()}
     return tuple(
-        gather(kind, None, {name: given[name] for name in defaults(kind) if name in given}) for kind in option_classes()
+        gather(kind, None, {name: absolute[name] for name in defaults(kind) if name in absolute})
+        for kind in option_classes()
     )
 
 

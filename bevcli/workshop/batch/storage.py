@@ -55,12 +55,12 @@ def expand(pattern: str) -> list[str]:
     if is_url(pattern):
         system, path = _filesystem(pattern)
         with _one_line(pattern, InputError):
-            found = sorted(system.unstrip_protocol(match) for match in system.glob(path.rstrip("/")))
+            matches = sorted(system.unstrip_protocol(match) for match in system.glob(path.rstrip("/")))
     else:
-        found = sorted(glob.glob(pattern))
-    if not found:
+        matches = sorted(glob.glob(pattern))
+    if not matches:
         raise InputError(f"{pattern}: nothing matches this pattern (expected drives)")
-    return found
+    return matches
 
 
 class LocalFolder:

@@ -148,8 +148,8 @@ class Worker:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)
         except BevcliError as error:
             return None, _with_final_paths(str(error), (path, drive.source), (aside, "its results"))
-        found = scores.detection
-        matches = DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
+        detection = scores.detection
+        matches = DriveMatches(detection.frame_count, detection.matches, detection.unmeasured, scores.segmentation)
         save_state(aside / MATCHES, matches)
         return scores, ""
 
@@ -200,10 +200,10 @@ def _about(drive: BatchDrive, result: str) -> Record:
 
 
 def _summary_columns(summary: RunSummary) -> Record:
-    facts = summary.to_dict()
-    counts = {name: facts[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")}
+    content = summary.to_dict()
+    counts = {name: content[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")}
     lists = ("dropped_images", "skipped_frames", "not_finite_frames")
-    return counts | {name: len(facts[name]) for name in lists}  # type: ignore[arg-type]
+    return counts | {name: len(content[name]) for name in lists}  # type: ignore[arg-type]
 
 
 def _score_columns(scores: Scores) -> Record:
@@ -237,9 +237,9 @@ def _with_final_paths(message: str, *pairs: tuple[Path, str]) -> str:
 def _rewrite_paths(aside: Path, where: str) -> None:
     """Names the final paths in summary.json."""
     path = aside / SUMMARY
-    facts = json.loads(path.read_text(encoding="utf-8"))
-    facts["files"] = [_with_final_paths(name, (aside, where)) for name in facts["files"]]
-    path.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["files"] = [_with_final_paths(name, (aside, where)) for name in content["files"]]
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _read_marker(content: bytes | None) -> tuple[int, str]:
@@ -293,7 +293,7 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[BatchDrive], workers: W
         idle = [remote.remote(job, job_hash, threads) for _ in range(count)]
         # Only a worker that has started gets a drive: a cluster may have no room for all of them yet.
         running = {worker.run.remote(None): worker for worker in idle}
-        left, waiting = list(reversed(drives)), len(drives)
+        pending, waiting = list(reversed(drives)), len(drives)
         try:
             while waiting:
                 (done,), _ = ray.wait(list(running))
@@ -303,8 +303,8 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[BatchDrive], workers: W
                         raise BevcliError(str(record["problem"]))
                     waiting -= 1
                     yield record
-                if left:
-                    running[worker.run.remote(left.pop())] = worker
+                if pending:
+                    running[worker.run.remote(pending.pop())] = worker
         except ray.exceptions.RayError as error:
             raise BevcliError(f"Ray stopped ({reason_of(error)[:200]}); `resume=True` (`--resume`) goes on") from None
 

@@ -31,12 +31,12 @@ def gpu() -> str | dict[str, str]:
         build = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a build without CUDA"
         mps = "; an Apple GPU is there (mps)" if torch.backends.mps.is_available() else ""
         return f"none that PyTorch sees ({build}){mps}"
-    found = {}
+    gpus = {}
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
         capability = f"compute capability {device.major}.{device.minor}"
-        found[f"cuda:{index}"] = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, {capability}"
-    return found | {"CUDA": f"{torch.version.cuda} of PyTorch"}
+        gpus[f"cuda:{index}"] = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, {capability}"
+    return gpus | {"CUDA": f"{torch.version.cuda} of PyTorch"}
 
 
 def kernels() -> str | dict[str, str]:
@@ -65,5 +65,5 @@ def kernels() -> str | dict[str, str]:
 
 def engines() -> str | dict[str, str]:
     """The other engines that are installed, and INT8."""
-    found = ", ".join(installed_engines())
-    return f"torch, {found}; INT8 runs in {found.partition(',')[0]}" if found else "torch only, so no INT8"
+    names = ", ".join(installed_engines())
+    return f"torch, {names}; INT8 runs in {names.partition(',')[0]}" if names else "torch only, so no INT8"

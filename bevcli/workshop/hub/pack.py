@@ -1,24 +1,55 @@
-"""`pack_model`: a folder that the Hugging Face Hub takes, from which `load_model("hf:…")` makes the same model."""
+"""`pack_model`: a folder that the Hugging Face Hub takes, from which `load_model("hf:…")` makes the same model.
+
+README.md is a model card, with the front matter that the Hugging Face Hub reads.
+"""
 
 import hashlib
 import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import safetensors.torch
+import yaml
 
 from bevcli._version import __version__
-from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
+from bevcli.checkpoints import Checkpoint, bundled_weights, expected_state, read_checkpoint, require_fit
 from bevcli.config import TRAINING, as_table, config_of_table, read_model_file
-from bevcli.errors import OutputError, WeightsError
+from bevcli.errors import InputError, OutputError, WeightsError
 from bevcli.inference.load import tracker_of_table, weights_file
+from bevcli.model.config import ModelConfig
 from bevcli.options import gather
-from bevcli.published import Known
+from bevcli.parsing.files import MIB, read_text
+from bevcli.published import Known, all_weights
 from bevcli.weights.options import PackOptions
-from bevcli.workshop.hub.card import facts_of, model_card
 from bevcli.workshop.hub.download import CARD, CONFIG, FORMAT, WEIGHTS, PackedConfig
 from bevcli.writing import write_whole
+
+PAPERS = {
+    "BEVFormer": "https://arxiv.org/abs/2203.17270",
+    "BEVFormerV2": "https://arxiv.org/abs/2211.10439",
+    "UniAD": "https://arxiv.org/abs/2212.10156",
+    "VAD": "https://arxiv.org/abs/2303.12077",
+}
+# Of the weights in the package: scores, their data, and a limit. docs/model-card.md has the whole tables.
+RENDERED = "rendered drives of 20 frames (seeds from 1000000 on)"
+BUNDLED: dict[str, tuple[dict[str, float], str, str]] = {
+    "demo": (
+        {"mAP": 0.559, "NDS": 0.638},
+        f"40 {RENDERED}",
+        "The weights were trained on rendered streets (`bevcli render`) and do not work on real images.",
+    ),
+    "photographs": (
+        {"mAP": 0.364, "NDS": 0.468},
+        f"3 {RENDERED}",
+        "Trained on rendered streets (`bevcli render`); of real images they find cars, and invent some.",
+    ),
+}
+PUBLISHED_DATA = "nuScenes validation split"
 
 
 def pack_model(
@@ -74,3 +105,145 @@ def pack_model(
     if any(own.mesh for own in config.class_settings.values()):
         notes.append("meshes of classes are files of this machine: the folder has none")
     return tuple(targets), tuple(notes)
+
+
+@dataclass(frozen=True)
+class CardFacts:
+    """What a card states beside the model's configuration.
+
+    Attributes:
+        licence: of the weights; "" where none is known.
+        datasets: that the weights were trained on.
+        scores: by name.
+        scored_on: the data of the scores.
+        source: where the weights were published first; "" if that is not known.
+        limit: a sentence on what the weights are not for; "" for none.
+        rigs: the rigs of the training, as the metadata of the weights states them; "" if it does not.
+    """
+
+    licence: str = ""
+    datasets: tuple[str, ...] = ()
+    scores: Mapping[str, float] | None = None
+    scored_on: str = ""
+    source: str = ""
+    limit: str = ""
+    rigs: str = ""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Notes on what the card lacks, and the options that state it."""
+        notes = {
+            "no licence: others may not use the weights: pass `licence` (`--licence NAME`)": self.licence,
+            "no data of the training: pass `datasets` (`--datasets NAME`)": self.datasets or self.limit,
+            "no scores: pass `scores` (`--scores FILE.json`)": self.scores,
+        }
+        return tuple(f"the model card states {text}" for text, stated in notes.items() if not stated)
+
+
+def facts_of(name: str, checkpoint: Checkpoint, options: PackOptions) -> CardFacts:
+    """What is known of the weights of a model, and what the options state. Raises InputError for wrong scores."""
+    rigs = checkpoint.facts.get("training_rigs", "")
+    known = CardFacts(rigs=rigs)
+    named = all_weights().get(name) if options.weights is None else None
+    if checkpoint.path == bundled_weights(name):
+        own_scores, scored_on, limit = BUNDLED[name]
+        known = CardFacts("Apache-2.0", (), own_scores, scored_on, "", limit, rigs)
+    elif named is not None:
+        source, data = named.source, ("nuscenes",) if named.source.published else ()
+        where = source.page or source.url
+        known = CardFacts(source.licence, data, source.published, PUBLISHED_DATA, where, "", rigs)
+    scores = known.scores if options.scores is None else _read_scores(options.scores)
+    return CardFacts(
+        options.licence or known.licence,
+        options.datasets or known.datasets,
+        scores,
+        options.scored_on or (known.scored_on if options.scores is None else "held-out drives"),
+        known.source,
+        known.limit,
+        rigs,
+    )
+
+
+def _read_scores(path: Path) -> dict[str, float]:
+    """mAP and NDS of the JSON of `bevcli validate` or `bevcli eval`. Raises InputError."""
+    try:
+        data = json.loads(read_text(path, 16 * MIB))
+        scores = {"mAP": float(data["mean_ap"]), "NDS": float(data["nd_score"])}
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: has no scores (expected the output of `bevcli validate --json`; {type(error).__name__}: {error})"
+        ) from None
+    if not all(map(math.isfinite, scores.values())):
+        raise InputError(f"{path}: a score is not finite (found {scores})")
+    return scores
+
+
+def model_card(config: ModelConfig, facts: CardFacts, values: int) -> str:
+    """The text of README.md. values: number of values in all tensors."""
+    front = yaml.safe_dump(_front_matter(config, facts), sort_keys=False, allow_unicode=True, width=1000)
+    paper, kind = PAPERS.get(config.architecture, ""), config.architecture
+    grid, (width, height) = config.bev_grid, config.image.size
+    outputs = "3D boxes with velocities" + (", a map of the ground" if "segmentation" in config.heads else "")
+    rows = {
+        "architecture": f"[{kind}]({paper})" if paper else kind,
+        "values": f"{values / 1e6:.1f} million",
+        "input": f"images of {len(config.cameras)} cameras or as many as there are, scaled to {width} x {height}; "
+        f"ego-motion; {config.rate_hz:g} frames a second",
+        "BEV map": f"{grid.columns} x {grid.rows} cells, x {grid.x_range_m[0]:g} to {grid.x_range_m[1]:g} m, "
+        f"y {grid.y_range_m[0]:g} to {grid.y_range_m[1]:g} m",
+        "output": outputs,
+        "classes": ", ".join(config.classes),
+        "rigs of the training": facts.rigs,
+        "trained on": ", ".join(facts.datasets),
+        "first published": facts.source,
+    }
+    table = [f"| {title} | {text} |" for title, text in rows.items() if text]
+    parts = [
+        f"---\n{front}---\n",
+        f"# {config.name}\n",
+        f"Detects objects in bird's-eye view from several cameras. {facts.limit}".strip() + "\n",
+        _USE,
+        "## Model\n\n| | |\n|---|---|\n" + "\n".join(table) + "\n",
+    ]
+    if facts.scores:
+        lines = [f"| {name} | {value:.3f} |" for name, value in facts.scores.items()]
+        parts.append(f"## Scores\n\n{facts.scored_on}:\n\n| metric | value |\n|---|---|\n" + "\n".join(lines) + "\n")
+    return "\n".join(parts)
+
+
+_USE = """## Use
+
+After `pip install 'bevcli[hub]'`, `bevcli run my_drive --model hf:OWNER/NAME` runs the model. OWNER/NAME is the name of
+this repository; `@REVISION`, a branch, tag or commit, may follow it. In Python:
+
+```python
+import bevcli
+
+model = bevcli.load_model("hf:OWNER/NAME")
+```
+
+`config.json` states the model and the SHA-256 of `model.safetensors`. bevcli checks it, and runs no code of them.
+"""
+
+
+def _front_matter(config: ModelConfig, facts: CardFacts) -> dict[str, Any]:
+    licence = facts.licence.lower()
+    named = {"license": licence}
+    if not re.fullmatch(r"[a-z0-9.-]*", licence):  # no identifier of the Hub
+        named = {"license": "other", "license_name": facts.licence}
+    front: dict[str, Any] = {
+        **named,
+        "library_name": "bevcli",
+        "pipeline_tag": "object-detection",
+        "tags": ["bevcli", config.architecture.lower(), "3d-object-detection", "bird-eye-view", "multi-camera"],
+        "datasets": list(facts.datasets),
+    }
+    if facts.scores:
+        metrics = [{"type": name, "value": value} for name, value in facts.scores.items()]
+        result = {
+            "task": {"type": "object-detection", "name": "3D object detection from several cameras"},
+            "dataset": {"type": facts.datasets[0] if facts.datasets else "other", "name": facts.scored_on},
+            "metrics": metrics,
+        }
+        front |= {"metrics": list(facts.scores), "model-index": [{"name": config.name, "results": [result]}]}
+    return {key: value for key, value in front.items() if value}

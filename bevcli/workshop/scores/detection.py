@@ -234,8 +234,8 @@ class ScoreTable:
 
 def known_mean(values: Iterable[float]) -> float:
     """The mean of the values that are not NaN; NaN without any."""
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan
+    defined = [value for value in values if not math.isnan(value)]
+    return sum(defined) / len(defined) if defined else math.nan
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """`record`: writes a drive with its labels, and boxes of one or two models against them, into a recording."""
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -15,8 +14,9 @@ from bevcli.printing import counted
 from bevcli.recording.log_static import RecordedBoxes
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, count_classes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.view import count_labels
 from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 
 MOST = 2  # models: each has a colour
@@ -161,8 +161,7 @@ def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
     first_map = drive.ground_truth_frame(0).ground_truth_map
     of_map = () if first_map is None else tuple(first_map.classes)
     if not inputs:  # labels alone have no class that is not theirs
-        counts = drive.class_counts or _label_counts(drive)
-        classes |= {name: ObjectClass(name) for name in sorted(counts.keys() - classes.keys())}
+        classes |= {name: ObjectClass(name) for name in sorted(count_labels(drive).keys() - classes.keys())}
         return RecordedBoxes(classes=classes, map_classes=of_map)
     first = next(iter(inputs.values()))
     classes = dict(first.boxes.classes or classes)
@@ -170,9 +169,3 @@ def _recorded(drive: Drive, inputs: Mapping[str, ScoredInput]) -> RecordedBoxes:
     ranges = {name: min(range_m, limit) for name, range_m in ranges_m(classes.values()).items()}
     untrained = any(source.boxes.extras.get("untrained") is True for source in inputs.values())
     return RecordedBoxes(tuple(inputs), classes, ranges, untrained, of_map)
-
-
-def _label_counts(drive: Drive) -> Counter[str]:
-    """The number of labels by class."""
-    truths = (drive.ground_truth_frame(index).ground_truth for index in range(len(drive.stamps)))
-    return count_classes(boxes for boxes in truths if boxes is not None)

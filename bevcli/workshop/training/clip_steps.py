@@ -186,10 +186,10 @@ def _maps_of(config: ModelConfig) -> str:
 
 
 @contextlib.contextmanager
-def last_outputs(part: nn.Module) -> Iterator[deque[Any]]:
+def last_outputs(module: nn.Module) -> Iterator[deque[Any]]:
     """Inside, the only item is what the last forward pass of a part returned. No hook remains."""
     kept = deque[Any](maxlen=1)
-    hook = part.register_forward_hook(lambda part, inputs, outputs: kept.append(outputs))
+    hook = module.register_forward_hook(lambda module, inputs, outputs: kept.append(outputs))
     try:
         yield kept
     finally:

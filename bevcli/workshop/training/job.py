@@ -292,8 +292,8 @@ def prepare_training(
         )
     rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
-    own = None if data.split is None and config.held_out == 0 else evaluated
-    notes = check_training_drives(data, drives, own, config.clips, model_config)
+    scored_apart = None if data.split is None and config.held_out == 0 else evaluated
+    notes = check_training_drives(data, drives, scored_apart, config.clips, model_config)
     if data.rendered is not None and not (out / "drives").exists():
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
     if config.freeze_batch_norm and not (options.weights or options.backbone_weights or options.resume):
@@ -312,8 +312,8 @@ def prepare_training(
     if group.leads and not (options.resume and not out.exists()):
         lock.enter_context(folder_lock(out))
         check_folder(out, resume=options.resume)  # again: another training may have been faster
-    if group.leads and own is not None and data.rendered is None:
-        write_split(out / "split.toml", Split(drives.folders, own.folders))
+    if group.leads and scored_apart is not None and data.rendered is None:
+        write_split(out / "split.toml", Split(drives.folders, scored_apart.folders))
     rest = options.seed, group, notes, options.log, tuple(started), lock
     return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 

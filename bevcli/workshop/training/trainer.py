@@ -347,8 +347,8 @@ def load_checkpoint(
         trained.load_state_dict(contents["model"])
         settings = [dict(group) for group in optimizer.param_groups]
         optimizer.load_state_dict(contents["optimizer"])
-        for group, own in zip(optimizer.param_groups, settings, strict=True):
-            group.update(own)  # of this training, not of the file
+        for group, setting in zip(optimizer.param_groups, settings, strict=True):
+            group.update(setting)  # of this training, not of the file
         for key, value in {} if average is None else average.items():
             value.copy_(contents["average"][key])
         _check_numbers(optimizer, [*trained.state_dict().values(), *(average or {}).values()])
@@ -362,8 +362,8 @@ def load_checkpoint(
 
 def _check_numbers(optimizer: torch.optim.AdamW, tensors: list[Tensor]) -> None:
     """Raises ValueError for what PyTorch takes: moments of a wrong shape or sign, NaN in them or in `tensors`."""
-    for parameter, own in optimizer.state.items():
-        first, second, step = (own[name] for name in ("exp_avg", "exp_avg_sq", "step"))
+    for parameter, moments in optimizer.state.items():
+        first, second, step = (moments[name] for name in ("exp_avg", "exp_avg_sq", "step"))
         if not first.shape == second.shape == parameter.shape or step.shape or min(step, second.min()) < 0:
             raise ValueError("the optimizer's moments do not fit the weights")
         tensors = [*tensors, first, second, step]

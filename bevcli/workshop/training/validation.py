@@ -27,9 +27,9 @@ from bevcli.geometry.transforms import inverse
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import MIB, read_text
-from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes, count_classes
+from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
-from bevcli.sequences.view import scenes_of
+from bevcli.sequences.view import count_labels, scenes_of
 from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs
@@ -86,8 +86,7 @@ def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> 
     """
     counts: Counter[str] = Counter()
     for drive in map(drives.open, range(len(drives))):
-        truths = (drive.ground_truth_frame(index).ground_truth for index in range(len(drive.stamps)))
-        counts.update(drive.class_counts or count_classes(boxes for boxes in truths if boxes is not None))
+        counts.update(count_labels(drive))
     absent = [name for name in config.classes if not counts[name]]
     if counts and len(absent) == len(config.classes):
         named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
