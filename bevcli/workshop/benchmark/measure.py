@@ -260,7 +260,7 @@ def time_runs(
     return median(in_runs), median(in_runs) / median(fast.seconds)
 
 
-def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recording) -> list[float]:
+def _time_run(fast: Version, drive: MadeUpDrive, indices: range, recording: Recording) -> list[float]:
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
 
@@ -269,7 +269,7 @@ def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recor
         recording.log(*step[:2])
         fast.state = step[2]
 
-    for _ in write_behind(fast.runner.run(drive, places, fast.state), record):
+    for _ in write_behind(fast.runner.run(drive, indices, fast.state), record):
         pass
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 

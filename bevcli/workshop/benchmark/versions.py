@@ -104,13 +104,13 @@ def fine_stages(model: TemporalModel) -> tuple[dict[str, str], dict[str, str]]:
         return stages, {}
     if not isinstance(model, Network):
         return stages, dict.fromkeys(stages, "input")
-    parts = {
+    modules = {
         "temporal_self_attention": "temporal attention",
         "spatial_cross_attention": "spatial attention",
         "feed_forward": "FFN",
     }
     for layer in range(model.config.encoder.layers):
-        stages |= {f"encoder.layers.{layer}.{part}": stage for part, stage in parts.items()}
+        stages |= {f"encoder.layers.{layer}.{module}": stage for module, stage in modules.items()}
     # The last norm of the encoder counts as FFN; the history is turned just before the encoder. Pillars
     # are input.
     stages |= {"encoder": "FFN", "decoder": "decoder and head"}
@@ -255,7 +255,9 @@ def compare_engines(model: str, frames: int) -> EngineTable:
     network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
     kinds: dict[str, Any] = {name: kind.precisions for name, kind in installed_engines().items()}
     pairs = (
-        (engine, precision) for engine, known in ({TORCH: ("fp32", "bf16")} | kinds).items() for precision in known
+        (engine, precision)
+        for engine, precisions in ({TORCH: ("fp32", "bf16")} | kinds).items()
+        for precision in precisions
     )
     for engine, precision in pairs:
         loaded = Model(network, engine=engine, precision=precision)

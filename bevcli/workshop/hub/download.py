@@ -73,7 +73,7 @@ def _snapshot(repository: str, revision: str | None, fetch: bool) -> Path:
         folder = get(CONFIG, revision).parent
         get(WEIGHTS, folder.name)  # of the same commit
     except Exception as error:  # of huggingface_hub, or of what downloads for it
-        where = f"hf:{repository}" + (f"@{revision}" if revision else "")
+        model_name = f"hf:{repository}" + (f"@{revision}" if revision else "")
         cause = f"{reason_of(error.__cause__ or error):.300}"
         reasons: dict[tuple[type[Exception], ...], str] = {  # the first one that fits
             (errors.RevisionNotFoundError,): f"the repository has no branch, tag or commit {revision}",
@@ -84,7 +84,7 @@ def _snapshot(repository: str, revision: str | None, fetch: bool) -> Path:
             (errors.EntryNotFoundError,): f"is no model of bevcli: it lacks {CONFIG} or {WEIGHTS}",
         }
         reason = next((text for kinds, text in reasons.items() if isinstance(error, kinds)), None)
-        raise WeightsError(f"{where}: {reason or f'cannot be downloaded ({cause})'}") from None
+        raise WeightsError(f"{model_name}: {reason or f'cannot be downloaded ({cause})'}") from None
     return folder
 
 
@@ -137,23 +137,23 @@ def read_folder(folder: Path, source: str, mend: str = "pack the model anew") ->
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: is not of `bevcli weights pack` ({error})") from None
     if config.library_name != "bevcli" or config.format != FORMAT:
-        stated = f"library {config.library_name:.60}, format {config.format}"
+        identity = f"library {config.library_name:.60}, format {config.format}"
         raise WeightsError(
-            f"{path}: this bevcli cannot read it (expected library bevcli, format {FORMAT}; found {stated})"
+            f"{path}: this bevcli cannot read it (expected library bevcli, format {FORMAT}; found {identity})"
         )
     classes = config.model.get("class_settings", {})
-    if any("mesh" in own for own in classes.values() if isinstance(own, dict)):
+    if any("mesh" in settings for settings in classes.values() if isinstance(settings, dict)):
         raise WeightsError(f"{path}: names a mesh, a file of this machine: refused (`bevcli weights pack` writes none)")
     weights = folder / WEIGHTS
     try:
         stat = weights.stat()
     except OSError as error:
         raise WeightsError(f"{weights}: {error.strerror} (config.json is there)") from None
-    found = Known(_sha256(weights, stat.st_mtime_ns, stat.st_size), stat.st_size)
-    if found != config.weights:
+    weights_here = Known(_sha256(weights, stat.st_mtime_ns, stat.st_size), stat.st_size)
+    if weights_here != config.weights:
         raise WeightsError(
-            f"{weights}: has the SHA-256 {found.sha256} and {found.bytes:,} bytes (expected {config.weights.sha256} "
-            f"and {config.weights.bytes:,}, as config.json states): {mend}"
+            f"{weights}: has the SHA-256 {weights_here.sha256} and {weights_here.bytes:,} bytes (expected "
+            f"{config.weights.sha256} and {config.weights.bytes:,}, as config.json states): {mend}"
         )
     return HubModel(config.model, path, weights, f"{source}: {config.limit}" if config.limit else source)
 

@@ -73,7 +73,7 @@ def pack_model(
         OutputError: a file exists, or cannot be written.
     """
     chosen, name, out = gather(PackOptions, options, changes), str(model), Path(folder)
-    targets = [out / each for each in (CONFIG, WEIGHTS, CARD)]
+    targets = [out / file_name for file_name in (CONFIG, WEIGHTS, CARD)]
     there = next((target for target in targets if target.exists()), None)
     if there is not None and not chosen.force:
         raise OutputError(
@@ -90,10 +90,15 @@ def pack_model(
         table[TRAINING] = contents[TRAINING]
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
     weights = safetensors.torch.save(tensors, dict(checkpoint.facts))
-    known = Known(hashlib.sha256(weights).hexdigest(), len(weights))
+    content_hash = Known(hashlib.sha256(weights).hexdigest(), len(weights))
     facts = facts_of(name, checkpoint, chosen)
     packed = PackedConfig(
-        library_name="bevcli", bevcli_version=__version__, format=FORMAT, weights=known, model=table, limit=facts.limit
+        library_name="bevcli",
+        bevcli_version=__version__,
+        format=FORMAT,
+        weights=content_hash,
+        model=table,
+        limit=facts.limit,
     )
     texts = [
         json.dumps(msgspec.to_builtins(packed), indent=1, ensure_ascii=False) + "\n",
@@ -102,7 +107,7 @@ def pack_model(
     for target, content in zip(targets, (texts[0].encode(), weights, texts[1].encode()), strict=True):
         write_whole(target, content, parents=True)
     notes = list(facts.missing)
-    if any(own.mesh for own in config.class_settings.values()):
+    if any(settings.mesh for settings in config.class_settings.values()):
         notes.append("meshes of classes are files of this machine: the folder has none")
     return tuple(targets), tuple(notes)
 
@@ -146,12 +151,12 @@ def facts_of(name: str, checkpoint: Checkpoint, options: PackOptions) -> CardFac
     known = CardFacts(rigs=rigs)
     named = all_weights().get(name) if options.weights is None else None
     if checkpoint.path == bundled_weights(name):
-        own_scores, scored_on, limit = BUNDLED[name]
-        known = CardFacts("Apache-2.0", (), own_scores, scored_on, "", limit, rigs)
+        bundled_scores, scored_on, limit = BUNDLED[name]
+        known = CardFacts("Apache-2.0", (), bundled_scores, scored_on, "", limit, rigs)
     elif named is not None:
         source, data = named.source, ("nuscenes",) if named.source.published else ()
-        where = source.page or source.url
-        known = CardFacts(source.licence, data, source.published, PUBLISHED_DATA, where, "", rigs)
+        first_published = source.page or source.url
+        known = CardFacts(source.licence, data, source.published, PUBLISHED_DATA, first_published, "", rigs)
     scores = known.scores if options.scores is None else _read_scores(options.scores)
     return CardFacts(
         options.licence or known.licence,

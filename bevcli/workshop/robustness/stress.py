@@ -37,7 +37,7 @@ RESULTS, FORMAT = "stress.json", "bevcli-stress/1"
 # Predicted boxes and ground truth of each scored frame of a scene, in the ego frame.
 SceneBoxes = tuple[tuple[Boxes3D, Boxes3D], ...]
 KEPT_BYTES = 1 << 30  # decoded images that are kept in memory, of all scenes together
-_INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
+_INPUT_KEYS = ("frames of the input", "calibration", "files of the input")
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class StressResults:
 
     def corruption_error(self, name: str, against: Self) -> float:
         """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""
-        own, other = self.of(name), against.of(name)
-        common = [severity for severity in own if severity in other]
+        scores, other = self.of(name), against.of(name)
+        common = [severity for severity in scores if severity in other]
         below = sum(1 - other[severity].nd_score for severity in common)
-        return sum(1 - own[severity].nd_score for severity in common) / below if below else math.nan
+        return sum(1 - scores[severity].nd_score for severity in common) / below if below else math.nan
 
     def mean_resilience(self, group: Group = Group.ROBOBEV) -> float:
         """The mean resilience rate of a group's corruptions that were tested, RoboBEV's mRR; NaN without any."""
@@ -211,7 +211,7 @@ class StressTest:
         memory, scenes = FrameMemory(KEPT_BYTES), [scene for drive in drives for scene in split_scenes(drive)]
         self._scenes = [KeptFrames(scene, memory, index) for index, scene in enumerate(scenes)]
         self._against = None if options.against is None else read_results(options.against)
-        self._facts = _facts(self._model, drives, replace(options, against=None))
+        self._fingerprint = _fingerprint_of(self._model, drives, replace(options, against=None))
         self._folder = RunFolder(out, force=force, resume=resume)
         self._range_m = options.max_range_m or self._model.config.bev_grid.nearest_side_m
         self._metrics = DetectionConfig.of(self._model.config.object_classes).cut_at(self._range_m)
@@ -228,26 +228,28 @@ class StressTest:
                 another one.
         """
         with self._folder as folder:
-            state = saved_state(folder, self._facts, StressState) if self._resume else None
+            state = saved_state(folder, self._fingerprint, StressState) if self._resume else None
             if state is None:
                 folder.remove_written()
-                state = StressState(self._facts)
+                state = StressState(self._fingerprint)
                 save_state(folder.state_path, state)
             self.results = replace(self.results, scores=state.scores)
             finished = {(scores.corruption, scores.severity) for scores in state.scores}
-            left = [condition for condition in self._conditions if (condition.name, condition.severity) not in finished]
-            done = self._kept_frames(left) + (len(self._conditions) - len(left)) * sum(map(_length, self._scenes))
+            pending = [
+                condition for condition in self._conditions if (condition.name, condition.severity) not in finished
+            ]
+            done = self._kept_frames(pending) + (len(self._conditions) - len(pending)) * sum(map(_length, self._scenes))
             yield done
             runner = self._model.runner(StepOptions(track=False, temporal=self._options.temporal))
             try:
-                for condition in left:
+                for condition in pending:
                     for index in range(len(self._scenes)):
                         for _ in self._run_scene(runner, condition, index):
                             done += 1
                             yield done
                     scores = (*self.results.scores, self._scores(condition))
                     self.results = replace(self.results, scores=tuple(sorted(scores, key=_order)))
-                    save_state(folder.state_path, StressState(self._facts, self.results.scores))
+                    save_state(folder.state_path, StressState(self._fingerprint, self.results.scores))
                     self._write_results()
                     for index in range(len(self._scenes)):
                         self._boxes_path(condition, index).unlink(missing_ok=True)
@@ -271,9 +273,9 @@ class StressTest:
             "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self._scenes],
         }
 
-    def _kept_frames(self, left: Sequence[Condition]) -> int:
-        """The number of frames of the first condition that is left whose boxes are stored."""
-        kept = [scene for n, scene in enumerate(self._scenes) if left and self._boxes_path(left[0], n).exists()]
+    def _kept_frames(self, pending: Sequence[Condition]) -> int:
+        """The number of frames of the first pending condition whose boxes are stored."""
+        kept = [scene for n, scene in enumerate(self._scenes) if pending and self._boxes_path(pending[0], n).exists()]
         return sum(map(_length, kept))
 
     def _boxes_path(self, condition: Condition, index: int) -> Path:
@@ -338,13 +340,13 @@ def _order(scores: ConditionScores) -> int:
     return conditions.index((scores.corruption, scores.severity))
 
 
-def _facts(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:
-    """The facts that the results depend on, apart from the conditions."""
-    of_drives = [run_fingerprint(model, drive, options) for drive in drives]
-    facts = dict(of_drives[0])
-    if len(of_drives) > 1:
-        facts |= {name: digest(tuple(of_drive[name] for of_drive in of_drives))[:12] for name in _INPUT_FACTS}
-    return facts | {"drives": ", ".join(drive.name for drive in drives)}
+def _fingerprint_of(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:
+    """All that the results depend on, apart from the conditions."""
+    fingerprints = [run_fingerprint(model, drive, options) for drive in drives]
+    fingerprint = dict(fingerprints[0])
+    if len(fingerprints) > 1:
+        fingerprint |= {name: digest(tuple(of_drive[name] for of_drive in fingerprints))[:12] for name in _INPUT_KEYS}
+    return fingerprint | {"drives": ", ".join(drive.name for drive in drives)}
 
 
 def stress_table(results: StressResults, against: StressResults | None = None) -> str:
@@ -378,9 +380,9 @@ def _block(
     for corruption in group:
         scores = results.of(corruption.name)
         cells = []
-        for part in map(scores.get, severities):
-            cells += [f"{part.nd_score:.3f}", f"{part.mean_ap:.3f}"] if part else ["-", "-"]
-        mean = sum(part.nd_score for part in scores.values()) / len(scores)
+        for condition in map(scores.get, severities):
+            cells += [f"{condition.nd_score:.3f}", f"{condition.mean_ap:.3f}"] if condition else ["-", "-"]
+        mean = sum(condition.nd_score for condition in scores.values()) / len(scores)
         rates = [f"{mean:.3f}", _percent(results.resilience(corruption.name))]
         rates += [_percent(results.corruption_error(corruption.name, against))] if against else []
         rows.append((corruption.name, *cells, *rates))

@@ -85,7 +85,7 @@ class Comparison:
             "confidence": CONFIDENCE,
             "mean_ap": self.mean_ap.to_dict(),
             "nd_score": self.nd_score.to_dict(),
-            "mean_dist_aps": {name: each.to_dict() for name, each in self.classes.items()},
+            "mean_dist_aps": {name: difference.to_dict() for name, difference in self.classes.items()},
             **self.worst.to_dict(),
             "scores": [scores.to_dict() for scores in self.scores],
             "notes": list(self.notes),
@@ -178,7 +178,7 @@ def compare(
     models = [read(path, ground_truth, count_missing, **which) for path in (a, b)]
     models, notes = _on_common_ground(models, max_range)
     scores = [score(model) for model in models]
-    models = [replace(model, detection=each.detection) for model, each in zip(models, scores, strict=True)]
+    models = [replace(model, detection=scored.detection) for model, scored in zip(models, scores, strict=True)]
     count = scores[0].detection.frame_count
     if count < FEW_FRAMES:
         notes.append(f"the intervals are too narrow for {counted(count, 'frames')} (expected {FEW_FRAMES} or more)")
@@ -199,8 +199,8 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
     """The frames, the classes and the range that both models have, and notes about what is left out."""
     notes = []
     keys = [[(true.stamp, true.extras.get("sample_token")) for true in model.pairs.ground_truth] for model in models]
-    places = [{key: index for index, key in enumerate(index_of)} for index_of in keys]
-    common = [key for key in keys[0] if key in places[1]]
+    indices_by_key = [{key: index for index, key in enumerate(index_of)} for index_of in keys]
+    common = [key for key in keys[0] if key in indices_by_key[1]]
     if not common:
         raise InputError("the two predictions have no frame of the ground truth in common: choose two of one drive")
     if len(common) < max(map(len, keys)):
@@ -224,18 +224,18 @@ def _on_common_ground(models: Sequence[Compared], max_range: float | None) -> tu
         )
     return [
         replace(_at(model, [index_of[key] for key in common]), classes=classes, max_range_m=max_range)
-        for model, index_of in zip(models, places, strict=True)
+        for model, index_of in zip(models, indices_by_key, strict=True)
     ], notes
 
 
-def _at(model: Compared, places: list[int]) -> Compared:
-    """Only the frames at these places of the pairs, without maps."""
+def _at(model: Compared, indices: list[int]) -> Compared:
+    """Only the frames at these indices of the pairs, without maps."""
     pairs = model.pairs
     kept = replace(
         pairs,
-        predictions=tuple(pairs.predictions[index] for index in places),
-        ground_truth=tuple(pairs.ground_truth[index] for index in places),
-        reference_from_ego=pairs.reference_from_ego[places],
+        predictions=tuple(pairs.predictions[index] for index in indices),
+        ground_truth=tuple(pairs.ground_truth[index] for index in indices),
+        reference_from_ego=pairs.reference_from_ego[indices],
     )
     assert model.predictions is not None
     assert model.truth is not None

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,7 @@ from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.plots import write_plots
 from bevcli.workshop.scores.tracking import TrackingScores, score_tracks
 from bevcli.workshop.scores.worst_frames import WorstFrames, find_worst_frames
-
-if TYPE_CHECKING:
-    from bevcli.workshop.vad.driving_scores import DrivingScores
+from bevcli.workshop.vad.driving_scores import DrivingScores, evaluate_driving
 
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "
@@ -72,12 +70,12 @@ class FrameScores:
     detection: DetectionScores
     segmentation: SegmentationScores | None = None
     tracking: TrackingScores | None = None
-    vad: "DrivingScores | None" = None
+    vad: DrivingScores | None = None
     worst: WorstFrames | None = None
     notes: tuple[str, ...] = ()
 
     @property
-    def others(self) -> "list[TrackingScores | DrivingScores | WorstFrames]":
+    def others(self) -> list[TrackingScores | DrivingScores | WorstFrames]:
         """The scores of further results that were asked for."""
         return [scores for scores in (self.tracking, self.vad, self.worst) if scores is not None]
 
@@ -200,8 +198,6 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
     tracking = score_tracks(compared) if results.tracking else None
     vad = None
     if results.map or results.motion or results.plan:
-        from bevcli.workshop.vad.driving_scores import evaluate_driving
-
         vad = evaluate_driving(results, compared)
     worst = find_worst_frames([compared], results.worst) if results.worst else None
     scores = Scores(detection, segmentation, tracking, vad, worst, pairs=pairs)

@@ -48,8 +48,8 @@ class ScoredInput:
     @property
     def range_m(self) -> float | None:
         """Distance to the end of the BEV grid of the model that made the predictions, metres; None if not stated."""
-        stated = self.boxes.extras.get("range_m")
-        return float(stated) if isinstance(stated, (int, float)) and stated > 0 else None
+        range_m = self.boxes.extras.get("range_m")
+        return float(range_m) if isinstance(range_m, (int, float)) and range_m > 0 else None
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:

@@ -33,10 +33,10 @@ def best_outcome(matches: ClassMatches, row: int) -> Outcome:
     is_match = matches.matched[row] >= 0
     f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
     kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
-    is_found = np.zeros(len(matches.ground_truth), dtype=bool)
-    is_found[matches.matched[row][kept & is_match]] = True
+    is_matched = np.zeros(len(matches.ground_truth), dtype=bool)
+    is_matched[matches.matched[row][kept & is_match]] = True
     truth = matches.ground_truth
-    return Outcome(truth[is_found], truth[~is_found], matches.predictions[kept & ~is_match])
+    return Outcome(truth[is_matched], truth[~is_matched], matches.predictions[kept & ~is_match])
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,11 @@ class WorstFrames:
         rows = [["worst frames", "", "boxes", *self._columns()]]
         several = len({frame.stamp.scene for frame in self.frames}) > 1
         for name, indices in self.lists.items():
-            for place, index in enumerate(indices):
+            for rank, index in enumerate(indices):
                 stamp = self.frames[index].stamp
                 frame = f"{stamp.scene} frame {stamp.index}" if several else f"frame {stamp.index}"
                 counts = map(str, (self.boxes[index], *self._counts(index)))
-                rows.append(["" if place else _heading(name), frame, *counts])
+                rows.append(["" if rank else _heading(name), frame, *counts])
         yield f"{aligned(rows, left=(0, 1))}\n(scores from the largest F1 of each class at {self.distance_m:g} m on)"
         if self.view is not None:
             yield f"Look at it: {self.view}"

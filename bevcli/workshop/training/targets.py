@@ -3,7 +3,7 @@
 The boxes and masks of one frame are made on the CPU; a batch has them padded, so that one copy moves them to a GPU.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -259,23 +259,22 @@ class Targets:
 
     def to(self, device: torch.device) -> "Targets":
         """A copy on a device."""
-        return self._changed(lambda tensor: upload(tensor, device))
+        targets: Targets = exchanged(self, (upload(tensor, device) for _, tensor in tensors_in(self)))
+        return targets
 
     def pinned(self) -> "Targets":
         """A copy in memory that a GPU reads by itself."""
-        return self._changed(pinned)
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> "Targets":
-        parts = (self.detection, self.perspective, self.segmentation)
-        boxes, all_boxes, masks = exchanged(parts, (change(tensor) for _, tensor in tensors_in(parts)))
-        return Targets(boxes, all_boxes, masks)
+        targets: Targets = exchanged(self, (pinned(tensor) for _, tensor in tensors_in(self)))
+        return targets
 
 
-def joined_targets(parts: Sequence[Targets]) -> Targets:
-    masks = [part.segmentation[frame] for part in parts if part.segmentation for frame in range(len(part.segmentation))]
+def joined_targets(batches: Sequence[Targets]) -> Targets:
+    masks = [
+        batch.segmentation[frame] for batch in batches if batch.segmentation for frame in range(len(batch.segmentation))
+    ]
     return Targets(
-        padded([part.detection[frame] for part in parts for frame in range(len(part.detection))]),
-        padded([part.perspective[frame] for part in parts for frame in range(len(part.perspective))]),
+        padded([batch.detection[frame] for batch in batches for frame in range(len(batch.detection))]),
+        padded([batch.perspective[frame] for batch in batches for frame in range(len(batch.perspective))]),
         padded_masks(masks) if masks else None,
     )
 
