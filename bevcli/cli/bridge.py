@@ -17,7 +17,7 @@ from bevcli.inference.options import complete_model
 from bevcli.options import Option, Reads, defaults
 from bevcli.printing import did_you_mean
 from bevcli.registry import is_of_hub
-from bevcli.sequences.format import option_classes
+from bevcli.sequences.format import formats
 from bevcli.writing import partial_path
 
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
@@ -191,7 +191,7 @@ def _require(value: Any, flag: _Flag) -> None:
 def _flags_of(hint: Any, part: Part) -> dict[str, _Flag]:
     """The options that a command takes of a dataclass or of all formats, by the names of the fields."""
     flags: dict[str, _Flag] = {}
-    classes: list[type[Any]] = [*option_classes()] if hint == FormatValues else [hint]
+    classes: list[type[Any]] = [*formats()] if hint == FormatValues else [hint]
     for kind in classes:
         kinds, values = get_type_hints(kind), defaults(kind)
         for field in dataclasses.fields(kind):

@@ -15,7 +15,7 @@ from bevcli.options import Option, defaults, named
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.rig import CheckOptions
-from bevcli.sequences.format import option_classes
+from bevcli.sequences.format import formats
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer.options import ViewOptions
 from bevcli.writing import output_errors, write_whole
@@ -80,7 +80,7 @@ def viz(
     if not viewing.is_recording(shown):
         viewing.record_drive(shown, options, recording, source, format_options)
         return
-    kinds = (ViewOptions, RecordingOptions, InputOptions, *option_classes())
+    kinds = (ViewOptions, RecordingOptions, InputOptions, *formats())
     usual = {name: (kind, value) for kind in kinds for name, value in defaults(kind).items()}
     for_drives = {
         "boxes": options.boxes,

@@ -29,7 +29,7 @@ from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.sequence_checks import check_scenes, rig_findings
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_of, draft_rig
 from bevcli.sequences.format import format_of, is_drive
-from bevcli.sequences.native import FORMAT as NATIVE, FolderOptions
+from bevcli.sequences.native import FolderOptions, NativeFolder
 from bevcli.sequences.native.folder import FolderDrive, read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions, RigOptions
@@ -169,7 +169,7 @@ def check_calibration(
 
 def _is_other_drive(path: Path) -> bool:
     """True for a drive that is not a native folder, such as a bag."""
-    return is_drive(path) and format_of(path) is not NATIVE
+    return is_drive(path) and format_of(path) is not NativeFolder
 
 
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import defaults, named
+from bevcli.options import defaults, named, options
 from bevcli.registry import entries, load
-from bevcli.sequences.options import FormatOptions, InputOptions
+from bevcli.sequences.options import InputOptions
 
 if TYPE_CHECKING:
     from bevcli.frame import Drive, Frame, FrameResult
@@ -24,45 +23,52 @@ ROOT_DEPTH = 2  # levels of folders between a data set's root and its drives, su
 FEW = 4  # names in a message
 
 
-@dataclass(frozen=True)
+@options("Input")
 class Format:
-    """An input format.
+    """An input format: a dataclass of its own options, which says how a path is recognised, and opens it with them.
 
-    Attributes:
+    Class attributes:
         name: with an article, for messages: "a nuScenes root".
         expected: the files that it is recognised by, for messages: "v1.0-*/scene.json".
-        recognises: whether a path that exists has this format. Looks at names, or at a few bytes.
-        opener: opens a path with the common options and its own, or the name of what does, "module:attribute", which is
-            imported when it is needed. `open_sequence` itself selects the scene and the frames, and takes away the
-            ground truth. Raises InputError.
-        options: the dataclass of its own options.
+        reader: name of what opens a path, "module:attribute", which is imported when it is needed; see `open`.
         annotated: whether its drives may have ground truth that opening them reads, so that `bevcli eval` takes them.
         has_poses: whether its drives may have poses; without them, `bevcli run` uses no history.
         precedence: the format with the highest one is taken where several recognise a path. A format that needs little
             to recognise a path has a low one.
     """
 
-    name: str
-    expected: str
-    recognises: Callable[[Path], bool]
-    opener: str | Callable[[Path, InputOptions, Any], Drive]
-    options: type[FormatOptions] = FormatOptions
-    annotated: bool = False
-    has_poses: bool = True
-    precedence: int = 0
+    name: ClassVar[str]
+    expected: ClassVar[str]
+    reader: ClassVar[str]
+    annotated: ClassVar[bool] = False
+    has_poses: ClassVar[bool] = True
+    precedence: ClassVar[int] = 0
 
-    def open(self, path: Path, common: InputOptions, own: FormatOptions) -> Drive:
-        """A path of this format as a drive. Raises InputError."""
-        opener = resolve_name(self.opener) if isinstance(self.opener, str) else self.opener
-        return opener(path, common, own)
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a path that exists and has this format. Looks at names, or at a few bytes."""
+        raise NotImplementedError
+
+    def open(self, path: Path, common: InputOptions) -> Drive:
+        """A path of this format as a drive: its `reader`, called with the path, the common options and these.
+
+        `open_sequence` itself selects the scene and the frames, and takes away the ground truth. Raises InputError.
+        """
+        drive: Drive = resolve_name(self.reader)(path, common, self)
+        return drive
+
+    @property
+    def wants_all_frames(self) -> bool:
+        """True where an option asks for frames that thinning to a model's rate would drop."""
+        return False
 
 
-def formats(broken: list[BevcliError] | None = None) -> tuple[Format, ...]:
+def formats(broken: list[BevcliError] | None = None) -> tuple[type[Format], ...]:
     """All formats, in the order of their registered names.
 
     Those that cannot be imported are left out, as a package of somebody else may be broken. broken: gets their errors.
     """
-    loaded: list[Format] = []
+    loaded: list[type[Format]] = []
     for name in entries(GROUP):
         try:
             loaded.append(load(GROUP, name))
@@ -72,18 +78,14 @@ def formats(broken: list[BevcliError] | None = None) -> tuple[Format, ...]:
     return tuple(loaded)
 
 
-def option_classes() -> list[type[FormatOptions]]:
-    """The dataclasses of the formats' own options."""
-    return [form.options for form in formats()]
-
-
-def format_of(path: Path) -> Format:
+def format_of(path: Path) -> type[Format]:
     """The format of a path. Raises InputError if it is missing, or is no drive, or has two formats."""
     broken: list[BevcliError] = []
-    known = sorted(formats(broken), key=lambda form: form.precedence)  # in messages, the most general one comes first
+    # In messages, the most general one comes first.
+    candidates = sorted(formats(broken), key=lambda form: form.precedence)
     if not path.exists():
-        raise InputError(f"{path}: is missing (expected {_either([form.name for form in known])})")
-    matching = [form for form in known if form.recognises(path)]
+        raise InputError(f"{path}: is missing (expected {_either([form.name for form in candidates])})")
+    matching = [form for form in candidates if form.recognises(path)]
     if not matching:
         drives = list(drives_in(path))
         if drives:
@@ -93,7 +95,7 @@ def format_of(path: Path) -> Format:
                 "by `bevcli batch`"
             )
         kind = "is a file, and not" if path.is_file() else "is not"
-        expected = _either([f"{form.name} (expected {form.expected})" for form in known])
+        expected = _either([f"{form.name} (expected {form.expected})" for form in candidates])
         raise InputError("; ".join([f"{path}: {kind} {expected}", *map(str, broken)]))
     highest = max(form.precedence for form in matching)
     first, *others = [form for form in matching if form.precedence == highest]
@@ -112,13 +114,12 @@ def drives_in(root: Path) -> dict[str, Path]:
 
     The name of a drive is that of its folder or file; with the folders above it where two have the same.
     """
-    known = formats()
-    drives = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
+    drives = {path.relative_to(root).as_posix(): path for path in _drives_below(root, formats(), ROOT_DEPTH)}
     names = Counter(path.name for path in drives.values())
     return {name if names[path.name] > 1 else path.name: path for name, path in drives.items()}
 
 
-def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator[Path]:
+def _drives_below(folder: Path, known: Iterable[type[Format]], depth: int) -> Iterator[Path]:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
@@ -131,20 +132,20 @@ def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator
                 yield from _drives_below(path, known, depth - 1)
 
 
-def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: str) -> None:
+def check_options(values: Mapping[str, Any], chosen: Iterable[type[Format]], where: str) -> None:
     """Check that formats have the options that are given. Values that are the default are accepted for every format.
 
     where: start of a message. Raises InputError for an option that only other formats have; TypeError for one that no
     format has, or BevcliError if a format cannot be imported that may have it.
     """
-    own = {name for form in chosen for name in defaults(form.options)}
+    own = {name for form in chosen for name in defaults(form)}
     for name in (name for name in values if name not in own):
         broken: list[BevcliError] = []
-        having = [form for form in formats(broken) if name in defaults(form.options)]
+        having = [form for form in formats(broken) if name in defaults(form)]
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
-        if values[name] != defaults(having[0].options)[name]:
-            option = named(having[0].options, name)
+        if values[name] != defaults(having[0])[name]:
+            option = named(having[0], name)
             raise InputError(f"{where}: {option} is for {_either([form.name for form in having])}: remove it")
 
 

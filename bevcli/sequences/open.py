@@ -66,9 +66,8 @@ def open_steps(
         options = replace(options, ego_motion="measured")
     chosen = format_of(path)
     check_options(changes, [chosen], f"{path}: is {chosen.name}")
-    own_defaults = defaults(chosen.options)
-    own = gather(chosen.options, None, {name: value for name, value in changes.items() if name in own_defaults})
-    drive = chosen.open(path, options, own)
+    own = gather(chosen, None, {name: value for name, value in changes.items() if name in defaults(chosen)})
+    drive = own.open(path, options)
     check_time_unit(drive, path)
     if options.ground_truth:
         names = ClassNames(options.class_map, options.classes or NUSCENES_CLASSES)

@@ -133,16 +133,6 @@ class InputOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
-@options("Input")
-class FormatOptions:
-    """The options that only one format has: the base class of each format's own."""
-
-    @property
-    def wants_all_frames(self) -> bool:
-        """True where an option asks for frames that thinning to a model's rate would drop."""
-        return False
-
-
 def parse_by_camera(texts: list[str]) -> float | dict[str, float]:
     """A number for all cameras, or numbers CAMERA=NUMBER. Raises ValueError."""
     if len(texts) == 1 and "=" not in texts[0]:
@@ -162,7 +152,7 @@ def _number(text: str) -> float:
 
 
 @options("Input")
-class RigOptions(FormatOptions):
+class RigOptions:
     """What replaces the calibration and the ego-motion of an input. A format that takes it inherits it."""
 
     calibration: Path | None = option(

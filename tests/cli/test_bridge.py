@@ -101,7 +101,7 @@ def test_options_of_all_formats_arrive_as_a_mapping(monkeypatch):
     class Other:
         topic: str = option(default="t", help="A topic.")
 
-    monkeypatch.setattr(bridge, "option_classes", lambda: [ReadOptions, Other])
+    monkeypatch.setattr(bridge, "formats", lambda: [ReadOptions, Other])
 
     def read(values: Annotated[bridge.FormatValues, Part(without=("names",))]) -> None:
         assert values["topic"] == "x"

@@ -15,7 +15,7 @@ from bevcli import registry
 from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.sequences.format import GROUP, format_of, formats, option_classes
+from bevcli.sequences.format import GROUP, format_of, formats
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
@@ -38,8 +38,17 @@ from bevcli.sequences.options import RigOptions
 
 
 @options("Input")
-class StripOptions(RigOptions):
+class Strips(RigOptions, Format):
+    name = "a strip"
+    expected = "name.strip"
     images_per_second: float = option(default=2.0, help="Strips: images per second.")
+
+    @classmethod
+    def recognises(cls, path):
+        return path.suffix == ".strip"
+
+    def open(self, path, common):
+        return Strip(path, self)
 
 
 class Strip(Sequence):
@@ -47,7 +56,7 @@ class Strip(Sequence):
 
     has_ego_motion = False
 
-    def __init__(self, path, common, own):
+    def __init__(self, path, own):
         draft = draft_of(own)
         if draft is None:
             raise InputError(f"{path}: states no calibration: pass `calibration`")
@@ -60,9 +69,6 @@ class Strip(Sequence):
         stamp, (camera,) = self.stamps[place], self.rig.names
         images = {camera: CameraImage(stamp.timestamp_ns, self.images[place])}
         return Frame(stamp, self.rig, images, Pose.identity(), {camera: Pose.identity()}, AT_REST)
-
-
-FORMAT = Format("a strip", "name.strip", lambda path: path.suffix == ".strip", Strip, StripOptions)
 '''
 
 
@@ -73,7 +79,7 @@ def plug_in(tmp_path, monkeypatch):
     facts = site / "strips-1.0.dist-info"
     facts.mkdir(parents=True)
     (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: strips\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text("[bevcli.sequences]\nstrips = strips:FORMAT\n")
+    (facts / "entry_points.txt").write_text("[bevcli.sequences]\nstrips = strips:Strips\n")
     (site / "strips.py").write_text(PLUG_IN)
     monkeypatch.syspath_prepend(str(site))
     registry.installed.cache_clear()
@@ -100,12 +106,12 @@ def strip(tmp_path, drive) -> dict:
 def test_each_option_is_stated_once():
     common = {field.name for field in fields(InputOptions)}
     shared = {field.name for field in fields(FolderOptions)}  # of a folder and a video; those of a rig are among them
-    own = [{field.name for field in fields(one.options)} for one in formats()]
+    own = [{field.name for field in fields(one)} for one in formats()]
     assert not common & set().union(*own)
     for number, names in enumerate(own):
         for others in own[number + 1 :]:
             assert names & others <= shared
-    assert all(field.metadata["option"].help for kind in (InputOptions, *option_classes()) for field in fields(kind))
+    assert all(field.metadata["option"].help for kind in (InputOptions, *formats()) for field in fields(kind))
 
 
 def test_an_option_of_another_format_is_refused_by_name(drive):
@@ -139,7 +145,7 @@ def test_the_strongest_format_is_taken(drive, tmp_path):
 
 
 def test_a_package_can_add_a_format(plug_in, strip, drive):
-    assert len([line for line in PLUG_IN.splitlines() if line]) <= 40
+    assert len([line for line in PLUG_IN.splitlines() if line]) <= 45
     sequence = open_sequence(**strip, images_per_second=4, frames=slice(1, None))
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [250_000_000, 500_000_000]
     assert [int(sequence.load(place).images["CAM_FRONT"].pixels_bgr[0, 0, 0]) for place in (0, 1)] == [20, 30]
@@ -153,10 +159,10 @@ def test_a_broken_package_stops_only_what_needs_its_format(plug_in, strip, drive
     (strip["path"].parent / "site/strips.py").write_text("import a_package_that_is_missing")
     assert open_sequence(drive).stamps
     for path, options in ((strip["path"], {}), (drive, {"images_per_second": 4})):
-        with pytest.raises(BevcliError, match=r"strips = strips:FORMAT cannot be imported.*a_package") as error:
+        with pytest.raises(BevcliError, match=r"strips = strips:Strips cannot be imported.*a_package") as error:
             open_sequence(path, **options)
         assert "\n" not in str(error.value)
-    assert len(formats()) == len(option_classes()) == len(registry.entries(GROUP)) - 1
+    assert len(formats()) == len(registry.entries(GROUP)) - 1
 
 
 def test_recognising_a_path_imports_no_reader(tmp_path):

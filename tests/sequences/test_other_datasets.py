@@ -33,7 +33,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.labels import with_track_velocities
 from bevcli.workshop.scores.evaluate import evaluate
 
-FORMATS: dict[str, Format] = {name: load("bevcli.sequences", name) for name in WRITTEN}
+FORMATS: dict[str, type[Format]] = {name: load("bevcli.sequences", name) for name in WRITTEN}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}
 LENS = Distortion("brown_conrady", (-0.24, -0.21, 0.0, 0.0, 0.32))  # as of a camera of Argoverse 2
 DOCUMENT = (Path(__file__).parents[2] / "docs/other-inputs.md").read_text()

@@ -50,20 +50,20 @@ class FolderOptions(RigOptions):
             raise InputError(f"`start_ns={self.start_ns}` (`--start-ns`): expected nanoseconds, at most {LARGEST_NS}")
 
 
-def is_folder_of_images(path: Path) -> bool:
-    """True for a folder with a file or folder of a native sequence, or with folders that are named like cameras."""
-    if any((path / part).exists() for part in MARKERS):
-        return True
-    from bevcli.workshop.formats.camera_names import has_camera_folders
+@options("Input")
+class NativeFolder(FolderOptions, Format):
+    """A native sequence folder."""
 
-    return has_camera_folders(path)
+    name = "a sequence folder"
+    expected = "calibration.json, frames.csv, ego_motion.csv, images or videos"
+    reader = "bevcli.sequences.native.folder:FolderDrive"
+    precedence = -10
 
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with a file or folder of a native sequence, or with folders that are named like cameras."""
+        if any((path / name).exists() for name in MARKERS):
+            return True
+        from bevcli.workshop.formats.camera_names import has_camera_folders
 
-FORMAT = Format(
-    name="a sequence folder",
-    expected="calibration.json, frames.csv, ego_motion.csv, images or videos",
-    recognises=is_folder_of_images,
-    opener="bevcli.sequences.native.folder:FolderDrive",
-    options=FolderOptions,
-    precedence=-10,
-)
+        return has_camera_folders(path)

@@ -8,12 +8,17 @@ from pathlib import Path
 
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
-from bevcli.sequences.options import FormatOptions
 
 
 @options("Input")
-class NuScenesOptions(FormatOptions):
-    """The part of a nuScenes dataset that is read."""
+class NuScenesOptions(Format):
+    """A nuScenes root, and the part of it that is read."""
+
+    name = "a nuScenes root"
+    expected = "v1.0-*/scene.json"
+    reader = "bevcli.sequences.nuscenes.sequence:NuScenesDrive"
+    annotated = True
+    precedence = 20
 
     version: str | None = option(
         default=None, help="nuScenes: dataset version, such as v1.0-mini. Default: the only one present."
@@ -30,6 +35,11 @@ class NuScenesOptions(FormatOptions):
         """With sweeps, every frame is kept unless a rate is given."""
         return self.sweeps
 
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True if a folder contains the tables of a nuScenes version."""
+        return is_nuscenes_root(path)
+
 
 def versions_in(root: Path) -> list[str]:
     """The versions whose tables a folder contains, such as "v1.0-mini" for ROOT/v1.0-mini/scene.json."""
@@ -39,14 +49,3 @@ def versions_in(root: Path) -> list[str]:
 def is_nuscenes_root(path: Path) -> bool:
     """True if a folder contains the tables of a nuScenes version."""
     return bool(versions_in(path))
-
-
-FORMAT = Format(
-    name="a nuScenes root",
-    expected="v1.0-*/scene.json",
-    recognises=is_nuscenes_root,
-    opener="bevcli.sequences.nuscenes.sequence:NuScenesDrive",
-    options=NuScenesOptions,
-    annotated=True,
-    precedence=20,
-)

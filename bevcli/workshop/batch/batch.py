@@ -12,12 +12,12 @@ from typing import Any
 from bevcli.errors import InputError, OutputError
 from bevcli.inference.load import Model, choose_device, load_model
 from bevcli.inference.options import ModelOptions
-from bevcli.options import spread
+from bevcli.options import defaults, spread
 from bevcli.recording.meshes import read_class_meshes
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.folder import folder_lock
 from bevcli.runs.options import RunOptions
-from bevcli.sequences.format import option_classes
+from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, Workers, storage
@@ -63,7 +63,7 @@ def batch(
     chosen, workers, model, run_options, recording, input_options, format_values = spread(
         options | {"out": str(out)}, *kinds
     )
-    names = {name for kind in option_classes() for name in kind.__dataclass_fields__}
+    names = {name for form in formats() for name in defaults(form)}
     if format_values.keys() - names:
         raise TypeError(f"batch() has no option {min(format_values.keys() - names)}")
     if chosen.retry_failed and not chosen.resume:

@@ -27,12 +27,12 @@ from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, hash_of_file, hash_of_values, read_text
 from bevcli.runs.options import RunOptions
-from bevcli.sequences.format import check_options, drives_in, format_of, is_drive, option_classes
+from bevcli.sequences.format import Format, check_options, drives_in, format_of, formats, is_drive
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import FormatOptions, InputOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 from bevcli.writing import user_cache, weights_folder
 
@@ -196,7 +196,8 @@ SCORE_BINS = 20  # of the histogram of a drive's scores, from 0 to 1
 Record = dict[str, Any]  # of a drive after it was run; a row of batch.parquet
 _Count = Annotated[int, Meta(ge=0, le=1 << 62)]
 _Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
-Own = TypeVar("Own", bound=FormatOptions)
+
+Own = TypeVar("Own", bound=Format)
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ class Job:
     out: str
     model: ModelOptions = field(default_factory=ModelOptions)
     source: InputOptions = field(default_factory=InputOptions)
-    own: tuple[FormatOptions, ...] = ()
+    own: tuple[Format, ...] = ()
     run: RunOptions = field(default_factory=RunOptions)
     evaluate: bool = False
     retries: int = 2
@@ -231,7 +232,7 @@ class Job:
 
     def open(self, path: Path, scene: str | None) -> Drive:
         """A drive, or a scene of it. Raises InputError."""
-        own = self.own_of(format_of(path).options)
+        own = self.own_of(format_of(path))
         return open_sequence(path, replace(self.source, scene=scene), **vars(own))
 
     def check_options(self, drives: Iterable[BatchDrive]) -> None:
@@ -265,12 +266,12 @@ class Job:
         return hash_of_values(fingerprint)
 
 
-def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
+def all_own_options(values: Mapping[str, Any]) -> tuple[Format, ...]:
     """The own options of every format, from the options of all formats by name. Relative paths become absolute."""
     absolute = {name: value.absolute() if isinstance(value, Path) else value for name, value in values.items()}
     return tuple(
         gather(kind, None, {name: absolute[name] for name in defaults(kind) if name in absolute})
-        for kind in option_classes()
+        for kind in formats()
     )
 
 

@@ -17,7 +17,7 @@ from bevcli.options import option, options, parse_pairs
 from bevcli.parsing.files import VIDEO_SUFFIXES, open_regular
 from bevcli.sequences.format import Format
 from bevcli.sequences.native import FolderOptions
-from bevcli.sequences.options import FormatOptions, InputOptions, RigOptions
+from bevcli.sequences.options import InputOptions, RigOptions
 
 if TYPE_CHECKING:
     from bevcli.frame import Drive
@@ -39,8 +39,13 @@ UnlistedFrames = Literal["empty", "unlabelled"]
 
 
 @options("Input")
-class Argoverse2Options(FormatOptions):
-    """The options of an Argoverse 2 log."""
+class Argoverse2Options(Format):
+    """An Argoverse 2 log."""
+
+    name = "an Argoverse 2 log"
+    expected = "city_SE3_egovehicle.feather"
+    reader = "bevcli.workshop.formats.argoverse2:open_log"
+    annotated = True
 
     stereo: bool = option(default=False, help="Argoverse 2: also use the two stereo cameras.")
     distorted: bool = option(
@@ -50,10 +55,65 @@ class Argoverse2Options(FormatOptions):
         default=AXLE_HEIGHT_M, help="Argoverse 2: height of the rear axle above the ground, metres.", metavar="M"
     )
 
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with a file of a log."""
+        return any((path / marker).exists() for marker in ARGOVERSE2_FILES)
+
 
 @options("Input")
-class BagOptions(RigOptions):
-    """The options of a bag."""
+class DgpScene(Format):
+    """A scene of a DGP dataset."""
+
+    name = "a DGP scene"
+    expected = "scene_*.json"
+    reader = "bevcli.workshop.formats.dgp:open_scene"
+    annotated = True
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with the file of a scene, or with the folders of one that lacks its file."""
+        return any(path.glob("scene_*.json")) or all((path / name).is_dir() for name in DGP_FOLDERS)
+
+
+@options("Input")
+class T4Dataset(Format):
+    """A T4 dataset."""
+
+    name = "a T4 dataset"
+    expected = "annotation/sample_data.json"
+    reader = "bevcli.workshop.formats.t4:open_t4"
+    annotated = True
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with a table of a T4 dataset."""
+        return any((path / "annotation" / f"{name}.json").exists() for name in T4_TABLES)
+
+
+@options("Input")
+class VideoFile(FolderOptions, Format):
+    """A drive that is a video of one camera."""
+
+    name = "a video"
+    expected = ".mp4, .mkv, .avi, .webm, .mov or .m4v"
+    reader = "bevcli.workshop.formats.video_file:open_video"
+    has_poses = False
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a video, by its name."""
+        return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+@options("Input")
+class BagOptions(RigOptions, Format):
+    """A ROS 2 bag or an MCAP file."""
+
+    name = "a ROS bag"
+    expected = ".mcap or .db3 files"
+    reader = "bevcli.workshop.formats.ros.sequence:open_bag"
+    precedence = 10
 
     topics: Mapping[str, str] = option(
         default_factory=dict,
@@ -70,6 +130,21 @@ class BagOptions(RigOptions):
         flag="--topics",
         metavar="FILE.toml",
     )
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a bag, also one of ROS 1, which its reader refuses."""
+        return is_ros_bag(path) or path.suffix == ".bag"
+
+    def open(self, path: Path, common: InputOptions) -> Drive:
+        """A bag as a drive. Raises InputError where the packages of the extra `ros` are not installed."""
+        try:
+            installed = all(map(find_spec, BAG_PACKAGES))
+        except ModuleNotFoundError:  # the package around one of them
+            installed = False
+        if not installed:
+            raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
+        return super().open(path, common)
 
 
 @options("Input")
@@ -155,56 +230,3 @@ def is_ros_bag(path: Path) -> bool:
         return False
     with open_regular(path / BAG_METADATA) as file:
         return b"rosbag2_bagfile_information" in file.read(4096)
-
-
-def open_bag(path: Path, common: InputOptions, own: BagOptions) -> Drive:
-    """A bag as a drive. Raises InputError where the packages of the extra `ros` are not installed."""
-    try:
-        installed = all(map(find_spec, BAG_PACKAGES))
-    except ModuleNotFoundError:  # the package around one of them
-        installed = False
-    if not installed:
-        raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
-    from bevcli.workshop.formats.ros import sequence
-
-    return sequence.open_bag(path, common, own)
-
-
-ARGOVERSE2 = Format(
-    name="an Argoverse 2 log",
-    expected="city_SE3_egovehicle.feather",
-    recognises=lambda path: any((path / marker).exists() for marker in ARGOVERSE2_FILES),
-    opener="bevcli.workshop.formats.argoverse2:open_log",
-    options=Argoverse2Options,
-    annotated=True,
-)
-DGP = Format(
-    name="a DGP scene",
-    expected="scene_*.json",
-    recognises=lambda path: any(path.glob("scene_*.json")) or all((path / name).is_dir() for name in DGP_FOLDERS),
-    opener="bevcli.workshop.formats.dgp:open_scene",
-    annotated=True,
-)
-ROS = Format(
-    name="a ROS bag",
-    expected=".mcap or .db3 files",
-    recognises=lambda path: is_ros_bag(path) or path.suffix == ".bag",
-    opener=open_bag,
-    options=BagOptions,
-    precedence=10,
-)
-T4 = Format(
-    name="a T4 dataset",
-    expected="annotation/sample_data.json",
-    recognises=lambda path: any((path / "annotation" / f"{name}.json").exists() for name in T4_TABLES),
-    opener="bevcli.workshop.formats.t4:open_t4",
-    annotated=True,
-)
-VIDEO = Format(
-    name="a video",
-    expected=".mp4, .mkv, .avi, .webm, .mov or .m4v",
-    recognises=lambda path: path.suffix.lower() in VIDEO_SUFFIXES and path.is_file(),
-    opener="bevcli.workshop.formats.video_file:open_video",
-    options=FolderOptions,
-    has_poses=False,
-)

@@ -19,8 +19,9 @@ from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
+from bevcli.sequences.format import Format
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
-from bevcli.sequences.options import FormatOptions, InputOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats.labels import with_track_velocities
 
 # DDAD's class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as Wheeled
@@ -272,7 +273,7 @@ def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
     return times, np.stack([pose.translation for _, pose in rows]), np.stack([pose.quaternion for _, pose in rows])
 
 
-def open_scene(path: Path, common: InputOptions, own: FormatOptions) -> ListedDrive:
+def open_scene(path: Path, common: InputOptions, own: Format) -> ListedDrive:
     """The samples of a DGP scene. Point clouds are not read, only the boxes that are annotated in them.
 
     The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.

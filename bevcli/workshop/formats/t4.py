@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from bevcli.sequences.files.boxes_file import ClassNames
+from bevcli.sequences.format import Format
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Dialect
 from bevcli.sequences.nuscenes.sequence import TableDrive
-from bevcli.sequences.options import FormatOptions, InputOptions
+from bevcli.sequences.options import InputOptions
 
 LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
 # The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
@@ -46,7 +47,7 @@ CLASS_OF_CATEGORY = {
 }
 
 
-def open_t4(path: Path, common: InputOptions, own: FormatOptions) -> TableDrive:
+def open_t4(path: Path, common: InputOptions, own: Format) -> TableDrive:
     """The keyframes of a T4 dataset.
 
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
