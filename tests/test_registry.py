@@ -79,7 +79,7 @@ def test_two_packages_with_the_same_name_are_refused(installed):
 
 def test_a_package_cannot_replace_a_format_of_bevcli(installed):
     installed(("ros", "json:loads"))
-    with pytest.raises(BevcliError, match=r'two packages register "ros": bevcli.workshop.formats:ROS and json:'):
+    with pytest.raises(BevcliError, match=r'two packages register "ros": bevcli.workshop.formats:BagOptions and json:'):
         registry.entries(GROUP)
 
 
