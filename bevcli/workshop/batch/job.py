@@ -270,8 +270,7 @@ def all_own_options(values: Mapping[str, Any]) -> tuple[Format, ...]:
     """The own options of every format, from the options of all formats by name. Relative paths become absolute."""
     absolute = {name: value.absolute() if isinstance(value, Path) else value for name, value in values.items()}
     return tuple(
-        gather(kind, None, {name: absolute[name] for name in defaults(kind) if name in absolute})
-        for kind in formats()
+        gather(kind, None, {name: absolute[name] for name in defaults(kind) if name in absolute}) for kind in formats()
     )
 
 
