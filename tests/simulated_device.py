@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from bevcli.model.deformable_attention import GridSampling, level_sizes, sampling_locations
+from bevcli.model.deformable_attention import GridSampling, sampling_locations
 from bevcli.model.deformable_convolution import predicted_deformable_convolution
 
 CPU = torch.device("cpu")
@@ -302,7 +302,7 @@ def sample_hits_plainly(values, reference_points, offsets, logits, query, predic
     offsets, logits = (each.transpose(1, 2)[query, prediction] for each in (offsets, logits))  # (M, heads, L, P, …)
     weights = logits.flatten(-2).softmax(-1).view_as(logits)
     points = reference_points.repeat(1, logits.shape[-1] // reference_points.shape[1], 1)
-    locations = sampling_locations(points[:, None, None], offsets, level_sizes(level_shapes, CPU))
+    locations = sampling_locations(points[:, None, None], offsets, GridSampling().level_sizes(level_shapes, CPU))
     return GridSampling()(values, level_shapes, locations, weights, [int(count) for count in counts])
 
 

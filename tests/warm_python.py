@@ -18,7 +18,7 @@ from bevcli.viewer.recording_file import CHECK_ENVIRONMENT
 # A child ends as `python -P -c CODE …` does, but without the interpreter's own end.
 SERVER = """
 import gc, json, os, sys, traceback
-import rerun.chunk, trimesh, bevcli.recording.meshes
+import rerun.chunk, bevcli.recording.mesh_file
 
 def end_of(code):
     try:

@@ -5,7 +5,7 @@ measured clockwise from -y: yaw = -angle - pi/2, with yaw counter-clockwise from
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -152,14 +152,15 @@ class DecoderLayer(nn.Module):
         config: DecoderConfig,
         channels: int,
         bev_shape: tuple[int, int],
-        attention: Callable[[int, int, int, int], DeformableAttention] = DeformableAttention,
+        attention: type[DeformableAttention] = DeformableAttention,
+        attention_levels: int = 1,
     ) -> None:
-        """Random weights. attention: makes the cross-attention from channels, query channels, heads and points."""
+        """Random weights. attention: class of the cross-attention, which has weights for so many feature levels."""
         super().__init__()
         self.level_shapes = (bev_shape,)
         heads, dropout = config.attention_heads, config.dropout
         self.self_attention = nn.MultiheadAttention(channels, heads, dropout, batch_first=True)
-        self.cross_attention = attention(channels, channels, heads, config.points)
+        self.cross_attention = attention(channels, channels, heads, config.points, attention_levels)
         self.feed_forward = FeedForward(channels, config.feed_forward_width, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.dropout = nn.Dropout(dropout)

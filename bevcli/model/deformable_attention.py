@@ -117,7 +117,7 @@ class DeformableAttention(nn.Module):
         """Offsets and logits of the weights of the samples of queries (..., query_channels).
 
         Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; logits are
-        (..., heads, maps, L, P), see `softmax_weights`.
+        (..., heads, maps, L, P), see `GridSampling.weights`.
         """
         offsets, logits = self.sampling_offsets(query), self.attention_weights(query)
         return offsets.float().unflatten(-1, (*self.shape, 2)), logits.unflatten(-1, self.shape)
@@ -153,34 +153,33 @@ class DeformableAttention(nn.Module):
         return self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))
 
 
-def softmax_weights(logits: Tensor) -> Tensor:
-    """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
-    return logits.flatten(-2).softmax(-1).view_as(logits)
-
-
-def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
-    """(L, 2) float32 width and height of each level, on a device."""
-    sizes = torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32)
-    return upload(sizes, device)
-
-
 class GridSampling(nn.Module):
     """Weighted sums of bilinearly sampled values, by `grid_sample`, one map after another.
 
     Attributes:
         sample_hits: a kernel that an attention calls in place of `forward`, without tables of locations and weights.
-        weights: `softmax_weights`, or the same faster.
-        level_sizes: the function, or one that keeps its results.
+        kept_sizes: results of `level_sizes`, for inference, where CUDA graphs hold their addresses; None keeps none.
     """
 
-    def __init__(
-        self,
-        sample_hits: SampleHits | None = None,
-        weights: Callable[[Tensor], Tensor] = softmax_weights,
-        level_sizes: Callable[[LevelShapes, torch.device], Tensor] = level_sizes,
-    ) -> None:
+    def __init__(self, *, keeps_sizes: bool = False) -> None:
         super().__init__()
-        self.sample_hits, self.weights, self.level_sizes = sample_hits, weights, level_sizes
+        self.sample_hits: SampleHits | None = None
+        self.kept_sizes: dict[tuple[LevelShapes, torch.device], Tensor] | None = {} if keeps_sizes else None
+
+    def weights(self, logits: Tensor) -> Tensor:
+        """The weights, whose sum over levels and points is 1, of logits (..., L, P)."""
+        return logits.flatten(-2).softmax(-1).view_as(logits)
+
+    def level_sizes(self, level_shapes: LevelShapes, device: torch.device) -> Tensor:
+        """(L, 2) float32 width and height of each level, on a device."""
+        kept = self.kept_sizes
+        if kept is not None and (level_shapes, device) in kept:
+            return kept[level_shapes, device]
+        sizes = torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32)
+        sizes = upload(sizes, device)
+        if kept is not None:
+            kept[level_shapes, device] = sizes
+        return sizes
 
     def forward(
         self,
@@ -231,7 +230,7 @@ def sampling_locations(reference_points: Tensor, offsets: Tensor, sizes: Tensor)
     Args:
         reference_points: (..., L or 1, P or 1, 2) x and y, 0 to 1 over a map; up to 1e6 behind a camera.
         offsets: (..., L, P, 2) x and y in cells of each level.
-        sizes: (L, 2) float32 width and height of each level, see `level_sizes`.
+        sizes: (L, 2) float32 width and height of each level, see `GridSampling.level_sizes`.
     """
     # Broadcasting over a last axis of two elements takes several times as long as dividing full tensors.
     sizes = sizes[:, None].expand(offsets.shape[-3:]).contiguous()  # (L, P, 2)

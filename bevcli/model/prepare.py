@@ -53,14 +53,12 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     network.to(device)
     choose.fold_batch_norms(network, device)
     choose.choose_kernels(network, device)
-    kinds: dict[type[nn.Module], type[nn.Module]] = CPU_KINDS
+    kinds: choose.Kinds = CPU_KINDS
     if device.type != "cpu":
-        from bevcli.model.kernels import gpu
+        from bevcli.model.kernels import gpu  # with what only a GPU needs: CUDA graphs, a compiled loop for hits
 
         kinds = gpu.gpu_kinds(device)
-    for name, module in list(network.named_modules()):
-        if kind := kinds.get(type(module)):
-            network.set_submodule(name, choose.in_place_of(module, kind))
+    choose.change_classes(network, kinds)
     if device.type != "cpu":
         gpu.finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
@@ -109,9 +107,9 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     Started any earlier, the thread would slow down the copying of the model.
     """
     loaded = threading.Event()
-    for name, module in list(network.named_modules()):
+    for module in network.modules():
         if type(module) is ResNet:  # of a subclass, another stem may need negative maxima
-            network.set_submodule(f"{name}.pool", choose.in_place_of(module.pool, CompiledPool, loaded=loaded))
+            choose.change_classes(module, {nn.MaxPool2d: CompiledPool}, loaded=loaded)
     loading = threading.Thread(target=load_compiled, args=(dtype, loaded), name="load-compiled", daemon=True)
     loading.start()
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
@@ -179,7 +177,7 @@ class TokensInBlocks(ImageTokens):
 
 
 # The classes that take the place of plain ones on a CPU, beside those of `choose_kernels`.
-CPU_KINDS: dict[type[nn.Module], type[nn.Module]] = {
+CPU_KINDS: choose.Kinds = {
     Pillars: choose.KeptPillars,
     CalibrationEmbedding: choose.KeptCalibrationEmbedding,
     EfficientNetLite: EfficientNetLiteByImage,

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.backbone import Backbone, Stage
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,6 @@ class Bottleneck(nn.Module):
         self.bn1 = nn.BatchNorm2d(channels)
         self.conv2: nn.Module
         if deformable:
-            from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-
             self.conv2 = ModulatedDeformableConvolution(channels, channels, stride2)
         else:
             self.conv2 = nn.Conv2d(channels, channels, 3, stride2, padding=1, bias=False)

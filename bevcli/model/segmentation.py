@@ -4,7 +4,7 @@ The head's location decoder gives thing queries a place, and its mask decoder tu
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +121,8 @@ class LocationDecoder(nn.Module):
         *,
         branch_layers: int = 2,
         refines_extent: bool = False,
-        attention: Callable[[int, int, int, int], DeformableAttention] = DeformableAttention,
+        attention: type[DeformableAttention] = DeformableAttention,
+        attention_levels: int = 1,
     ) -> None:
         """Random weights.
 
@@ -130,14 +131,16 @@ class LocationDecoder(nn.Module):
             branch_layers: linear layers of a location branch.
             refines_extent: whether a layer refines centre and extent of the layer before, and samples inside them;
                 otherwise it refines the centre only.
-            attention: see `DecoderLayer`.
+            attention, attention_levels: see `DecoderLayer`.
         """
         super().__init__()
         self.refines_extent = refines_extent
         # The first half of the channels is the position of a query, the second half its content.
         self.query_embedding = nn.Parameter(torch.randn(config.queries, 2 * channels))
         self.reference_points = nn.Linear(channels, 2)
-        self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape, attention) for _ in range(config.layers))
+        self.layers = nn.ModuleList(
+            DecoderLayer(config, channels, bev_shape, attention, attention_levels) for _ in range(config.layers)
+        )
         self.location_branches = nn.ModuleList(branch(channels, branch_layers, 4) for _ in range(config.layers))
 
     def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ in float32). `bev` is a flat image of the bev frame in metres: x to the right, -
 longitudes, where the drive states its place on Earth. Lines on the ground are directly below `world` and `bev`, by
 their kind (`line_kinds`), such as "bev/map_lines".
 
-Colours are RGB, 0 to 255. rerun takes half a second to import, and is imported only for paths that need its rules.
+Colours are RGB, 0 to 255.
 """
 
 import colorsys
@@ -15,6 +15,7 @@ from struct import Struct
 
 import cv2
 import numpy as np
+import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.object_classes import Color, ObjectClass
@@ -139,8 +140,6 @@ def class_mesh(class_name: str) -> str:
 
 def _escaped(name: str) -> str:
     """A name as one part of a path, by rerun's rules."""
-    import rerun as rr
-
     return rr.escape_entity_path_part(name)
 
 

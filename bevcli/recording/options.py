@@ -1,6 +1,7 @@
 """RecordingOptions: how much a recording holds, and how it is drawn."""
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -29,12 +30,8 @@ def require_av(purpose: str) -> None:
 
 
 def has_av() -> bool:
-    """True if PyAV can be imported."""
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        return False
-    return True
+    """True if PyAV is installed."""
+    return find_spec("av") is not None
 
 
 @options("Recording")

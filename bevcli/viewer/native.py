@@ -10,25 +10,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 import rerun_cli  # type: ignore[import-untyped]
+from rerun.experimental import ViewerClient  # the only client that takes screenshots
 
 from bevcli.errors import InputError, OutputError, WaitError
 from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
 from bevcli.writing import write_whole
 
-if TYPE_CHECKING:
-    from rerun.experimental import ViewerClient
-
 LOOPBACK = "127.0.0.1"
 PORTS_TRIED = 20
-Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
 WHOLE_TIMEOUT_S = 180.0
 ENDINGS = (".png", ".jpg", ".jpeg")
@@ -83,7 +80,7 @@ def show_window(recording: Path, frame: int | None = None) -> bool:
     try:
         if frame is not None:
             client = _connect(process, int(port))
-            _go_to(recording, client, _wait(process, lambda: _opened(client), NO_DRIVER), frame)
+            _go_to(recording, client, _opened(process, client, NO_DRIVER), frame)
         return process.wait() == 0
     finally:
         stop(process)
@@ -122,8 +119,7 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
     try:
         client = _connect(process, port)
         client.open(str(recording))
-        state = _wait(process, lambda: _opened(client), "the viewer cannot open the recording")
-        _go_to(recording, client, state, frame)
+        _go_to(recording, client, _opened(process, client, "the viewer cannot open the recording"), frame)
         time.sleep(SETTLE_S)
         _write(image, client.take_screenshot())
         return tuple(view.name for view in client.get_state().views)
@@ -137,24 +133,21 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
 
 
 def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
-    from rerun.experimental import ViewerClient  # costs a run's start a tenth of a second
-
-    def answer() -> ViewerClient | None:
-        try:
+    for _ in _attempts(process):
+        with contextlib.suppress(ConnectionError):
             client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
             client.take_screenshot()  # without a driver, the viewer answers other calls until it first draws, and ends
-        except ConnectionError:
-            return None
-        return client
-
-    return _wait(process, answer, NO_DRIVER)
+            return client
+    raise OutputError(NO_DRIVER)
 
 
-def _opened(client: ViewerClient) -> Any:
-    """The state of the viewer once it shows a recording; None before."""
-    state = client.get_state()
-    ready = state.recordings and state.recordings[0].timelines and state.views and not state.loading
-    return state if ready else None
+def _opened(process: subprocess.Popen[bytes], client: ViewerClient, failure: str) -> Any:
+    """The state of the viewer once it shows a recording. failure: text of the OutputError if it never does."""
+    for _ in _attempts(process):
+        state = client.get_state()
+        if state.recordings and state.recordings[0].timelines and state.views and not state.loading:
+            return state
+    raise OutputError(failure)
 
 
 def _go_to(recording: Path, client: ViewerClient, state: Any, frame: int | None) -> None:
@@ -170,14 +163,12 @@ def _go_to(recording: Path, client: ViewerClient, state: Any, frame: int | None)
     client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
 
 
-def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None], failure: str) -> Answer:
+def _attempts(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Yields about ten times a second while the viewer runs, for START_TIMEOUT_S."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline and process.poll() is None:
-        result = attempt()
-        if result is not None:
-            return result
+        yield
         time.sleep(0.1)
-    raise OutputError(failure)
 
 
 def _write(image: Path, png: bytes) -> None:

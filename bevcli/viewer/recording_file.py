@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
@@ -118,7 +117,8 @@ def recording_in(path: Path) -> Path:
 def _check(file: Path, path: Path) -> None:
     """Raises InputError, which names `path`, unless all of a file can be read."""
     memory = CHECK_MEMORY + 4 * file.stat().st_size
-    done = _run(path, partial(run_python, CHECK, [file], memory))
+    with _limited(path) as (seconds, environment):
+        done = run_python(CHECK, [file], memory, seconds, environment)
     if done.returncode == 0 and CUT_SHORT in done.stderr:
         raise InputError(f"{path}: the recording cannot be read: it is damaged (rerun does not read all of it)")
     if done.returncode:
@@ -130,15 +130,16 @@ def _check(file: Path, path: Path) -> None:
 def _repair(path: Path, copy: Path) -> None:
     """Copies all messages of a recording that can be read. Raises InputError if this takes too long."""
     command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
-    _run(path, partial(run_program, command))
+    with _limited(path) as (seconds, environment):
+        run_program(command, seconds, environment)
 
 
-def _run(path: Path, run: Callable[..., subprocess.CompletedProcess[bytes]]) -> subprocess.CompletedProcess[bytes]:
-    """Run a process that reads a recording. run: takes its time limit and its environment."""
+@contextmanager
+def _limited(path: Path) -> Iterator[tuple[float, dict[str, str]]]:
+    """The time limit and the environment of a process that reads a recording. Raises InputError after that time."""
     seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
-    environment = {**viewer_environment(), **CHECK_ENVIRONMENT, "RUST_BACKTRACE": "0"}
     try:
-        return run(seconds=seconds, environment=environment)
+        yield seconds, {**viewer_environment(), **CHECK_ENVIRONMENT, "RUST_BACKTRACE": "0"}
     except subprocess.TimeoutExpired:
         raise InputError(f"{path}: the recording cannot be read within {seconds:.0f} s: it is damaged") from None
 

@@ -141,16 +141,17 @@ def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, netw
 def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
     both = Barrier(2, timeout=60)
 
-    def write(path):
-        shutil.copy(small_file, path)
-        both.wait()
-        return "drive"
+    def make(file):
+        with file.written() as path:
+            shutil.copy(small_file, path)
+            both.wait()
+        return file.opened(OnnxRuntimeEngine, "drive").calibrated_with
 
+    file = CachedFile("same")
     with ThreadPoolExecutor(2) as pool:
-        made = [pool.submit(CachedFile("same").get, OnnxRuntimeEngine.open, write) for _ in range(2)]
-        assert {task.result()[1] for task in made} == {"drive"}
-    assert CachedFile("same").load(OnnxRuntimeEngine.open) is not None
-    assert not list(CachedFile("same").path.parent.glob(".unfinished*"))
+        assert set(pool.map(make, [file, file])) == {"drive"}
+    assert file.load(OnnxRuntimeEngine) is not None
+    assert not list(file.path.parent.glob(".unfinished*"))
 
 
 def test_probes_need_torch(drive, network):

@@ -174,13 +174,13 @@ def compare_hits(shape: AttentionShape, counts: Sequence[int]) -> None:
 
 def compare_stems() -> None:
     """Compare the stems of a ResNet, for even, odd and no images; the numbers are NaN in the same places."""
-    from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
+    from bevcli.model.kernels.choose import change_classes, fold_batch_norms
     from bevcli.model.kernels.triton_convolution import FusedStem
 
     torch.manual_seed(0)
     backbone = ResNetConfig((1, 1, 1, 1), output_stages=(1,), width=12).build().eval().requires_grad_(False)
     backbone.bn1.bias.normal_()
-    fused = in_place_of(copy.deepcopy(backbone), FusedStem)
+    change_classes(fused := copy.deepcopy(backbone), {ResNet: FusedStem})
     fold_batch_norms(fused, torch.device("meta"))
     for batch, height, width in ((2, 32, 64), (1, 33, 47), (1, 2, 2), (0, 32, 32)):
         images = torch.randn(batch, 3, height, width)

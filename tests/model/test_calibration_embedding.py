@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokensConfig, ray_features
-from bevcli.model.kernels.choose import KeptCalibrationEmbedding, in_place_of
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, change_classes
 from bevcli.workshop.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)
@@ -91,7 +92,8 @@ def test_a_prepared_embedding_follows_rig_and_image_size():
     torch.manual_seed(0)
     embedding = CalibrationEmbedding(8, 1.84).requires_grad_(False)
     torch.nn.init.normal_(embedding.layers[-1].weight, std=0.1)
-    prepared = in_place_of(embedding, KeptCalibrationEmbedding)
+    prepared = copy.deepcopy(embedding)
+    change_classes(prepared, {CalibrationEmbedding: KeptCalibrationEmbedding})
     rig = small_inputs().image_from_bev
     moved = rig.clone()
     moved[:, 0, 0, 3] += 5.0

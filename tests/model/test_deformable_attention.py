@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes, sampling_locations
-from bevcli.model.kernels.choose import softmax_of_few
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, sampling_locations
 from bevcli.model.kernels.compiled import CompiledSampling, Hits, sample_hits
 from bevcli.model.kernels.loops import softmax_of_groups
+from bevcli.model.kernels.training import LearnedSampling
 from bevcli.workshop.benchmark.versions import PaddedSampling
 
 TWO_LEVELS = ((4, 6), (2, 3))
@@ -59,7 +59,8 @@ def test_gradients_reach_values_locations_and_weights() -> None:
 
 def test_offsets_are_cells_of_their_own_level() -> None:
     offsets = torch.ones(1, 2, 1, 2)
-    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, level_sizes(TWO_LEVELS, offsets.device))
+    sizes = sample.level_sizes(TWO_LEVELS, offsets.device)
+    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, sizes)
     expected = [[0.5 + 1 / 6, 0.5 + 1 / 4], [0.5 + 1 / 3, 0.5 + 1 / 2]]
     torch.testing.assert_close(locations[0, :, 0], torch.tensor(expected))
 
@@ -129,7 +130,7 @@ def test_hits_are_sampled_as_by_their_locations_and_weights(depth):
     offsets = 3 * torch.randn(*logits.shape, 2, generator=random)
     weights = logits.flatten(-2).softmax(-1).view_as(logits)
     found = [each[cells, :, hits.prediction] for each in (offsets, weights)]
-    locations = sampling_locations(points[:, None, None], found[0], level_sizes(shapes, offsets.device))
+    locations = sampling_locations(points[:, None, None], found[0], sample.level_sizes(shapes, offsets.device))
     expected = COMPILED(values, shapes, locations, found[1], counts)
     torch.testing.assert_close(sample_hits(values, shapes, hits, offsets, logits), expected)
     logits[cells[3], :, hits.prediction[3]] = torch.nan
@@ -142,7 +143,7 @@ def test_hits_are_sampled_as_by_their_locations_and_weights(depth):
 def test_compiled_loops_have_the_gradients_of_the_plain_module(depth, threads, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     gradients = []
-    for sampling in (PLAIN, COMPILED):
+    for sampling in (PLAIN, LearnedSampling()):
         values, shapes, locations, weights, counts = case(depth)
         learned = [tensor.requires_grad_() for tensor in (values, locations, weights)]
         result = sampling(values, shapes, locations, weights, counts)
@@ -201,7 +202,7 @@ def test_the_gpu_equals_the_cpu(dtype):
 @pytest.mark.parametrize("elements", [1, 4, 8, 16])
 def test_the_softmax_of_few_elements_equals_that_of_pytorch(elements):
     logits = 200 * torch.randn(50, 3, elements, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(softmax_of_few(logits[:, :, None])[:, :, 0], logits.softmax(-1))
+    torch.testing.assert_close(COMPILED.weights(logits[:, :, None])[:, :, 0], logits.softmax(-1))
 
 
 @pytest.mark.parametrize("count", [4, 6, 8, 32])

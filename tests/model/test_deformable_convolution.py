@@ -10,8 +10,8 @@ from torch import nn
 
 import bevcli.model.kernels.compiled as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, modulated_deformable_convolution
-from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
+from bevcli.model.kernels.training import choose_training_kernels
 
 
 @pytest.mark.parametrize("stride", [1, 2])
@@ -123,7 +123,7 @@ def test_results_and_gradients_on_a_gpu_equal_the_cpu(stride, dtype):
         layer = plain_layer(stride).to(dtype).to(device, torch.float32 if device.type == "cpu" else dtype)
         x = image().to(dtype).to(layer.weight)
         layer.weight.requires_grad = True
-        choose_kernels(layers := nn.Sequential(layer), device, gradients=True)
+        choose_training_kernels(layers := nn.Sequential(layer), device)
         result = layers(x.requires_grad_())
         gradients = torch.autograd.grad(result.square().sum(), (x, layer.weight))
         found.append([each.float().cpu() for each in (result, *gradients)])

@@ -13,7 +13,7 @@ from torch import nn
 from bevcli.model import prepare
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
-from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
+from bevcli.model.kernels.choose import change_classes, fold_batch_norms
 from bevcli.model.prepare import TokensInBlocks, prepare_for_inference
 from bevcli.model.step import ModelOutputs
 from bevcli.workshop.benchmark.versions import textbook_version
@@ -50,7 +50,7 @@ def test_outputs_are_the_models(model, version):
 def test_image_tokens_in_blocks_are_the_same(dtype, camera_index, monkeypatch):
     monkeypatch.setattr(prepare, "TOKENS_OF_A_BLOCK", 7)
     plain = ImageTokens(cameras=2, channels=8, config=ImageTokensConfig(level_embeddings=3))
-    blocks = in_place_of(plain, TokensInBlocks)
+    change_classes(blocks := copy.deepcopy(plain), {ImageTokens: TokensInBlocks})
     random = torch.Generator().manual_seed(0)
     maps = [torch.randn(camera_index.numel(), 8, *size, generator=random).to(dtype) for size in ((5, 4), (2, 3))]
     with torch.inference_mode():

@@ -14,7 +14,7 @@ from bevcli.model.backbone import Stage
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.encoder import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
-from bevcli.model.kernels.choose import fold_batch_norms, in_place_of
+from bevcli.model.kernels.choose import change_classes, fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import (
     FusedBlock,
@@ -144,7 +144,7 @@ def test_layers_that_predict_positions_are_not_rounded():
 @pytest.mark.parametrize("size", [(8, 12), (7, 5), (1, 1)])
 def test_a_compiled_pool_and_a_relu_equal_the_plain_ones(size):
     plain, loaded = nn.MaxPool2d(3, stride=2, padding=1), threading.Event()
-    compiled = in_place_of(plain, CompiledPool, loaded=loaded)
+    change_classes(compiled := copy.deepcopy(plain), {nn.MaxPool2d: CompiledPool}, loaded=loaded)
     for dtype in (torch.float32, torch.bfloat16, torch.float16):
         x = torch.randn(2, 24, *size).to(dtype)
         expected = plain(x.float()).relu().to(dtype)

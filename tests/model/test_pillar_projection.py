@@ -12,7 +12,7 @@ from bevcli.config import load_config
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import SpatialCrossAttention
-from bevcli.model.kernels.choose import in_place_of
+from bevcli.model.kernels.choose import change_classes
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.kernels.gpu import PaddedPillars, hits_on_cpu
 from bevcli.model.pillar_projection import PillarHits, PillarProjection, Pillars, find_hits, project_pillars
@@ -135,7 +135,7 @@ def test_added_hits_change_no_bit_of_the_attention():
 
 def test_a_rig_keeps_its_sizes_while_it_moves_a_little():
     pillars = Pillars(GRID)
-    pillars = in_place_of(pillars, PaddedPillars, points_on_cpu=pillars.points, sizes={})
+    change_classes(pillars, {Pillars: PaddedPillars}, points_on_cpu=pillars.points, sizes={})
     matrices, has_image = projections(1, 6), torch.ones(1, 6, dtype=torch.bool)
     sizes = set()
     for step in range(5):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bevcli.recording import meshes
+from bevcli.recording import mesh_file, meshes
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def in_this_process(monkeypatch):
         output = io.BytesIO()
         with monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", SimpleNamespace(buffer=output))
-            error = meshes.write_parts(*arguments)
+            error = mesh_file.write_parts(*arguments)
         return subprocess.CompletedProcess(arguments, int(bool(error)), output.getvalue(), (error or "").encode())
 
     monkeypatch.setattr(meshes, "run_python", read)

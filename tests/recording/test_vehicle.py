@@ -13,9 +13,10 @@ from recorded_drive import record
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import read_bytes
-from bevcli.recording import entities, meshes
+from bevcli.recording import entities, mesh_file, meshes
 from bevcli.recording.entities import EGO_COLOR
-from bevcli.recording.meshes import load_vehicle, read_parts
+from bevcli.recording.mesh_file import read_parts
+from bevcli.recording.meshes import load_vehicle
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import default_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
@@ -134,8 +135,8 @@ def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, na
         path.write_text("newmtl paint\nKd 1 0 0\n")
     os.mkfifo(folder / "pipe.mtl")
     (folder / "car.obj").write_text(TRIANGLE.format(name))
-    monkeypatch.setattr(meshes, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
-    ((_, _, faces, _),) = read_parts(folder / "car.obj")  # a part that is missing has no colour
+    monkeypatch.setattr(mesh_file, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
+    ((_, _, faces, _),) = read_parts(folder / "car.obj", RED)  # a part that is missing has no colour
     assert faces.tolist() == [[0, 1, 2]]
     assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")
 

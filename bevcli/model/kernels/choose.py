@@ -4,67 +4,60 @@ The attentions of the encoder run one kernel for all hits, without tables of loc
 calibration, poses and sizes keep the result of the last call.
 """
 
-from functools import cache
+from collections.abc import Mapping
 from importlib.util import find_spec
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-from bevcli.model.deformable_attention import DeformableAttention, GridSampling, SampleHits, level_sizes
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, SampleHits
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.image_tokens import CalibrationEmbedding
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
 
-VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
-Kind = TypeVar("Kind", bound=nn.Module)
-Kinds = dict[type[nn.Module], type[nn.Module]]
+Kinds = Mapping[type[nn.Module], type[nn.Module]]
 BY_HITS = (TemporalSelfAttention, SpatialCrossAttention)
 
 
-def in_place_of(plain: nn.Module, kind: type[Kind], **attributes: Any) -> Kind:
-    """A module of another class, mostly a faster subclass, with the parameters, parts and settings of the plain one."""
-    fast = kind.__new__(kind)
-    vars(fast).update(vars(plain), **attributes)
-    return fast
+def change_classes(model: nn.Module, classes: Kinds, **attributes: Any) -> None:
+    """Makes modules of exactly these classes ones of others, in place, mostly of faster subclasses.
+
+    No constructor runs: a module keeps its parameters, parts and settings. attributes: that the other classes need too.
+    """
+    for module in model.modules():
+        if type(module) in classes:
+            module.__class__ = classes[type(module)]
+            vars(module).update(attributes)
 
 
-def choose_kernels(model: nn.Module, device: torch.device, *, gradients: bool = False) -> None:
+def choose_kernels(model: nn.Module, device: torch.device) -> None:
     """Gives a model, in place, the memory layout and the deformable operations that are fastest on a device.
 
-    model: not itself one of the operations. gradients: whether the model is trained; then only kernels with gradients
-    are used.
+    They have no gradients; `choose_training_kernels` chooses those of a training.
     """
     if isinstance(model, Network):
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    functions: dict[str, Any] = {}
-    if not gradients:
-        functions["level_sizes"] = cache(level_sizes)  # CUDA graphs hold the addresses of the tables
-        functions |= {"weights": softmax_of_few} if device.type == "cpu" else {}
     sampling: type[GridSampling] = GridSampling
     kernel: SampleHits | None = None
     if device.type == "cpu":
         sampling, kernel = CompiledSampling, sample_hits
     elif has_triton(device):
-        from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-        from bevcli.model.kernels import triton_attention, triton_convolution  # only where Triton is installed
-
-        sampling, kernel = triton_attention.TritonSampling, triton_attention.sample_hits
-        for name, module in list(model.named_modules()):
-            if isinstance(module, ModulatedDeformableConvolution):
-                model.set_submodule(name, in_place_of(module, triton_convolution.TritonDeformableConvolution))
+        attention, convolution = triton_kernels()
+        sampling, kernel = attention.TritonSampling, attention.sample_hits
+        change_classes(model, {ModulatedDeformableConvolution: convolution.TritonDeformableConvolution})
     attentions = [module for module in model.modules() if isinstance(module, DeformableAttention)]
-    for attention in attentions:
-        attention.sampling = sampling(**functions)
-    if not gradients and kernel is not None:
-        # Those with many queries; on a GPU all, where each kernel of its own takes time to launch.
-        encoder = [part.attention for part in model.modules() if isinstance(part, BY_HITS)]
-        for attention in encoder if device.type == "cpu" else attentions:
-            attention.sampling.sample_hits = kernel
+    for module in attentions:
+        module.sampling = sampling(keeps_sizes=True)
+    # Those with many queries; on a GPU all, where each kernel of its own takes time to launch.
+    encoder = [part.attention for part in model.modules() if isinstance(part, BY_HITS)]
+    for module in encoder if device.type == "cpu" else attentions:
+        module.sampling.sample_hits = kernel
 
 
 def has_triton(device: torch.device) -> bool:
@@ -72,20 +65,18 @@ def has_triton(device: torch.device) -> bool:
     return device.type == "cuda" and find_spec("triton") is not None
 
 
-def softmax_of_few(logits: Tensor) -> Tensor:
-    """As `softmax_weights`. On a CPU, PyTorch's softmax takes ten times as long for 4 or 8 samples."""
-    flat = logits.flatten(-2)
-    if flat.shape[-1] >= VECTORISED:
-        return flat.softmax(-1).view_as(logits)
-    exponentials = (flat - flat.amax(-1, keepdim=True)).exp_()
-    return exponentials.div_(exponentials.sum(-1, keepdim=True)).view_as(logits)
+def triton_kernels() -> tuple[Any, Any]:
+    """The modules of kernels for attention and for convolution. They need Triton."""
+    from bevcli.model.kernels import triton_attention, triton_convolution
+
+    return triton_attention, triton_convolution
 
 
 def fold_batch_norms(model: nn.Module, device: torch.device) -> None:
     """Folds batch norms into the convolutions before them, in place, for inference on a device: see `Backbone`."""
     for parent in list(model.modules()):
         for name, norm_name in _batch_norms(parent):
-            convolution, norm = (parent.get_submodule(each) for each in (name, norm_name))
+            convolution, norm = map(parent.get_submodule, (name, norm_name))
             if type(norm) is not nn.BatchNorm2d or norm.running_mean is None or norm.running_var is None:
                 continue
             if type(convolution) is not nn.Conv2d and not getattr(convolution, "folds_batch_norm", False):
@@ -104,8 +95,8 @@ def _batch_norms(parent: nn.Module) -> list[tuple[str, str]]:
     children = [name for name, _ in parent.named_children()]
     if isinstance(parent, nn.Sequential) and type(parent).forward is nn.Sequential.forward:
         return list(pairwise(children))
-    stated = getattr(parent, "batch_norms", {}).items()
-    return [(name, norm) for name, norm in stated if name in children and norm in children]
+    pairs = getattr(parent, "batch_norms", {}).items()
+    return [(name, norm) for name, norm in pairs if name in children and norm in children]
 
 
 class LastCall(nn.Module):

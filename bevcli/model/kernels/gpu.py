@@ -16,10 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.jit import njit
 from bevcli.model import segmentation, upload
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
-from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton, in_place_of
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, change_classes, has_triton, triton_kernels
 from bevcli.model.kernels.compiled import in_threads
 from bevcli.model.kernels.rounding import rounded_products
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
@@ -43,9 +44,7 @@ def gpu_kinds(device: torch.device) -> dict[type[nn.Module], type[nn.Module]]:
         }
         kinds |= {Bottleneck: FusedBottleneck} if torch.version.hip is None else {}  # cuDNN is NVIDIA's
     if has_triton(device):
-        from bevcli.model.kernels.triton_convolution import FusedStem  # only where Triton is installed
-
-        kinds |= {ResNet: FusedStem}
+        kinds |= {ResNet: triton_kernels()[1].FusedStem}
     return kinds
 
 
@@ -158,11 +157,9 @@ class PillarsOfCpu(Pillars):
 
 def find_hits_on_cpu(network: nn.Module, device: torch.device) -> None:
     """Lets the CPU find the hits of a network that is trained on a GPU, in place. Nothing changes on a CPU."""
-    if device.type == "cpu":
-        return
-    for name, module in list(network.named_modules()):
+    for module in network.modules() if device.type != "cpu" else ():
         if type(module) is Pillars:
-            network.set_submodule(name, in_place_of(module, PillarsOfCpu, points_on_cpu=module.points.cpu()))
+            change_classes(module, {Pillars: PillarsOfCpu}, points_on_cpu=module.points.cpu())
 
 
 class PaddedPillars(PillarsOfCpu):
@@ -190,8 +187,6 @@ def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, i
 
     points: (Y·X, Z, 3) on the CPU; other arguments as for `project_pillars`.
     """
-    from bevcli.model.kernels.other_loops import find_hits  # loads the compiler
-
     batch, cameras = has_image.shape
     (total, heights, _), images = points.shape, batch * cameras
     cells = np.empty((images, total), dtype=np.int64)
@@ -212,6 +207,34 @@ def hits_on_cpu(image_from_bev: Tensor, points: Tensor, image_size: tuple[int, i
         hits_per_camera=tuple(counts.tolist()),
         cameras_per_cell=torch.from_numpy(np.bincount(cell, minlength=batch * total)),
     )
+
+
+@njit(nogil=True, error_model="numpy")
+def find_hits(images_from_bev, points, has_image, image_size, min_depth, cells, reference_points, counts, begin, end):  # type: ignore[no-untyped-def]
+    """Writes the cells that cameras begin to end - 1 see, and the points of their pillars, in the order of the cells.
+
+    images_from_bev: (G, 4, 4) float32. points: (Y·X, Z, 3) float32. has_image: (G,) bool. image_size: (2,) float32
+    height, width. cells: (G, Y·X) int64. reference_points: (G, Y·X, Z, 2) float32. counts: (G,) int64, of the hits.
+    """
+    zero, one, height, width = np.float32(0), np.float32(1), image_size[0], image_size[1]
+    for camera in range(begin, end):
+        matrix, count = images_from_bev[camera], 0
+        for cell in range(len(points) if has_image[camera] else 0):
+            is_seen = False
+            for point in range(points.shape[1]):
+                x, y, z = points[cell, point, 0], points[cell, point, 1], points[cell, point, 2]
+                u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+                v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+                depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+                divisor = max(depth, min_depth)
+                column, row = u / divisor / width, v / divisor / height
+                reference_points[camera, count, point, 0], reference_points[camera, count, point, 1] = column, row
+                inside = (column > zero) & (column < one) & (row > zero) & (row < one)
+                is_seen |= inside & (depth > min_depth)
+            if is_seen:
+                cells[camera, count] = cell
+                count += 1
+        counts[camera] = count
 
 
 def _roomy(count: int) -> int:

@@ -9,12 +9,12 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -44,6 +44,7 @@ from bevcli.workshop.engines.export_onnx import (
     calibration_images,
     check_size,
     export_onnx,
+    imported,
     quantize,
     require,
 )
@@ -56,7 +57,6 @@ KEY_DIGITS = 20
 UNUSED_S = 90 * 24 * 3600.0
 CALIBRATION_FRAMES = 16
 ONCE = "once for these weights, number of cameras and image size"
-Open = Callable[[Path], ExportedModel]
 
 
 class Engine(LoadedFile):
@@ -155,32 +155,43 @@ class Engine(LoadedFile):
         """A model that is loaded for this engine, as an exported file for a rig: see `Model.in_engine`."""
         sized = model.for_rig(rig)
         options = _options(sized, rig, cls.deformable_convolution)
-        exact = CachedFile(_key(sized, options, "fp32"))
-
-        def write(path: Path) -> str:
-            report(f"exporting {model.name} for {options.cameras} cameras to {model.engine}, {ONCE}")
-            labels = {"untrained": model.untrained, "bundled": model.bundled}
-            export_onnx(sized.network, path, options, contents=sized.contents(), **labels)
-            return ""
-
-        def calibrate(path: Path) -> str:
-            frames = _calibration_frames(model, drive)
-            network, _ = exact.get(cls.open, write)
-            report(f"calibrating {model.name} with {frames.name}, {ONCE}")
-            images = calibration_images(sized.config, network.cameras, [frames], CALIBRATION_FRAMES)
-            quantize(network.file, images, path)
-            return frames.name
-
-        if model.precision != "int8":
-            network, calibrated_with = exact.get(cls.in_precision(model.precision).open, write)
+        if model.precision == "int8":
+            cached = cls._in_int8(sized, options, drive, report)
         else:
-            file = CachedFile(_key(sized, options, "int8", CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
-            if not file.stamp:  # then of this drive: longer ones do not use the file of a short one
-                file = CachedFile(_key(sized, options, "int8", len(_calibration_frames(model, drive).stamps)))
-            network, calibrated_with = file.get(cls.open, calibrate)
-        calibrated = f", calibrated with {calibrated_with}" if calibrated_with else ""
-        note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {network.file}"
-        return replace(model, network=network, file=network.file, engine_note=note)
+            cached = cls.in_precision(model.precision)._in_float32(sized, options, report)
+        calibrated = f", calibrated with {cached.calibrated_with}" if cached.calibrated_with else ""
+        file = cached.network.file
+        note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {file}"
+        return replace(model, network=cached.network, file=file, engine_note=note)
+
+    @classmethod
+    def _in_float32(cls, sized: Model, options: OnnxOptions, report: Callable[[str], None]) -> "CachedNetwork":
+        """The exported file of a model for a rig, in this engine, made where the cache does not have it."""
+        file = CachedFile(_key(sized, options, "fp32"))
+        if (cached := file.load(cls)) is not None:
+            return cached
+        report(f"exporting {sized.name} for {options.cameras} cameras to {sized.engine}, {ONCE}")
+        labels = {"untrained": sized.untrained, "bundled": sized.bundled}
+        with file.written() as path:
+            export_onnx(sized.network, path, options, contents=sized.contents(), **labels)
+        return file.opened(cls)
+
+    @classmethod
+    def _in_int8(
+        cls, sized: Model, options: OnnxOptions, drive: Drive | None, report: Callable[[str], None]
+    ) -> "CachedNetwork":
+        """As `_in_float32`, calibrated with the first frames of a drive."""
+        file = CachedFile(_key(sized, options, "int8", CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
+        if not file.stamp:  # then of this drive: longer ones do not use the file of a short one
+            file = CachedFile(_key(sized, options, "int8", len(_calibration_frames(sized, drive).stamps)))
+        if (cached := file.load(cls)) is not None:
+            return cached
+        frames = _calibration_frames(sized, drive)
+        exact = cls._in_float32(sized, options, report).network
+        report(f"calibrating {sized.name} with {frames.name}, {ONCE}")
+        with file.written() as path:
+            quantize(exact.file, calibration_images(sized.config, exact.cameras, [frames], CALIBRATION_FRAMES), path)
+        return file.opened(cls, frames.name)
 
 
 class OnnxRuntimeEngine(Engine):
@@ -191,8 +202,7 @@ class OnnxRuntimeEngine(Engine):
 
     def __init__(self, file: Path, threads: int) -> None:
         super().__init__(file, threads)
-        import onnxruntime
-
+        (onnxruntime,) = imported("onnxruntime")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3  # errors only
@@ -223,8 +233,7 @@ class OpenVinoEngine(Engine):
 
     def __init__(self, file: Path, threads: int) -> None:
         super().__init__(file, threads)
-        import onnx
-
+        (onnx,) = imported("onnx")
         settings: dict[str, Any] = {
             # By default OpenVINO rounds everything to bfloat16 where the CPU has it, which moves boxes by decimetres.
             "INFERENCE_PRECISION_HINT": self.hint,
@@ -337,6 +346,13 @@ class FileFacts(msgspec.Struct, frozen=True):
     calibrated_with: str = ""
 
 
+class CachedNetwork(NamedTuple):
+    """A file of the cache in an engine, and the name of the drive that calibrated it, "" for float32."""
+
+    network: ExportedModel
+    calibrated_with: str
+
+
 @dataclass(frozen=True)
 class CachedFile:
     """A file of the cache. key: hash of everything that its contents depend on."""
@@ -349,53 +365,53 @@ class CachedFile:
         return user_cache() / "engines" / f"{self.key}.onnx"
 
     @property
+    def facts_path(self) -> Path:
+        """The file with its facts."""
+        return self.path.with_suffix(".json")
+
+    @property
     def stamp(self) -> tuple[object, ...]:
         """Inodes and sizes of the file and its facts, which change with them; empty where one is missing."""
         try:
-            stats = [path.stat() for path in (self.path, self._facts)]
+            stats = [path.stat() for path in (self.path, self.facts_path)]
         except OSError:
             return ()
         return (self.path, *((stat.st_ino, stat.st_size) for stat in stats))
 
-    def get(self, open_file: Open, write: Callable[[Path], str]) -> tuple[ExportedModel, str]:
-        """The file in an engine, made where it is missing or broken, and the name of the drive that calibrated it.
+    def load(self, engine: type[Engine]) -> CachedNetwork | None:
+        """The file in an engine; None where it is missing or broken. Raises BevcliError for a missing engine."""
+        return _load(self, engine, self.stamp)
 
-        open_file: opens it in the engine. write: makes it, and returns that name.
-        Raises BevcliError where the engine is not installed, OutputError, and what `write` raises.
-        """
-        loaded = _load(self, open_file, self.stamp)
-        if loaded is not None:
-            return loaded
+    @contextmanager
+    def written(self) -> Iterator[Path]:
+        """A path for the contents of the file, which takes its place after the block. Raises OutputError."""
         _remove_unused(self.path.parent)
         with whole_file(self.path, parents=True, shared=True) as unfinished:
-            calibrated_with = write(unfinished)
-        network = open_file(self.path)
+            yield unfinished
+
+    def opened(self, engine: type[Engine], calibrated_with: str = "") -> CachedNetwork:
+        """The file in an engine, after it was written; its facts are kept beside it."""
+        network = engine.open(self.path)
         facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
-        write_whole(self._facts, msgspec.json.encode(facts), shared=True)
-        return network, calibrated_with
-
-    def load(self, open_file: Open) -> tuple[ExportedModel, str] | None:
-        """As `get`; None for a file that is missing or broken."""
-        try:
-            facts = msgspec.json.decode(read_bytes(self._facts, MIB, error=WeightsError), type=FileFacts)
-            network = open_file(self.path)
-        except (msgspec.MsgspecError, ValueError, RecursionError, WeightsError, ConfigError):
-            return None
-        if bytes(network.digest.tolist()).hex() != facts.sha256:
-            return None
-        with suppress(OSError):  # a cache that cannot be written can be read
-            os.utime(self.path)
-        return network, facts.calibrated_with
-
-    @property
-    def _facts(self) -> Path:
-        return self.path.with_suffix(".json")
+        write_whole(self.facts_path, msgspec.json.encode(facts), shared=True)
+        return CachedNetwork(network, calibrated_with)
 
 
 @lru_cache(maxsize=1)
-def _load(file: CachedFile, open_file: Open, stamp: object) -> tuple[ExportedModel, str] | None:
-    """A file of the cache in an engine; the last one is kept for the next drive. stamp: of the file."""
-    return file.load(open_file) if stamp else None
+def _load(file: CachedFile, engine: type[Engine], stamp: object) -> CachedNetwork | None:
+    """See `CachedFile.load`; the last file is kept for the next drive."""
+    if not stamp:
+        return None
+    try:
+        facts = msgspec.json.decode(read_bytes(file.facts_path, MIB, error=WeightsError), type=FileFacts)
+        network = engine.open(file.path)
+    except (msgspec.MsgspecError, ValueError, RecursionError, WeightsError, ConfigError):
+        return None
+    if bytes(network.digest.tolist()).hex() != facts.sha256:
+        return None
+    with suppress(OSError):  # a cache that cannot be written can be read
+        os.utime(file.path)
+    return CachedNetwork(network, facts.calibrated_with)
 
 
 def _remove_unused(folder: Path) -> None:

@@ -13,6 +13,7 @@ import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from bevcli.workshop.engines.export_form import ExportForm, Port
 from bevcli.writing import check_output, whole_file
 
 EXPORTERS = ("onnx", "onnxscript")  # packages that write the file
-QUANTIZERS = ("onnx", "onnxruntime")  # packages that make it INT8, whatever engine runs it
+QUANTIZERS = ("onnx", "onnxruntime", "onnxruntime.quantization")  # modules that make it INT8, whatever engine runs it
 NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
 LARGEST_BYTES = 2**31  # protobuf's own limit, which every file of `bevcli export-onnx` keeps
 
@@ -83,9 +84,7 @@ def export_onnx(
             form, because it looks at later frames or because its memory grows.
         OutputError: the file cannot be written.
     """
-    require(*EXPORTERS)
-    import onnx
-
+    onnx, _ = imported(*EXPORTERS)
     chosen = gather(OnnxOptions, options, changes)
     if chosen.opset < MIN_OPSET[chosen.deformable_convolution]:
         raise BevcliError(
@@ -243,10 +242,7 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
         WeightsError: the file cannot be loaded, is not of `bevcli export-onnx`, or is quantised already.
         OutputError: the file cannot be written.
     """
-    require(*QUANTIZERS)
-    import onnx
-    from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
-
+    onnx, _, quantization = imported(*QUANTIZERS)
     try:
         check_size(file)
         proto = onnx.load(str(file), load_external_data=False)
@@ -258,16 +254,16 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     check_output(out, file)
     # Without advice about models that have not been simplified.
     with errors_only(""), whole_file(out, parents=True) as unfinished:
-        quantize_static(
+        quantization.quantize_static(
             proto,
             str(unfinished),
-            _reader(proto, images),
-            quant_format=QuantFormat.QDQ,
+            CalibrationFeeds(proto, images),
+            quant_format=quantization.QuantFormat.QDQ,
             op_types_to_quantize=list(QUANTIZED_OPERATORS),
             nodes_to_quantize=quantized_nodes(proto.graph),
             per_channel=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
             extra_options={
                 "WeightSymmetric": True,
                 "ActivationSymmetric": False,
@@ -303,32 +299,39 @@ def _unrounded(graph: Any) -> list[str]:
     return ["Conv"] if clips else []
 
 
-def _reader(proto: Any, images: Iterable[np.ndarray]) -> Any:
-    """The inputs for one frame after another; matrices are the identity, other inputs but the images zero."""
-    import onnx
-    from onnxruntime.quantization import CalibrationDataReader
+class CalibrationFeeds:
+    """The inputs for one frame after another, as ONNX Runtime asks for them.
 
-    rest = {}
-    for value in proto.graph.input:
-        kind = value.type.tensor_type
-        shape = [dimension.dim_value for dimension in kind.shape.dim]
-        rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
-        if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
-            rest[value.name] += np.eye(4, dtype=rest[value.name].dtype)
-    feeds = (rest | {"images": image} for image in images)
+    Matrices are the identity, other inputs but the images zero.
+    """
 
-    class Frames(CalibrationDataReader):
-        def get_next(self) -> Mapping[str, np.ndarray] | None:
-            return next(feeds, None)
+    def __init__(self, proto: Any, images: Iterable[np.ndarray]) -> None:
+        (onnx,) = imported("onnx")
+        self.images, self.rest = iter(images), {}
+        for value in proto.graph.input:
+            kind = value.type.tensor_type
+            shape = [dimension.dim_value for dimension in kind.shape.dim]
+            self.rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+            if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
+                self.rest[value.name] += np.eye(4, dtype=self.rest[value.name].dtype)
 
-    return Frames()
+    def get_next(self) -> Mapping[str, np.ndarray] | None:
+        """See `onnxruntime.quantization.CalibrationDataReader`."""
+        image = next(self.images, None)
+        return None if image is None else self.rest | {"images": image}
 
 
 def require(*names: str, extra: str = "onnx") -> None:
     """Raises BevcliError where one of these packages is not installed. extra: of bevcli, which installs them."""
-    missing = [name for name in names if find_spec(name) is None]
+    missing = [name for name in dict.fromkeys(name.partition(".")[0] for name in names) if find_spec(name) is None]
     if missing:
         raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[{extra}]'")
+
+
+def imported(*names: str) -> list[Any]:
+    """These modules of optional packages. Raises BevcliError where a package is not installed."""
+    require(*names)
+    return [import_module(name) for name in names]
 
 
 @contextlib.contextmanager

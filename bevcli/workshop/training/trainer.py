@@ -20,9 +20,8 @@ from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
-from bevcli.model.kernels.choose import choose_kernels
-from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.kernels.rounding import rounded_products
+from bevcli.model.kernels.training import choose_training_kernels
 from bevcli.model.network import Network
 from bevcli.parsing.pth import read_pth
 from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
@@ -135,8 +134,7 @@ class Trainer:
                 limit = f"at most `steps={job.config.steps}` (`--steps {job.config.steps}`)"
                 stated = f"has done {self.done} steps already (expected {limit})"
                 raise InputError(f"{job.out}: {stated}")
-        choose_kernels(job.model, job.device, gradients=True)
-        find_hits_on_cpu(job.model, job.device)
+        choose_training_kernels(job.model, job.device)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         self.maker = BatchMaker(

@@ -6,7 +6,6 @@ decoders paint the masks of things and of stuff.
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -137,7 +136,8 @@ class MapHead(nn.Module):
             (grid.rows, grid.columns),
             branch_layers=3,
             refines_extent=True,
-            attention=partial(FlatListAttention, levels=levels),
+            attention=FlatListAttention,
+            attention_levels=levels,
         )
         self.class_branch = nn.Linear(channels, len(config.things))
         # The first half of the channels is the content of a query, the second half its position.

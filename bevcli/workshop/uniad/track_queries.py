@@ -3,7 +3,6 @@
 Each has a memory of its own embeddings, and all attend to each other before the next frame.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import ObjectQueries, inverse_sigmoid
+from bevcli.model.upload import exchanged, tensors_in
 
 NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego query
 
@@ -63,13 +63,9 @@ class Memories:
     is_empty: Tensor
     wait: Tensor
 
-    def changed(self, change: Callable[[Tensor], Tensor]) -> "Memories":
-        """The memories after a change of every tensor."""
-        return Memories(change(self.embeddings), change(self.is_empty), change(self.wait))
-
     def __getitem__(self, selection: Tensor) -> "Memories":
         """The memories of a mask (K,) bool."""
-        return self.changed(lambda column: column[selection])
+        return Memories(*(column[selection] for column in vars(self).values()))
 
     @staticmethod
     def empty(like: Tensor, length: int) -> "Memories":
@@ -114,17 +110,13 @@ class TrackQueries:
 
     def ended(self) -> "TrackQueries":
         """No track; the identities go on where they are."""
-        return self._each(lambda column: column[:0])
+        queries: TrackQueries = exchanged(self, (column[:0] for _, column in tensors_in(self)))
+        return queries
 
     def to(self, device: torch.device) -> "TrackQueries":
         """The same tracks on a device."""
-        return self._each(lambda column: column.to(device))
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> "TrackQueries":
-        queries = change(self.position), change(self.content), change(self.box_codes)
-        return TrackQueries(
-            *queries, change(self.ids), change(self.misses), self.memories.changed(change), self.next_id
-        )
+        queries: TrackQueries = exchanged(self, (column.to(device) for _, column in tensors_in(self)))
+        return queries
 
 
 @dataclass(frozen=True)

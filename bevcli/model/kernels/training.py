@@ -1,11 +1,88 @@
-"""Compiled loops that inference on a CPU does not need: gradients of sampling, and the hits of pillars for a GPU.
+"""What training needs of the kernels: gradients of sampling, in a compiled loop on the CPU.
 
 See `bevcli.model.kernels.loops` for what the functions take.
 """
 
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
 import numpy as np
+import torch
+from torch import Tensor, nn
 
 from bevcli.jit import njit
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.kernels.choose import change_classes, has_triton, triton_kernels
+from bevcli.model.kernels.compiled import CompiledSampling, as_array, in_threads
+from bevcli.model.kernels.gpu import find_hits_on_cpu
+from bevcli.model.network import Network
+
+
+def choose_training_kernels(model: nn.Module, device: torch.device) -> None:
+    """As `choose_kernels`, for a model that is trained: kernels with gradients; on a GPU, the CPU finds the hits."""
+    if isinstance(model, Network):
+        model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    sampling: type[GridSampling] = GridSampling
+    if device.type == "cpu":
+        sampling = LearnedSampling
+    elif has_triton(device):
+        attention, convolution = triton_kernels()
+        sampling = attention.TritonSampling
+        change_classes(model, {ModulatedDeformableConvolution: convolution.TritonDeformableConvolution})
+    for module in model.modules():
+        if isinstance(module, DeformableAttention):
+            module.sampling = sampling()
+    find_hits_on_cpu(model, device)
+
+
+class LearnedSampling(GridSampling):
+    """A `GridSampling` on the CPU whose gradients are computed in float32."""
+
+    def forward(
+        self,
+        values: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        locations: Tensor,
+        weights: Tensor,
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        """As `GridSampling.forward`."""
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
+            learned = values.float(), locations.float(), weights.float()
+            return _WeightedSums.apply(*learned, level_shapes, queries_per_map)
+        return CompiledSampling()(values, level_shapes, locations, weights, queries_per_map)
+
+
+class _WeightedSums(torch.autograd.Function):
+    """The sums, and their gradients for values in float32."""
+
+    @staticmethod
+    def forward(
+        context: Any,
+        values: Tensor,
+        locations: Tensor,
+        weights: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        context.save_for_backward(values, locations, weights)
+        context.level_shapes, context.queries_per_map = level_shapes, queries_per_map
+        return CompiledSampling()(values, level_shapes, locations, weights, queries_per_map)  # without gradients
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        values, locations, weights = context.saved_tensors
+        results = torch.zeros(values.shape), torch.empty(locations.shape), torch.empty(weights.shape)
+        out_gradient = gradients[0].unflatten(-1, values.shape[2:])
+        shapes = np.asarray(context.level_shapes, dtype=np.int64)
+        starts = np.cumsum([0, *context.queries_per_map])
+        read = (as_array(values), shapes, as_array(locations), as_array(weights), starts, as_array(out_gradient))
+        written = [tensor.numpy() for tensor in results]
+        heads_of_maps = values.shape[0] * values.shape[2]
+        in_threads(partial(sample_maps_backward, *read, *written), heads_of_maps, min_range=1)
+        return (*results, None, None)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -77,31 +154,3 @@ def sample_maps_backward(  # type: ignore[no-untyped-def]
                     locations_gradient[query, head, level, point, 0] = weight * along_x * np.float32(width)
                     locations_gradient[query, head, level, point, 1] = weight * along_y * np.float32(height)
                 start += height * width
-
-
-@njit(nogil=True, error_model="numpy")
-def find_hits(images_from_bev, points, has_image, image_size, min_depth, cells, reference_points, counts, begin, end):  # type: ignore[no-untyped-def]
-    """Writes the cells that cameras begin to end - 1 see, and the points of their pillars, in the order of the cells.
-
-    images_from_bev: (G, 4, 4) float32. points: (Y·X, Z, 3) float32. has_image: (G,) bool. image_size: (2,) float32
-    height, width. cells: (G, Y·X) int64. reference_points: (G, Y·X, Z, 2) float32. counts: (G,) int64, of the hits.
-    """
-    zero, one, height, width = np.float32(0), np.float32(1), image_size[0], image_size[1]
-    for camera in range(begin, end):
-        matrix, count = images_from_bev[camera], 0
-        for cell in range(len(points) if has_image[camera] else 0):
-            is_seen = False
-            for point in range(points.shape[1]):
-                x, y, z = points[cell, point, 0], points[cell, point, 1], points[cell, point, 2]
-                u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
-                v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
-                depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-                divisor = max(depth, min_depth)
-                column, row = u / divisor / width, v / divisor / height
-                reference_points[camera, count, point, 0], reference_points[camera, count, point, 1] = column, row
-                inside = (column > zero) & (column < one) & (row > zero) & (row < one)
-                is_seen |= inside & (depth > min_depth)
-            if is_seen:
-                cells[camera, count] = cell
-                count += 1
-        counts[camera] = count
