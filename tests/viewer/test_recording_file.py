@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from functools import partial
 
 import pytest
 from memory_drive import MemoryDrive
@@ -156,6 +155,7 @@ def test_a_message_of_unknown_kind_is_damage_not_the_end(recording, tmp_path, me
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
 def test_the_first_process_to_read_a_recording_has_one_gigabyte(recording):
     greedy = recording_file.CHECK.replace("try:\n", "bytearray(1200 << 20)\ntry:\n")
-    done = recording_file._run(recording, partial(run_python, greedy, [recording], 1 << 30))
+    with recording_file._limited(recording) as (seconds, environment):
+        done = run_python(greedy, [recording], 1 << 30, seconds, environment)
     assert done.returncode == 1
     assert b"MemoryError" in done.stderr
