@@ -93,7 +93,7 @@ class Layout(rrb.Blueprint):
     @contextmanager
     def saved_to(self, path: Path, application: str) -> Iterator[rr.RecordingStream]:
         """The stream of a recording with this layout, for one block. Frees the layout. Raises OutputError."""
-        with whole_file(path) as own, plain_name(own) as unfinished, rr.RecordingStream(application) as stream:
+        with whole_file(path) as whole, plain_name(whole) as unfinished, rr.RecordingStream(application) as stream:
             try:
                 stream.save(unfinished, default_blueprint=self)
             except RuntimeError as error:

@@ -242,23 +242,25 @@ def log_boxes_in_images(
     stream: rr.RecordingStream, cameras: Sequence[PosedCamera], layers: Sequence[ImageLayer]
 ) -> None:
     """Draws boxes, and the labels of those that have some, into the images. Layers with labels come first."""
-    corners, colors = (np.concatenate([getattr(each, part) for each in layers]) for part in ("corners", "colors"))
-    texts = [text for each in layers for text in each.texts or ()]
-    starts = np.cumsum([0, *(len(each.corners) for each in layers)])
+    corners, colors = (np.concatenate([getattr(layer, part) for layer in layers]) for part in ("corners", "colors"))
+    texts = [text for layer in layers for text in layer.texts or ()]
+    starts = np.cumsum([0, *(len(layer.corners) for layer in layers)])
     for posed, lines in zip(cameras, lines_in_images(corners, cameras), strict=True):
         camera, ends = posed.camera, np.searchsorted(lines.owners, starts).tolist()
         labelled = int(np.searchsorted(lines.owners, len(texts)))
         predicted = ImageLines(lines.segments[:labelled], lines.owners[:labelled])
         positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
-        for i, each in enumerate(layers):
-            part, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, each.kind)
-            segments, own, radii = lines.segments[part], colors[lines.owners[part]], ui_points(each.width)
-            strips = components(rr.LineStrips2D, strips=segments, colors=own, radii=radii, draw_order=each.order)
+        for i, layer in enumerate(layers):
+            part, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, layer.kind)
+            segments, line_colors, radii = lines.segments[part], colors[lines.owners[part]], ui_points(layer.width)
+            strips = components(
+                rr.LineStrips2D, strips=segments, colors=line_colors, radii=radii, draw_order=layer.order
+            )
             log(stream, entity, strips)
-            if each.texts is not None:
+            if layer.texts is not None:
                 chosen = (owners >= starts[i]) & (owners < starts[i + 1])
-                names, own = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
-                labels = labels_2d(positions[chosen], names, colors=own, draw_order=each.order + 1)
+                names, label_colors = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
+                labels = labels_2d(positions[chosen], names, colors=label_colors, draw_order=layer.order + 1)
                 log(stream, f"{entity}/labels", labels)
 
 

@@ -22,8 +22,8 @@ from bevcli.printing import counted
 from bevcli.recording import entities
 from bevcli.recording.components import log, packed
 from bevcli.recording.log_cameras import labels_2d
+from bevcli.recording.meshes import Mesh, VehicleMesh, default_vehicle
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.vehicle import Mesh, VehicleMesh, default_vehicle
 
 UNTRAINED = "untrained weights"
 FROM_RENDERED = "trained on renderings"

@@ -10,6 +10,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -98,7 +99,7 @@ class _Place:
     pose: Pose
     ego_from_bev: Array
 
-    @property
+    @cached_property
     def world_from_bev(self) -> Array:
         """(4, 4) into the recording's world."""
         return self.moved @ self.pose.matrix @ self.ego_from_bev
@@ -239,6 +240,10 @@ class Recording:
             stream.log(entities.WORLD, rr.AnyValues(origin=self._kept.origin), static=True)
         self._at(frame.stamp)
         moved = rigid(-self._kept.origin)  # from the sequence's world into the recording's world
+        if prediction is not None:
+            place = _Place(moved, prediction.world_from_ego, prediction.ego_from_bev)
+        else:
+            place = _Place(moved, frame.world_from_ego, frame.rig.ego_from_bev)
         self._log_ego(frame, moved)
         poses = [moved @ frame.world_from_ego_at[c.name].matrix @ c.ego_from_camera for c in frame.rig.cameras]
         cameras = tuple(
@@ -248,7 +253,7 @@ class Recording:
             name = posed.camera.name
             log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
             self._images.log(name, frame.images.get(name))
-        self._log_boxes(frame, found, moved, cameras)
+        self._log_boxes(frame, found, place, cameras)
         if is_first:
             counted = self._recorded.layers or self._recorded.classes
             lines = rr.SeriesLines(names=list(counted), colors=list(counted.values()))
@@ -256,13 +261,13 @@ class Recording:
             stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
         if prediction is not None:
             if self._recorded.results:
-                self._log_results(prediction, moved, cameras)
+                self._log_results(prediction, place, cameras)
             self._log_stages(prediction, is_first=is_first)
         elif self._recorded.map_classes:
             self._log_map(frame.ground_truth_map, frame.rig.ego_from_bev)
         self._log_events(frame, found)
         if prediction is not None and self._options.shows_internals:
-            self._log_internals(frame, prediction, moved, cameras)
+            self._log_internals(frame, prediction, place.world_from_bev, cameras)
         self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
         self._write()
 
@@ -287,8 +292,8 @@ class Recording:
         """
         stream, stamp = self._stream, frame.stamp
         pose = moved @ frame.world_from_ego.matrix
-        facts = any_values(scene=stamp.scene, timestamp_ns=stamp.timestamp_ns, pose=pose.ravel())
-        log(stream, entities.EGO, log_cameras.transform(pose) | facts)
+        row = any_values(scene=stamp.scene, timestamp_ns=stamp.timestamp_ns, pose=pose.ravel())
+        log(stream, entities.EGO, log_cameras.transform(pose) | row)
         if self._recorded.drive.has_ego_motion:
             km_h = 3.6 * float(np.linalg.norm(frame.kinematics.velocity[:2]))
             log(stream, entities.SPEED_CURVE, components(rr.Scalars, scalars=np.array([km_h])))
@@ -310,14 +315,12 @@ class Recording:
             line = components(rr.LineStrips3D, strips=way, colors=entities.EGO_COLOR, radii=0.06)
             log(stream, entities.TRAJECTORY, line)
 
-    def _log_boxes(self, frame: Frame, found: Prediction | FileBoxes, moved: Array, cameras: PosedCameras) -> None:
+    def _log_boxes(self, frame: Frame, found: Prediction | FileBoxes, place: _Place, cameras: PosedCameras) -> None:
         """Writes the boxes and the ground truth of a frame."""
         recorded, files = self._recorded, self._recorded.files
         if isinstance(found, Prediction):
-            place = _Place(moved, found.world_from_ego, found.ego_from_bev)
             sides, grid = [found.boxes], found.grid
         else:
-            place = _Place(moved, frame.world_from_ego, frame.rig.ego_from_bev)
             sides, grid = [place.in_bev(boxes) if boxes else NO_BOXES for boxes in found], None
         sides = [boxes.scored(self._options.score) for boxes in sides]
         truth = None if frame.ground_truth is None else place.in_bev(frame.ground_truth)
@@ -398,11 +401,10 @@ class Recording:
         seconds = np.array(list(prediction.stage_seconds.values()))
         log(self._stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
 
-    def _log_results(self, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+    def _log_results(self, prediction: Prediction, place: _Place, cameras: PosedCameras) -> None:
         """Writes the results and futures of a model that has further results."""
-        score, moved_from_ego = self._options.score, moved @ prediction.world_from_ego.matrix
-        world_from_bev = moved_from_ego @ prediction.ego_from_bev
-        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(moved_from_ego))
+        score, world_from_bev = self._options.score, place.world_from_bev
+        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(place.moved @ place.pose.matrix))
         for kind, names in self._recorded.results.items():
             result = result_of(kind, prediction.results)
             lines = GroundLines() if result is None else result.drawn(ground, names, score)
@@ -414,23 +416,25 @@ class Recording:
     def _log_events(self, frame: Frame, found: Prediction | FileBoxes) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
             self.event(log_static.WARNINGS[self._recorded.note], "WARN")
-        where = f"frame {frame.stamp.index}"
+        name = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
         if isinstance(found, Prediction) and found.started_anew:
             scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
-            self.event(f"{where}: no history: {found.started_anew}{scene}")
+            self.event(f"{name}: no history: {found.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
-            self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
+            self.event(f"{name}: camera {camera} has no image: {reason}", "WARN")
         if isinstance(found, Prediction):
             if found.failure:
-                self.event(f"{where}: {found.failure}", "ERROR" if found.not_finite else "WARN")
+                self.event(f"{name}: {found.failure}", "ERROR" if found.not_finite else "WARN")
             return
-        for name, boxes in zip(self._recorded.files.names if self._recorded.files else (), found, strict=True):
+        for file, boxes in zip(self._recorded.files.names if self._recorded.files else (), found, strict=True):
             if boxes is None:
-                self.event(f"{where}: {name} does not have this frame", "WARN")
+                self.event(f"{name}: {file} does not have this frame", "WARN")
 
-    def _log_internals(self, frame: Frame, prediction: Prediction, moved: Array, cameras: PosedCameras) -> None:
+    def _log_internals(
+        self, frame: Frame, prediction: Prediction, world_from_bev: Array, cameras: PosedCameras
+    ) -> None:
         """Writes pillars, segmentation, BEV features, history weights and probes."""
         stream, grid, ego_from_bev = self._stream, prediction.grid, prediction.ego_from_bev
         ranges = grid.x_range_m, grid.y_range_m
@@ -438,7 +442,7 @@ class Recording:
             all_cells = self._options.level == "full"
             self._pillars = log_static.log_pillars(stream, grid, ego_from_bev, all_cells=all_cells)
         pillars, colors = self._pillars
-        points = apply(moved @ prediction.world_from_ego.matrix @ ego_from_bev, pillars)
+        points = apply(world_from_bev, pillars)
         for posed in cameras:
             if posed.camera.name in frame.images:
                 log_cameras.log_pillar_hits(stream, posed, points, colors)

@@ -88,8 +88,8 @@ def show_window(recording: Path, frame: int | None = None) -> bool:
 
 def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:
     """A free port: the preferred one, or one of the 19 after it, or any other."""
-    wanted = [] if preferred is None else range(preferred, preferred + PORTS_TRIED)
-    for port in (*wanted, 0):
+    ports = [] if preferred is None else range(preferred, preferred + PORTS_TRIED)
+    for port in (*ports, 0):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -154,13 +154,13 @@ def _go_to(recording: Path, client: ViewerClient, state: Any, frame: int | None)
     timeline = next((t for t in state.recordings[0].timelines if t.name == entities.FRAME_TIMELINE), None)
     if timeline is None or timeline.start is None or timeline.end is None or timeline.time_type != "sequence":
         raise InputError(f"{recording}: the recording has no frames (expected one of `bevcli run`)")
-    wanted = timeline.start if frame is None else frame
-    if not timeline.start <= wanted <= timeline.end:
+    index = timeline.start if frame is None else frame
+    if not timeline.start <= index <= timeline.end:
         raise InputError(
-            f"{recording}: `frame={wanted}` (`--frame {wanted}`): the recording has frames {timeline.start} to "
+            f"{recording}: `frame={index}` (`--frame {index}`): the recording has frames {timeline.start} to "
             f"{timeline.end}"
         )
-    client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
+    client.set_time(entities.FRAME_TIMELINE, sequence=index, play_state="paused")
 
 
 def _attempts(process: subprocess.Popen[bytes]) -> Iterator[None]:

@@ -15,7 +15,7 @@ from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_c
 from bevcli.recording.log_boxes import MOVING_M_S, box_colors
 from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
 from bevcli.recording.log_static import bev_image_points, range_lines
-from bevcli.recording.vehicle import default_vehicle
+from bevcli.recording.meshes import default_vehicle
 from bevcli.viewer.drawing import (
     BACKGROUND,
     BEV_MARGIN,
@@ -86,12 +86,12 @@ def _camera_image(
     posed = PosedCamera(scaled, world_from_camera, inverse(world_from_camera))
     world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
     [lines] = lines_in_images(boxes.transformed(world_from_bev).corners(), [posed])
-    own, texts = box_colors(boxes, colors), box_labels(boxes)
+    own_colors, texts = box_colors(boxes, colors), box_labels(boxes)
     for box in np.unique(lines.owners):
-        draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own[box]), 1 + width // 800)
+        draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)
     size = max(0.36, width * LABEL_SHARE)
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
-        draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own[box]), size, centered=True)
+        draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own_colors[box]), size, centered=True)
     draw_title(canvas, camera.name, has_image=image is not None)
     if prediction.untrained:
         draw_text(canvas, UNTRAINED, (width // 2, height - 14), WARNING, 0.42, centered=True)
@@ -113,14 +113,14 @@ def _draw_from_above(
         canvas[y0:y1, x0:x1] = cv2.resize(area, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
     for ring in rings:
         draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, ring))], _bgr(RING_COLOR))
-    corners, own = boxes.corners()[..., :2] * (1, -1), box_colors(boxes, colors)
+    corners, own_colors = boxes.corners()[..., :2] * (1, -1), box_colors(boxes, colors)
     for index in reversed(range(len(boxes))):  # the best ones lie on top
-        draw_lines(canvas, to_canvas(corners[index][[TOP]]), _bgr(own[index]), 2)
+        draw_lines(canvas, to_canvas(corners[index][[TOP]]), _bgr(own_colors[index]), 2)
         velocity = boxes.velocities[index] * (1, -1)
         if np.linalg.norm(velocity) > MOVING_M_S:  # not of NaN
             start = boxes.centers[index, :2] * (1, -1)
             tail, tip = to_canvas(np.stack([start, start + velocity]))
-            draw_arrow(canvas, tail, tip, _bgr(own[index]))
+            draw_arrow(canvas, tail, tip, _bgr(own_colors[index]))
     for strip in default_vehicle().top_view:
         draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, strip))], _bgr(EGO_COLOR), 2)
 

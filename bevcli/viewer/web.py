@@ -206,8 +206,8 @@ def _is_own_name(host: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:
-        own = socket.gethostname().lower()
-        return name in ("localhost", own, own.partition(".")[0])
+        machine = socket.gethostname().lower()
+        return name in ("localhost", machine, machine.partition(".")[0])
     return True
 
 

@@ -16,9 +16,8 @@ from bevcli.parsing.files import read_bytes
 from bevcli.recording import entities, mesh_file, meshes
 from bevcli.recording.entities import EGO_COLOR
 from bevcli.recording.mesh_file import read_parts
-from bevcli.recording.meshes import load_vehicle
+from bevcli.recording.meshes import default_vehicle, load_vehicle
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.vehicle import default_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
 
 RED = (200, 10, 20)
@@ -186,7 +185,7 @@ def test_a_mesh_in_millimetres_is_an_error(tmp_path, in_this_process):
 def test_the_default_car_is_drawn_without_trimesh(tmp_path):
     code = (
         "import sys, bevcli.recording.writer\n"
-        "from bevcli.recording.vehicle import default_vehicle\n"
+        "from bevcli.recording.meshes import default_vehicle\n"
         "default_vehicle(); print('trimesh' in sys.modules)"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"

@@ -307,6 +307,7 @@ class Captured:
         """function: a method of the model, which is complete. rounds: see `rounded_products`."""
         self._function, self._device, self._rounds = function, device, rounds
         parts = [module for module in model.modules() if module is not model]
+        # PyTorch does not tell by a public name whether a module has hooks.
         hooks = [hooks for part in parts for hooks in (part._forward_hooks, part._forward_pre_hooks)]
         self._no_hooks, self._own = [kind for kind in hooks if not kind], [kind for kind in hooks if kind]
         self._own_hooks = sum(map(len, self._own))

@@ -1,8 +1,8 @@
 """Layers run by oneDNN on a CPU, for inference: weights are packed once, ReLU and sums are fused into convolutions.
 
 A residual block adds its last convolution to the shortcut in place: with few channels such a convolution mostly waits
-for memory. The operators are those that PyTorch's compiler uses; where a build of PyTorch lacks them, a model keeps its
-own layers.
+for memory. No public operator packs weights or fuses sums, so these are the private ones that PyTorch's compiler uses;
+where a build of PyTorch lacks them, a model keeps its own layers.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def has_onednn(dtype: torch.dtype) -> bool:
 def has_matrix_unit() -> bool:
     """This CPU multiplies matrices of bfloat16 in a unit of its own (AMX), and this build of PyTorch can use it."""
     can_round = hasattr(torch.backends.mkldnn, "matmul") and has_onednn(torch.bfloat16)
-    return can_round and torch.cpu._is_amx_tile_supported()
+    return can_round and torch.cpu._is_amx_tile_supported()  # PyTorch tells of AMX in no other way
 
 
 class PackedLinear(nn.Module):

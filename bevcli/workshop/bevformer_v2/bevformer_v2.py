@@ -24,16 +24,16 @@ from torch import Tensor, nn
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.model.backbone import Stage
+from bevcli.model.bev_queries import BevQueries
 from bevcli.model.config import ModelConfig
-from bevcli.model.deformable_attention import FeatureMaps
-from bevcli.model.encoder import EncoderLayer
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps
+from bevcli.model.encoder import Encoder, EncoderLayer, TemporalSelfAttention
 from bevcli.model.network import STAGES, Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.resnet import BasicBlock
 from bevcli.model.step import Clip, ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import OfficialNames
 from bevcli.model.upload import on_device, upload
-from bevcli.workshop.bevformer_v2.constant_parts import ConstantTemporalSelfAttention, OwnQueriesAttention
 from bevcli.workshop.bevformer_v2.window import (
     BEVFormerV2Config,
     BevFusionConfig,
@@ -201,3 +201,57 @@ class BevFusion(nn.Module):
         cells = torch.cat(list(maps), dim=-1).unflatten(1, self.bev_shape)  # (B, Y, X, frames · C)
         fused = self.blocks(cells.permute(0, 3, 1, 2))  # (B, width, Y, X)
         return self.norm(self.projection(fused.permute(0, 2, 3, 1).flatten(1, 2)))
+
+
+class ConstantTemporalSelfAttention(nn.Module):
+    """Takes the place of the first encoder layer's temporal self-attention, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, encoder: Encoder, bev_queries: BevQueries) -> None:
+        super().__init__()
+        first = encoder.layers[0].get_submodule("temporal_self_attention")
+        assert isinstance(first, TemporalSelfAttention)
+        self.attention = first.attention  # for observers of the encoder
+        queries = bev_queries.embedding[None]
+        with torch.no_grad():
+            attended = first(queries, bev_queries.position(), queries[:, None], encoder.reference_points(None))
+        self.register_buffer("attended", attended, persistent=False)  # (1, Y·X, C)
+
+    def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
+        """Arguments as for `TemporalSelfAttention`, of which only the shape of the query is read -> (B, Y·X, C)."""
+        return self.attended.expand_as(query)
+
+
+class OwnQueriesAttention(nn.Module):
+    """Takes the place of a temporal self-attention that never has a history: both maps are the queries.
+
+    Offsets and weights are a linear function of (query, query + position). The products with the query are added up
+    beforehand, and those with the position computed.
+    """
+
+    constant: Tensor
+
+    def __init__(self, plain: TemporalSelfAttention, position: Tensor) -> None:
+        """position: (Y·X, C), position embedding of the cells."""
+        super().__init__()
+        self.plain = plain
+        layers = (plain.attention.sampling_offsets, plain.attention.attention_weights)
+        of_history, of_query = torch.cat([layer.weight for layer in layers]).chunk(2, dim=1)
+        bias = torch.cat([layer.bias for layer in layers])
+        self.sizes = [layer.out_features for layer in layers]
+        self.both = nn.Linear(of_query.shape[1], of_query.shape[0], bias=False, device="meta")
+        self.both.weight = nn.Parameter(of_history + of_query, requires_grad=False)
+        self.register_buffer("constant", position @ of_query.T + bias, persistent=False)  # (Y·X, both sizes)
+
+    @property
+    def attention(self) -> DeformableAttention:
+        """The deformable attention, for observers of the encoder."""
+        return self.plain.attention
+
+    def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
+        """As `TemporalSelfAttention.forward`; the position is not read."""
+        offsets, logits = (self.both(query) + self.constant).split(self.sizes, dim=-1)
+        shape = self.plain.attention.shape
+        offsets, logits = offsets.float().unflatten(-1, (*shape, 2)), logits.unflatten(-1, shape)
+        return self.plain.sample(bev_maps, reference_points, offsets, logits)

@@ -121,13 +121,13 @@ class Engine(LoadedFile):
         if str(options.device) not in ("auto", "cpu"):
             raise BevcliError(f"`device={options.device}` (`--device`): {file} runs on the CPU: leave out the option")
         network = cls.open(file)
-        stated = network.metadata
+        metadata = network.metadata
         return Model(
             network,
-            precision=stated.precision,
-            weights=None if stated.untrained else file,
-            bundled=stated.bundled,
-            tracker=tracker_of_table(stated.contents, stated.config, str(file)),
+            precision=metadata.precision,
+            weights=None if metadata.untrained else file,
+            bundled=metadata.bundled,
+            tracker=tracker_of_table(metadata.contents, metadata.config, str(file)),
             engine=name,
             file=file,
         )
@@ -136,10 +136,10 @@ class Engine(LoadedFile):
     def check_options(cls, name: str, options: ModelOptions, config: ModelConfig) -> None:
         """Raises BevcliError where the engine, `name`, is not installed or cannot run a model with these options."""
         if options.precision not in (None, *cls.precisions):
-            known = " or ".join(cls.precisions)
+            precisions = " or ".join(cls.precisions)
             raise BevcliError(
                 f"`precision={options.precision}` (`--precision`): `engine={name}` (`--engine {name}`) computes in "
-                f"{known}"
+                f"{precisions}"
             )
         if str(options.device) not in ("auto", "cpu"):
             raise BevcliError(
@@ -155,43 +155,31 @@ class Engine(LoadedFile):
         """A model that is loaded for this engine, as an exported file for a rig: see `Model.in_engine`."""
         sized = model.for_rig(rig)
         options = _options(sized, rig, cls.deformable_convolution)
-        if model.precision == "int8":
-            cached = cls._in_int8(sized, options, drive, report)
-        else:
-            cached = cls.in_precision(model.precision)._in_float32(sized, options, report)
+        exact, is_int8 = CachedFile(_key(sized, options, "fp32")), model.precision == "int8"
+        file, engine = exact, cls.in_precision(model.precision)
+        if is_int8:
+            file = CachedFile(_key(sized, options, "int8", CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
+            if not file.stamp:  # then of this drive: longer ones do not use the file of a short one
+                file = CachedFile(_key(sized, options, "int8", len(_calibration_frames(model, drive).stamps)))
+        cached = file.load(engine)
+        if cached is None:
+            frames = _calibration_frames(model, drive) if is_int8 else None
+            cached = exact.load(engine) if is_int8 else None
+            if cached is None:
+                report(f"exporting {model.name} for {options.cameras} cameras to {model.engine}, {ONCE}")
+                labels = {"untrained": model.untrained, "bundled": model.bundled}
+                with exact.written() as path:
+                    export_onnx(sized.network, path, options, contents=sized.contents(), **labels)
+                cached = exact.opened(engine)
+            if frames is not None:
+                report(f"calibrating {model.name} with {frames.name}, {ONCE}")
+                images = calibration_images(sized.config, cached.network.cameras, [frames], CALIBRATION_FRAMES)
+                with file.written() as path:
+                    quantize(exact.path, images, path)
+                cached = file.opened(engine, frames.name)
         calibrated = f", calibrated with {cached.calibrated_with}" if cached.calibrated_with else ""
-        file = cached.network.file
-        note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {file}"
-        return replace(model, network=cached.network, file=file, engine_note=note)
-
-    @classmethod
-    def _in_float32(cls, sized: Model, options: OnnxOptions, report: Callable[[str], None]) -> "CachedNetwork":
-        """The exported file of a model for a rig, in this engine, made where the cache does not have it."""
-        file = CachedFile(_key(sized, options, "fp32"))
-        if (cached := file.load(cls)) is not None:
-            return cached
-        report(f"exporting {sized.name} for {options.cameras} cameras to {sized.engine}, {ONCE}")
-        labels = {"untrained": sized.untrained, "bundled": sized.bundled}
-        with file.written() as path:
-            export_onnx(sized.network, path, options, contents=sized.contents(), **labels)
-        return file.opened(cls)
-
-    @classmethod
-    def _in_int8(
-        cls, sized: Model, options: OnnxOptions, drive: Drive | None, report: Callable[[str], None]
-    ) -> "CachedNetwork":
-        """As `_in_float32`, calibrated with the first frames of a drive."""
-        file = CachedFile(_key(sized, options, "int8", CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
-        if not file.stamp:  # then of this drive: longer ones do not use the file of a short one
-            file = CachedFile(_key(sized, options, "int8", len(_calibration_frames(sized, drive).stamps)))
-        if (cached := file.load(cls)) is not None:
-            return cached
-        frames = _calibration_frames(sized, drive)
-        exact = cls._in_float32(sized, options, report).network
-        report(f"calibrating {sized.name} with {frames.name}, {ONCE}")
-        with file.written() as path:
-            quantize(exact.file, calibration_images(sized.config, exact.cameras, [frames], CALIBRATION_FRAMES), path)
-        return file.opened(cls, frames.name)
+        note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {file.path}"
+        return replace(model, network=cached.network, file=file.path, engine_note=note)
 
 
 class OnnxRuntimeEngine(Engine):
@@ -380,7 +368,7 @@ class CachedFile:
 
     def load(self, engine: type[Engine]) -> CachedNetwork | None:
         """The file in an engine; None where it is missing or broken. Raises BevcliError for a missing engine."""
-        return _load(self, engine, self.stamp)
+        return _load(self, engine, self.stamp)  # type: ignore[arg-type]  # mypy takes a class for its instances
 
     @contextmanager
     def written(self) -> Iterator[Path]:

@@ -3,7 +3,7 @@
 The futures of true objects are the places where the same objects are in later frames of the ground truth.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -96,8 +96,8 @@ class DrivingScores:
             content["motion"] = {name: {**sums.metrics, "ground_truth": sums.truths} for name, sums in motion.items()}
         if (plan := self.plan) is not None:
             content["plan"] = {
-                "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
-                "at_horizon": _horizons(plan, plan.at, plan.collisions_with_vehicles),
+                "averaged_up_to_horizon": _horizons(plan, averaged=True),
+                "at_horizon": _horizons(plan, averaged=False),
                 "frames": len(plan.distances_m),
             }
         return content
@@ -116,8 +116,8 @@ class DrivingScores:
                 rows.append((name, str(sums.truths), *map(number, sums.metrics.values())))
             yield aligned(rows)
         if (plan := self.plan) is not None:
-            averaged = _horizons(plan, plan.averaged, plan.collisions)
-            at = _horizons(plan, plan.at, plan.collisions_with_vehicles)
+            averaged = _horizons(plan, averaged=True)
+            at = _horizons(plan, averaged=False)
             rows = [("planned path", *averaged["L2"], "", *averaged["L2"])]
             for name, unit, factor in (("L2", "m", 1), ("collision", "%", 100)):
                 cells = [[number(factor * value) for value in of[name].values()] for of in (averaged, at)]
@@ -126,14 +126,14 @@ class DrivingScores:
             yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"
 
 
-def _horizons(
-    plan: metrics.PlanScores, of: Callable[[Any, float], float], collisions: Any
-) -> dict[str, dict[str, float]]:
-    """Distances and shares of collisions by horizon, in one convention."""
+def _horizons(plan: metrics.PlanScores, *, averaged: bool) -> dict[str, dict[str, float]]:
+    """Distances and shares of collisions by horizon: averaged up to it (ST-P3, VAD), or at it, of vehicles (UniAD)."""
+    score = plan.averaged if averaged else plan.at
+    collisions = plan.collisions if averaged else plan.collisions_with_vehicles
     seconds = [s for s in (1, 2, 3) if s <= plan.step_s * plan.distances_m.shape[1] + 1e-6]
     return {
-        "L2": {f"{s}s": of(plan.distances_m, s) for s in seconds},
-        "collision": {f"{s}s": of(collisions, s) for s in seconds},
+        "L2": {f"{s}s": score(plan.distances_m, s) for s in seconds},
+        "collision": {f"{s}s": score(collisions, s) for s in seconds},
     }
 
 
