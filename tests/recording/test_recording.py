@@ -183,7 +183,7 @@ def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes)
     failed = replace(predict(frame), boxes=Boxes3D.empty(), bev=None, started_anew=gap, **changes)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, failed)
-    assert sorted(events(tmp_path / "r.rrd")) == sorted(_frame_warnings(frame, failed))
+    assert sorted(events(tmp_path / "r.rrd")) == sorted(_frame_warnings(frame, failed, standing=None))
 
 
 def test_a_minimal_recording_has_no_internals(tmp_path):
