@@ -83,9 +83,9 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
 
     tracking: the dataclass of the table TRACKING; None for no such table.
     """
-    portable = {name: replace(own, mesh=None) for name, own in config.class_settings.items()}
-    stated = {name: own for name, own in portable.items() if own != ClassSettings()}
-    table = {ARCHITECTURE: config.architecture, **_plain(replace(config, class_settings=stated))}
+    portable = {name: replace(settings, mesh=None) for name, settings in config.class_settings.items()}
+    changed = {name: settings for name, settings in portable.items() if settings != ClassSettings()}
+    table = {ARCHITECTURE: config.architecture, **_plain(replace(config, class_settings=changed))}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
 
 

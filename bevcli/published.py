@@ -184,10 +184,10 @@ def own_table() -> Path:
 
 def read_sources() -> dict[str, Source]:
     """All sources by name; those of the user's own file replace those of the package. Raises ConfigError."""
-    package, own = resources.files("bevcli").joinpath("weights", "sources.toml"), own_table()
+    package, own_file = resources.files("bevcli").joinpath("weights", "sources.toml"), own_table()
     texts = {"sources.toml": package.read_text(encoding="utf-8")}
-    if own.is_file():
-        texts[str(own)] = read_text(own, TOML_BYTES, error=ConfigError)
+    if own_file.is_file():
+        texts[str(own_file)] = read_text(own_file, TOML_BYTES, error=ConfigError)
     sources = {}
     for file, text in texts.items():
         for name, table in parse_toml(text, file, ConfigError).items():

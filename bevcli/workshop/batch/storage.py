@@ -78,13 +78,13 @@ class LocalFolder:
         """All files below the folder, sorted by name; of a file, the file itself. Raises InputError."""
         if self.path.is_file():
             return [_stored(self.path, self.path.name)]
-        found = []
+        files = []
         for folder, _, names in os.walk(self.path):
             for name in names:
                 path = Path(folder, name)
                 with contextlib.suppress(OSError):  # a broken link
-                    found.append(_stored(path, path.relative_to(self.path).as_posix()))
-        return sorted(found)
+                    files.append(_stored(path, path.relative_to(self.path).as_posix()))
+        return sorted(files)
 
     def names(self, folder: str) -> set[str]:
         """The entries of a subfolder, empty without it. Raises InputError."""
@@ -136,9 +136,9 @@ class RemoteFolder:
     def files(self) -> list[StoredFile]:
         with _one_line(self.where, InputError):
             self._system.invalidate_cache()
-            found = self._system.find(self._root, detail=True)
+            entries = self._system.find(self._root, detail=True)
         own_name = PurePosixPath(self._root).name  # where the folder is a file
-        return sorted(_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items())
+        return sorted(_described(name[len(self._root) + 1 :] or own_name, entry) for name, entry in entries.items())
 
     def names(self, folder: str) -> set[str]:
         with _one_line(f"{self.where}/{folder}", InputError), contextlib.suppress(FileNotFoundError):
@@ -213,14 +213,14 @@ def open_storage(where: str) -> Storage:
 
 
 def _stored(path: Path, name: str) -> StoredFile:
-    facts = path.stat()
-    return StoredFile(name, facts.st_size, str(facts.st_mtime_ns))
+    status = path.stat()
+    return StoredFile(name, status.st_size, str(status.st_mtime_ns))
 
 
-def _described(name: str, facts: dict[str, Any]) -> StoredFile:
+def _described(name: str, entry: dict[str, Any]) -> StoredFile:
     keys = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "mtime", "updated", "last_modified")
-    version = next((str(facts[key]) for key in keys if facts.get(key)), "")
-    return StoredFile(name, int(facts.get("size") or 0), version)
+    version = next((str(entry[key]) for key in keys if entry.get(key)), "")
+    return StoredFile(name, int(entry.get("size") or 0), version)
 
 
 def _filesystem(url: str) -> tuple[Any, str]:

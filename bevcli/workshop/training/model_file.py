@@ -184,10 +184,10 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     for path, changes in changes_by_table.items():
         _change(table, path, changes)
     official = [label for label in NUSCENES_CLASSES if label in facts.class_counts]
-    own = [label for label in facts.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
-    table |= {"name": name, "classes": official + own, "cameras": list(facts.cameras)}
-    if own:
-        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
+    further = [label for label in facts.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": official + further, "cameras": list(facts.cameras)}
+    if further:
+        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in further}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
     table["image"]["size"] = _image_size(facts, table["image"]["size"][0])

@@ -74,12 +74,12 @@ def check_scored_drives(data: DriveOptions, drives: Drives, config: ModelConfig)
     return tuple(check_classes(drives, _count(drives), "scored", config))
 
 
-def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> Iterator[str]:
+def check_classes(drives: Drives, described: str, use: str, config: ModelConfig) -> Iterator[str]:
     """Notes about the classes in the ground truth of drives: boxes that are left out, and classes without a box.
 
     Args:
         drives: folders; opens each of them, and reads the frames of a format that has no table of its boxes.
-        where: the set of drives, for messages, such as "the 4 held-out drives".
+        described: the set of drives, for messages, such as "the 4 held-out drives".
         use: what happens to boxes of known classes: "trained on" or "scored".
 
     Raises InputError where no box has a class of the model.
@@ -90,10 +90,10 @@ def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> 
     absent = [name for name in config.classes if not counts[name]]
     if counts and len(absent) == len(config.classes):
         named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
-        raise _no_known_class(f"the ground truth of {where}", named, counts.most_common(1)[0][0], config)
-    yield from ClassNames(classes=config.classes).note(counts, where, use)
+        raise _no_known_class(f"the ground truth of {described}", named, counts.most_common(1)[0][0], config)
+    yield from ClassNames(classes=config.classes).note(counts, described, use)
     if counts and absent:
-        yield f"{where}: no box has the class {' or '.join(absent)} of the model {config.name}"
+        yield f"{described}: no box has the class {' or '.join(absent)} of the model {config.name}"
 
 
 def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -> None:
@@ -131,11 +131,11 @@ def _too_short(drives: str, clip_frames: int, frames: int) -> InputError:
     )
 
 
-def _no_known_class(where: str, found: str, example: str, config: ModelConfig) -> InputError:
+def _no_known_class(described: str, named: str, example: str, config: ModelConfig) -> InputError:
     return InputError(
-        f"{where} has no class of the model {config.name} (expected {', '.join(config.classes)}; found {found}): pass "
-        f"`class_map={{{example!r}: {config.classes[0]!r}}}` (`--class-map {example}={config.classes[0]}`), or set "
-        "classes in the model's file"
+        f"{described} has no class of the model {config.name} (expected {', '.join(config.classes)}; found {named}): "
+        f"pass `class_map={{{example!r}: {config.classes[0]!r}}}` (`--class-map {example}={config.classes[0]}`), or "
+        "set classes in the model's file"
     )
 
 

@@ -143,36 +143,36 @@ def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> W
     reasons = dict.fromkeys(rows, "rows in the file's order")
     reasons |= {key: "interpolated from another grid" for key in state if resampled[key] is not checkpoint.state[key]}
     reasons |= {key: "the first queries of the file" for key in state if state[key] is not resampled[key]}
-    own = model.state_dict()
+    model_state = model.state_dict()
     for key, tensor in state.items():
-        if key not in own:
+        if key not in model_state:
             start.count("unused", _part(key), "not in the model", tensor.numel(), key)
-        elif key in rows and rows[key].fit(tensor, own[key]):
-            rows[key].count(start, own[key][0].numel())
-            own[key] = rows[key].filled(tensor, own[key])
+        elif key in rows and rows[key].fit(tensor, model_state[key]):
+            rows[key].count(start, model_state[key][0].numel())
+            model_state[key] = rows[key].filled(tensor, model_state[key])
         else:
-            own[key] = _whole(start, key, tensor, own[key], reasons.get(key, ""))
-    for key in (key for key in own if key not in state):
-        start.count("new", _part(key), "not in the file", own[key].numel(), key)
+            model_state[key] = _whole(start, key, tensor, model_state[key], reasons.get(key, ""))
+    for key in (key for key in model_state if key not in state):
+        start.count("new", _part(key), "not in the file", model_state[key].numel(), key)
     if start.share < LEAST_SHARE:
         of = f"model {start.source}" if start.source else "an unknown model"
         raise WeightsError(
             f"{file}: holds {start.share:.0%} of the numbers of {model_file} (expected at least "
             f"{LEAST_SHARE:.0%}): its weights are of {of}; choose some of a model with the same backbone and channels"
         )
-    model.load_state_dict(own)
+    model.load_state_dict(model_state)
     return start
 
 
-def _whole(start: WarmStart, key: str, tensor: Tensor, own: Tensor, reason: str) -> Tensor:
+def _whole(start: WarmStart, key: str, tensor: Tensor, initial: Tensor, reason: str) -> Tensor:
     """A tensor of the file if it has the model's shape, or else the model's. reason: for the line of a loaded one."""
-    if tensor.shape == own.shape:
-        start.count("loaded", _part(key), reason, own.numel())
+    if tensor.shape == initial.shape:
+        start.count("loaded", _part(key), reason, initial.numel())
         return tensor
-    shapes = f"{key}: {_shape(tensor)} and {_shape(own)}"
-    start.count("new", _part(key), "another shape in the file", own.numel(), shapes)
+    shapes = f"{key}: {_shape(tensor)} and {_shape(initial)}"
+    start.count("new", _part(key), "another shape in the file", initial.numel(), shapes)
     start.count("unused", _part(key), "another shape in the model", tensor.numel())
-    return own
+    return initial
 
 
 def _part(key: str) -> str:
@@ -209,11 +209,11 @@ def _class_keys(model: Network) -> list[str]:
 def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes", "cameras"]) -> tuple[str, ...]:
     """The classes or cameras of a weights file: as it states, or those of the model that it is of; else none."""
     try:
-        stated = json.loads(checkpoint.facts.get(what, "null"))
+        names = json.loads(checkpoint.facts.get(what, "null"))
     except ValueError:
-        stated = None
-    if isinstance(stated, list) and all(isinstance(name, str) for name in stated):
-        return tuple(stated)
+        names = None
+    if isinstance(names, list) and all(isinstance(name, str) for name in names):
+        return tuple(names)
     name, models = checkpoint.facts.get("model"), checkpoint.models
     if models and (name is None or name in models):
         return tuple(getattr(load_config(models[0]), what))
@@ -280,18 +280,18 @@ def start_backbone(file: Path, model: Network, model_file: str) -> tuple[WarmSta
         raise WeightsError(
             f"{file}: {held}; choose other `backbone_weights` (`--backbone-weights`), or another kind in [backbone]"
         )
-    start, own = WarmStart(file, "", f"the backbone of {model_file}"), model.backbone.state_dict()
+    start, model_state = WarmStart(file, "", f"the backbone of {model_file}"), model.backbone.state_dict()
     if origin == "bevcli":
         renamed = {key.removeprefix("backbone."): tensor for key, tensor in state.items()}
     else:
         rename = _of_resnet if kind == "resnet" else _of_blocks(config, origin)
         renamed = {rename(key): tensor for key, tensor in state.items()}
-    for key, tensor in own.items():
+    for key, tensor in model_state.items():
         stage = re.match(r"stages\.(\d+)\.", key)
         part = f"backbone: stage {int(stage[1]) + 1}" if stage else "backbone: stem"
         if key in renamed and renamed[key].shape == tensor.shape:
             start.count("loaded", part, "", tensor.numel())
-            own[key] = renamed[key]
+            model_state[key] = renamed[key]
         elif key not in renamed and ("offset_and_mask" in key or key.endswith(INTEGER_KEY)):
             start.count("new", part, "not in the file", tensor.numel(), key)
         else:
@@ -301,9 +301,9 @@ def start_backbone(file: Path, model: Network, model_file: str) -> tuple[WarmSta
                 "other `backbone_weights` (`--backbone-weights`), or change [backbone]"
             )
     for key, tensor in renamed.items():
-        if key not in own:
+        if key not in model_state:
             start.count("unused", "other parts", "not in the backbone", tensor.numel(), key)
-    model.backbone.load_state_dict(own)
+    model.backbone.load_state_dict(model_state)
     return start, tuple(_notes(usual, model.config.image, start))
 
 
@@ -311,7 +311,7 @@ def _notes(usual: Normalisation | None, image: ImageConfig, start: WarmStart) ->
     if usual is None:
         return []
     pairs = zip((*usual[0], *usual[1]), (*image.mean, *image.std), strict=True)
-    if image.color_order == "rgb" and all(abs(theirs - own) <= ALMOST for theirs, own in pairs):
+    if image.color_order == "rgb" and all(abs(theirs - ours) <= ALMOST for theirs, ours in pairs):
         return []
     text = f"{start.file}: such weights usually take images with mean {list(usual[0])} and std {list(usual[1])}"
     return [f"{text} in RGB; the model's are {list(image.mean)}, {list(image.std)} in {image.color_order.upper()}"]
