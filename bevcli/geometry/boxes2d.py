@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +50,11 @@ class Boxes2D:
         for class_name, score, corners in zip(self.classes, self.scores, self.corners, strict=True):
             yield Box2D(str(class_name), float(score), corners)
 
-    def select(self, chosen: NDArray[Any] | np.bool) -> "Boxes2D":
-        """Some of the boxes. chosen: a mask (N,) bool, or indices."""
+    def scored(self, least: float) -> "Boxes2D":
+        """Those with this score or more."""
+        chosen = self.scores >= least
         return Boxes2D(self.corners[chosen], self.classes[chosen], self.scores[chosen])
+
+    def outlines(self) -> Array:
+        """(N, 5, 2) pixels, closed."""
+        return self.corners[:, [[0, 1], [2, 1], [2, 3], [0, 3], [0, 1]]]

@@ -25,15 +25,13 @@ def camera_boxes(found: ImageBoxes, prepared: PreparedFrame, image: ImageConfig)
     """
     boxes = {}
     for index, (name, scale) in enumerate(zip(prepared.assignment.cameras, prepared.scales, strict=True)):
-        scores = found.scores[0, index].double().numpy()
-        chosen = scores >= LEAST_SCORE
         if not prepared.has_image[0, index]:
             continue
-        resized = found.boxes[0, index].double().numpy()[chosen] + np.tile(image.crop_box[:2], 2) + 0.5
-        corners = in_image(resized / scale - 0.5, prepared.frame.rig[name])
-        labels = found.labels[0, index].numpy()[chosen]
-        in_sight = (corners[:, 2:] > corners[:, :2]).all(1)  # False for NaN
-        boxes[name] = Boxes2D(corners, np.array(IMAGE_CLASSES)[labels], scores[chosen]).select(in_sight)
+        resized = found.boxes[0, index].double().numpy() + np.tile(image.crop_box[:2], 2) + 0.5
+        corners, scores = in_image(resized / scale - 0.5, prepared.frame.rig[name]), found.scores[0, index].numpy()
+        chosen = (scores >= LEAST_SCORE) & (corners[:, 2:] > corners[:, :2]).all(1)  # False for NaN
+        classes = np.array(IMAGE_CLASSES)[found.labels[0, index].numpy()]
+        boxes[name] = Boxes2D(corners[chosen], classes[chosen], scores[chosen].astype(np.float64))
     return boxes
 
 

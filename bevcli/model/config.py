@@ -14,6 +14,7 @@ from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
@@ -252,6 +253,11 @@ class ModelConfig:
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
         return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
+    @property
+    def image_classes(self) -> tuple[str, ...]:
+        """The classes of the boxes in the images, in the order of their labels; empty without a detector."""
+        return IMAGE_CLASSES if isinstance(self.backbone, NanoDetConfig) else ()
 
     @property
     def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:

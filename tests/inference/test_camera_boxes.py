@@ -62,4 +62,4 @@ def test_boxes_end_at_the_image_and_those_beside_it_are_left_out(mini_config):
     around, beside = [-9.0, 20.0, 999.0, 999.0], [321.0, 20.0, 330.0, 40.0]
     found = camera_boxes(image_boxes([around, beside], [0.8, 0.7]), prepared(config), config.image)["CAM_FRONT"]
     np.testing.assert_allclose(found.corners, [[-0.5, 40.5, 639.5, 359.5]])
-    assert len(found.select(found.scores > 0.9)) == 0
+    assert len(found.scored(0.9)) == 0

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
@@ -144,7 +143,7 @@ def _image_box_ports(config: ModelConfig, cameras: int) -> Iterator[Port]:
         "first pixel has its centre at 0.",
     )
     yield Port("image_scores", shape, "(1, N, K): 0 to 1, falling; 0 for none.")
-    names = ", ".join(f"{index} {name}" for index, name in enumerate(IMAGE_CLASSES))
+    names = ", ".join(f"{index} {name}" for index, name in enumerate(config.image_classes))
     yield Port("image_labels", shape, f"(1, N, K): {names}.", torch.int64)
 
 
