@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
     from bevcli.geometry.boxes import Box3D as Box3D, Boxes3D as Boxes3D
+    from bevcli.geometry.boxes2d import Box2D as Box2D, Boxes2D as Boxes2D
     from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, SHOWN_SCORE, Color, ObjectClass
@@ -433,6 +434,7 @@ class Prediction:
         attention: what the attentions sampled, where this was asked for.
         stage_seconds: stage of the pipeline -> seconds, in the order of execution.
         results: further results of the model, each of another type.
+        image_boxes: camera -> boxes in its image, of the cameras with an image; None where the model has no detector.
         object_classes: of the model, by name.
         frame: that it is for, with its images, which `plot` draws; None where it was left out.
         untrained: whether the weights are random: boxes and maps are meaningless.
@@ -452,6 +454,7 @@ class Prediction:
     attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     results: tuple[FrameResult, ...] = ()
+    image_boxes: Mapping[str, Boxes2D] | None = None
     object_classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     frame: Frame | None = None
     untrained: bool = False

@@ -57,7 +57,7 @@ def run(
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
     tracks.csv (one row a box with its track), summary.json, for models that predict a map segmentation/, and for a
     drive of one scene calibration.json (the rig). A model that predicts lines of the map or plans a path adds
-    map_lines.json and plan.csv.
+    map_lines.json and plan.csv, one with a detector image_boxes.csv (one row a box in a camera's image).
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     gc.disable()  # a fifth faster: of the million objects of the packages, hardly any is garbage

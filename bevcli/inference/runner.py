@@ -16,6 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, Drive, Frame, FrameResult, FrameStamp, NewStart, Prediction, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
+from bevcli.inference.image_boxes import camera_boxes
 from bevcli.inference.options import StepOptions
 from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
 from bevcli.inference.preprocess import Preprocessor
@@ -184,6 +185,8 @@ class Runner:
             if is_finite:
                 after, fields = begun.after, self._decoded(last_layers, begun)
                 fields["bev"] = last_layers.bev[0] if last_layers.bev.shape[1] else None
+                if last_layers.image_boxes is not None:
+                    fields["image_boxes"] = camera_boxes(last_layers.image_boxes, prepared, self.config.image)
                 fields["attention"] = None if probe is None else attention_view(probe, prepared, self.config)
                 fields["stage_seconds"] = self.clock.read()
             else:

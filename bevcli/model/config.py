@@ -14,7 +14,9 @@ from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
 
@@ -188,7 +190,7 @@ class ModelConfig:
     max_gap_s: float = 2.0
     channels: int = 256
     heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
-    backbone: ResNetConfig | EfficientNetLiteConfig = field(default_factory=ResNetConfig)
+    backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = field(default_factory=ResNetConfig)
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
@@ -251,6 +253,11 @@ class ModelConfig:
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
         return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
+    @property
+    def image_classes(self) -> tuple[str, ...]:
+        """The classes of the boxes in the images, in the order of their labels; empty without a detector."""
+        return IMAGE_CLASSES if isinstance(self.backbone, NanoDetConfig) else ()
 
     @property
     def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:

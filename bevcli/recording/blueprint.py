@@ -157,7 +157,8 @@ def _views(recorded: Recorded, title: str, hidden_layers: tuple[str, ...]) -> rr
 
 def _scene(recorded: Recorded, titled: str, hidden_layers: tuple[str, ...]) -> rrb.Spatial3DView:
     lines = (*sorted(result.kind for result in recorded.results), entities.FUTURES)
-    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", entities.MODELS, *lines)
+    boxes = ("boxes", "ground_truth", entities.IMAGE_BOXES, entities.MODELS)
+    drawn_in_images = (*boxes, "pillars", "probes", *lines)
     overlays = [entities.overlay(name, kind) for name in recorded.drive.rig.names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]

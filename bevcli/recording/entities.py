@@ -70,6 +70,7 @@ LEGEND = "legend"
 EVENTS = "events"
 RUN = "run"
 FUTURES = "futures"  # a kind of lines on the ground
+IMAGE_BOXES = "image_boxes"  # an overlay: the boxes that a detector sees in the image
 # Last parts of the entities below "bev" that are no lines of a model's results.
 OTHER_BELOW_BEV = {
     *("features", "segmentation", "history", "range_rings", "vehicle", "boxes", "tracks", "ground_truth", "probes"),
@@ -144,8 +145,8 @@ def _escaped(name: str) -> str:
 
 
 def overlay(name: str, kind: str) -> str:
-    """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars", "probes",
-    or a kind of lines on the ground.
+    """The entity of an image overlay. kind: "boxes", "boxes/labels", IMAGE_BOXES, "ground_truth", "pillars",
+    "probes", or a kind of lines on the ground.
     """
     return f"{camera(name)}/{kind}"
 

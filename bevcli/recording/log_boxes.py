@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from bevcli.frame import FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.matching import MATCH_DISTANCE_M, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
 from bevcli.recording.components import Components, any_values, components, line_strips, log, ui_points
 
+OF_COCO = {"person": "pedestrian"}  # classes of boxes in images that are called otherwise in the scene
 LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = ui_points(0.8), ui_points(1.6)
@@ -105,10 +107,11 @@ def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray
     return is_true, is_found
 
 
-def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
+def box_colors(boxes: Boxes3D | Boxes2D, classes: Mapping[str, Color]) -> np.ndarray:
     """(N, 3) uint8 RGB: the colour of each box's class."""
     other = entities.index_color(len(classes))
-    return np.array([classes.get(name, other) for name in boxes.classes.tolist()], dtype=np.uint8).reshape(-1, 3)
+    names = [OF_COCO.get(name, name) for name in boxes.classes.tolist()]
+    return np.array([classes.get(name, other) for name in names], dtype=np.uint8).reshape(-1, 3)
 
 
 def log_boxes_3d(

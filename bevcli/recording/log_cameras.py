@@ -1,6 +1,6 @@
 """Writes the cameras of a frame into a recording: poses, images, boxes and other overlays of the images."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bevcli.frame import CameraImage, CameraSamples
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 from bevcli.parsing.images import encode_image
@@ -28,7 +29,8 @@ LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
 UNSEEN = ui_points(0.01)  # of a point that shows only its label
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
-POINT = ui_points(2.0)
+POINT, THIN = ui_points(2.0), ui_points(0.5)
+NO_COLORS = np.zeros((0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -262,6 +264,20 @@ def log_boxes_in_images(
                 names, label_colors = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
                 labels = labels_2d(positions[chosen], names, colors=label_colors, draw_order=layer.order + 1)
                 log(stream, f"{entity}/labels", labels)
+
+
+def log_image_boxes(
+    stream: rr.RecordingStream,
+    cameras: Sequence[PosedCamera],
+    boxes: Mapping[str, Boxes2D],
+    colors: Mapping[str, NDArray[np.uint8]],
+) -> None:
+    """Draws boxes in images as thin rectangles. boxes, and their colours (N, 3): by camera."""
+    for posed in cameras:
+        name = posed.camera.name
+        strips = boxes[name].outlines() if name in boxes else np.zeros((0, 5, 2))
+        row = components(rr.LineStrips2D, strips=strips, colors=colors.get(name, NO_COLORS), radii=THIN, draw_order=15)
+        log(stream, entities.overlay(name, entities.IMAGE_BOXES), row)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:

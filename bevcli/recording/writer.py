@@ -262,6 +262,11 @@ class Recording:
         if prediction is not None:
             if self._recorded.results:
                 self._log_results(prediction, place, cameras)
+            if self._recorded.config is not None and self._recorded.config.image_classes:
+                found_in = prediction.image_boxes or {}
+                shown = {name: boxes.scored(self._options.score) for name, boxes in found_in.items()}
+                colors = {name: log_boxes.box_colors(boxes, self._recorded.classes) for name, boxes in shown.items()}
+                log_cameras.log_image_boxes(stream, cameras, shown, colors)
             self._log_stages(prediction, is_first=is_first)
         elif self._recorded.map_classes:
             self._log_map(frame.ground_truth_map, frame.rig.ego_from_bev)

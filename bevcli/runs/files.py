@@ -24,7 +24,7 @@ from bevcli.runs.options import RunOptions
 from bevcli.runs.state import FilesState, RunState, save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.boxes_table import CsvWriter
+from bevcli.sequences.files.boxes_table import CsvWriter, ImageBoxesWriter
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.sequences.files.json_fields import pose_to_json
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from bevcli.sequences.files.submission import SubmissionWriter
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
-TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
+TRACKS, IMAGE_BOXES, SEGMENTATION = "tracks.csv", "image_boxes.csv", "segmentation"
 SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long it takes
 Growing = TypeVar("Growing", bound=GrowingFile)
@@ -69,6 +69,7 @@ class RunFiles:
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
         self._submission: SubmissionWriter | None = None  # of nuScenes drives
         self._tracks: CsvWriter | None = None
+        self._image_boxes: ImageBoxesWriter | None = None  # of models with a detector
         self._reference = "world" if drive.has_ego_motion else "ego"
         self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
         self._map_frames = list(state.files.map_frames) if state.files else []
@@ -98,6 +99,8 @@ class RunFiles:
             self._boxes = self._open(PREDICTIONS, BoxesWriter, frame_of_reference=self._reference, extras=extras)
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
+            if config.image_classes:
+                self._image_boxes = self._open(IMAGE_BOXES, ImageBoxesWriter)
             for result, names in config.results.items():
                 about = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}
                 self._results[result] = self._open(result.file_name, result.writer, **about)
@@ -168,6 +171,8 @@ class RunFiles:
             instances = boxes.instances
             tracked = of_frame if instances is None else replace(of_frame, boxes=boxes[instances != ""])
             self._tracks.write(tracked, self._reference)
+        if self._image_boxes is not None:
+            self._image_boxes.write(frame.stamp, prediction.image_boxes or {})
         if frame.sample_token is not None:
             self._submission = self._submission or self._open_submission()
             self._submission.write(of_frame)
@@ -205,7 +210,8 @@ class RunFiles:
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
-        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
+        tables = (TRACKS, IMAGE_BOXES, SUBMISSION, SEGMENTATION, CALIBRATION)
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, *tables)]
         paths += [self._out / result.file_name for result in self._results]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 

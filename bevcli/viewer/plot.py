@@ -49,18 +49,19 @@ def plot(prediction: Prediction, image: str | None, score: float, color_order: C
         raise InputError(f"`image={image}`: is not a camera of the rig (it has {', '.join(frame.rig.names)})")
     colors = class_colors(prediction.object_classes.values())
     if image is None:
-        drawn = _whole(prediction, frame, boxes, colors)
+        drawn = _whole(prediction, frame, boxes, colors, score)
     else:
         camera = frame.rig[image]
-        drawn = _camera_image(prediction, frame, boxes, colors, camera, camera.width, camera.height)
+        drawn = _camera_image(prediction, frame, boxes, colors, score, camera, camera.width, camera.height)
     return drawn if color_order == "bgr" else np.ascontiguousarray(drawn[..., ::-1])
 
 
-def _whole(prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color]) -> Canvas:
+def _whole(prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color], score: float) -> Canvas:
     canvas = new_sheet()
     sizes = {camera.name: (camera.width, camera.height) for camera in frame.rig.cameras}
     for tile in tiles_of(sizes, {camera.name: camera.yaw for camera in frame.rig.cameras}):
-        drawn = _camera_image(prediction, frame, boxes, colors, frame.rig[tile.camera], tile.width, tile.height)
+        camera = frame.rig[tile.camera]
+        drawn = _camera_image(prediction, frame, boxes, colors, score, camera, tile.width, tile.height)
         canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width] = drawn
     _draw_from_above(canvas[:, CAMERAS_WIDTH:], prediction, frame, boxes, colors)
     _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], prediction, boxes, colors)
@@ -72,6 +73,7 @@ def _camera_image(
     frame: Frame,
     boxes: Boxes3D,
     colors: dict[str, Color],
+    score: float,
     camera: Camera,
     width: int,
     height: int,
@@ -87,6 +89,10 @@ def _camera_image(
     world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
     [lines] = lines_in_images(boxes.transformed(world_from_bev).corners(), [posed])
     own_colors, texts = box_colors(boxes, colors), box_labels(boxes)
+    if prediction.image_boxes and camera.name in prediction.image_boxes:
+        in_image = prediction.image_boxes[camera.name].scored(score)
+        for outline, color in zip(in_image.outlines(), box_colors(in_image, colors), strict=True):
+            draw_lines(canvas, [outline * (width / camera.width, height / camera.height)], _bgr(color))
     for box in np.unique(lines.owners):
         draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)
     size = max(0.36, width * LABEL_SHARE)

@@ -198,6 +198,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     boxes = entities.overlay(tile.camera, "boxes")
     for kind in entities.line_kinds(frame.rows):
         draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
+    draw_strips(canvas, frame, entities.overlay(tile.camera, entities.IMAGE_BOXES), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
     layers = [entities.layer(entities.camera(tile.camera), name) for name in _layers(frame)]
     for entity in (boxes, *layers):
