@@ -1,6 +1,7 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import cv2
@@ -12,6 +13,8 @@ from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation
 
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
 TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
+ROAD_S = 5.0  # the mean of the vehicle's upward axis over this time before and after is taken for the road's
+LONGEST_S = 0.5  # that a pose counts for in that mean
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,27 @@ class EgoMotion:
         later = min(row + 1, len(self.timestamps_ns) - 1)
         columns = self.accelerations, self.angular_rates, self.velocities
         return Kinematics(*(column[row] + fraction * (column[later] - column[row]) for column in columns))
+
+    def road_normal_at(self, timestamp_ns: int) -> Array:
+        """(3,) unit vector that points up from the road, ego frame at a time.
+
+        The body pitches and rolls over the road, which is as the vehicle stands on the mean. Poses against gravity do
+        not tell where the road slopes. Raises InputError as `pose_at`.
+        """
+        row, fraction = self._locate(timestamp_ns)
+        normal = self._road_normals[row + round(fraction)]
+        return np.asarray(rotation_from_quaternion(self.pose_at(timestamp_ns).quaternion).T @ normal)
+
+    @cached_property
+    def _road_normals(self) -> Array:
+        """(T, 3) in the world frame."""
+        seconds = (self.timestamps_ns - self.first_ns) / 1e9
+        upward = np.stack([rotation_from_quaternion(q)[:, 2] for q in self.quaternions])
+        weights = np.minimum(np.gradient(seconds), LONGEST_S) if len(seconds) > 1 else np.ones(1)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(weights[:, None] * upward, axis=0)])
+        begin, end = np.searchsorted(seconds, seconds - ROAD_S), np.searchsorted(seconds, seconds + ROAD_S, "right")
+        normals = sums[end] - sums[begin]
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
         times, first, last = self.timestamps_ns, self.first_ns, self.last_ns

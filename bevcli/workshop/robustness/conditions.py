@@ -170,23 +170,25 @@ class EgoMotionLost(ChangedDrive):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._arrived: dict[int, tuple[Pose, Kinematics]] = {}
+        self._arrived: dict[int, Frame] = {}
 
     def change(self, index: int, frame: Frame) -> Frame:
         last = self._last_arrived(index)
         if last not in self._arrived:
             earlier = frame if last == index else self.drive.load(last)
-            self._arrived[last] = earlier.world_from_ego, earlier.kinematics
+            self._arrived[last] = replace(earlier, images={}, ground_truth=None)
         if last == index:
             return frame
-        pose, kinematics = self._arrived[last]
+        arrived = self._arrived[last]
+        pose = arrived.world_from_ego
         stated_from_world = pose.matrix @ inverse(frame.world_from_ego.matrix)
         truth = frame.ground_truth
         return replace(
             frame,
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(frame.world_from_ego_at, pose),
-            kinematics=kinematics,
+            kinematics=arrived.kinematics,
+            road_normal=arrived.road_normal,
             ground_truth=None if truth is None else truth.transformed(stated_from_world),
         )
 
