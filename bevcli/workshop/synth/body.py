@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import lsim
 
 from bevcli.geometry.transforms import Array, rigid
+from bevcli.workshop.synth.rig import tilt
 from bevcli.workshop.synth.traffic import EgoTrack
 
 MOST_DEG = (1.5, 1.0)  # pitch and roll
@@ -55,6 +56,5 @@ class BodyMotion:
     def level_from_body(self, time_s: float) -> Array:
         """(4, 4) from the ego frame to that of the vehicle on a level road with its springs at rest, metres."""
         pitch, roll, heave = (np.interp(time_s, self.times, x) for x in (*self.turns.T, self.heaves))
-        (cp, sp), (cr, sr) = ((np.cos(angle), np.sin(angle)) for angle in (pitch, roll))
-        turn = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        turn = tilt(pitch, roll)
         return rigid(MIDDLE + (0, 0, heave)) @ rigid(-turn @ MIDDLE, turn)

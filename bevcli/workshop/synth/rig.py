@@ -5,7 +5,7 @@ A rig is the default one, one from a file, or one drawn at random for training a
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -351,8 +351,11 @@ def _fitting(coefficients: tuple[float, ...], intrinsics: Array, size: tuple[int
 
 
 def _tilt(largest_deg: float, random: Generator) -> Array:
-    """(3, 3) rotation by a pitch about y and a roll about x, in a frame with x forward."""
-    pitch, roll = np.radians(random.uniform(-1, 1, 2) * largest_deg)
+    return tilt(*np.radians(random.uniform(-1, 1, 2) * largest_deg))
+
+
+def tilt(pitch: float, roll: float) -> Array:
+    """(3, 3) rotation by a pitch about y (nose down) and a roll about x (right side down), radians, x forward."""
     about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return np.asarray(about_y @ about_x)
