@@ -150,8 +150,8 @@ class CalibrationNoise(ChangedDrive):
 class BodyPitch(ChangedDrive):
     """A sequence whose body pitches and rolls, each frame anew; poses and calibration do not tell.
 
-    Level L has normal noise: a pitch with a standard deviation of L/2 degrees, and a roll of half of that. All images of
-    a frame are turned together about their cameras, which stay in place. What they show at last repeats their edges.
+    Level L draws a pitch with a standard deviation of L/2 degrees, and a roll with half of that. All images of a frame
+    are turned together about their cameras, which stay in place. What comes in from outside repeats an image's edge.
     """
 
     def change(self, index: int, frame: Frame) -> Frame:
