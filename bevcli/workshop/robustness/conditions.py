@@ -157,9 +157,11 @@ class BodyPitch(ChangedDrive):
     def change(self, index: int, frame: Frame) -> Frame:
         draws = self.random(frame.stamp, frame.stamp.index).standard_normal(2)
         level_from_body = tilt(*np.radians(self._level / 2 * draws * (1, 0.5)))
-        return _with_images(
-            frame, lambda name: _turned(frame.images[name].pixels_bgr, frame.rig[name], level_from_body)
-        )
+
+        def turned(name: str) -> Pixels:
+            return _turned(frame.images[name].pixels_bgr, frame.rig[name], level_from_body)
+
+        return _with_images(frame, turned)
 
 
 def _turned(pixels: Pixels, camera: Camera, level_from_body: Array) -> Pixels:
