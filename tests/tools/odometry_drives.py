@@ -1,7 +1,7 @@
 """The rendered drives of `odometry_accuracy.py`: `python tests/tools/odometry_drives.py OUT [--only NAME…]`.
 
-Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns; two hard drives, and two
-with a body that moves. Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.
+Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns; two hard drives; and
+two with a body that moves. Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.
 """
 
 import argparse
