@@ -51,6 +51,7 @@ class EgoMotion:
         angular_rates: (T, 3) rad/s, ego frame.
         velocities: (T, 3) m/s, ego frame.
         velocities_are_stated: whether they come from the input; if not, they are derived from the poses.
+        road_normals: (T, 3) unit vectors that point up from the road, ego frame; None: they are derived from the poses.
     """
 
     timestamps_ns: NDArray[np.int64]
@@ -60,6 +61,7 @@ class EgoMotion:
     angular_rates: Array
     velocities: Array
     velocities_are_stated: bool = field(default=True, kw_only=True)
+    road_normals: Array | None = field(default=None, kw_only=True)
 
     @property
     def first_ns(self) -> int:
@@ -73,8 +75,8 @@ class EgoMotion:
 
     def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
         """The poses and kinematics of some rows, by their increasing indices."""
-        columns = [column.name for column in fields(self) if column.name != "velocities_are_stated"]
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        return replace(self, **{name: x[rows] for name, x in columns.items() if isinstance(x, np.ndarray)})
 
     def covered(self, timestamps_ns: ArrayLike) -> NDArray[np.bool_]:
         """Whether each time is in the stored range, or at most 50 ms outside of it."""
@@ -103,8 +105,8 @@ class EgoMotion:
     def road_normal_at(self, timestamp_ns: int) -> Array:
         """(3,) unit vector that points up from the road, ego frame at a time.
 
-        The body pitches and rolls over the road, which is as the vehicle stands on the mean. Poses against gravity do
-        not tell where the road slopes. Raises InputError as `pose_at`.
+        Where it is not measured, the road is as the vehicle stands on the mean, over which the body pitches and rolls:
+        what poses state against gravity may be the slope of the road. Raises InputError as `pose_at`.
         """
         row, fraction = self._locate(timestamp_ns)
         normal = self._road_normals[row + round(fraction)]
@@ -113,8 +115,10 @@ class EgoMotion:
     @cached_property
     def _road_normals(self) -> Array:
         """(T, 3) in the world frame."""
-        seconds = (self.timestamps_ns - self.first_ns) / 1e9
-        upward = np.stack([rotation_from_quaternion(q)[:, 2] for q in self.quaternions])
+        rotations = np.stack([rotation_from_quaternion(q) for q in self.quaternions])
+        if self.road_normals is not None:
+            return np.einsum("tij,tj->ti", rotations, self.road_normals)
+        seconds, upward = (self.timestamps_ns - self.first_ns) / 1e9, rotations[:, :, 2]
         weights = np.minimum(np.gradient(seconds), LONGEST_S) if len(seconds) > 1 else np.ones(1)
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(weights[:, None] * upward, axis=0)])
         begin, end = np.searchsorted(seconds, seconds - ROAD_S), np.searchsorted(seconds, seconds + ROAD_S, "right")
