@@ -183,6 +183,7 @@ class Frame:
         world_from_ego_at: camera -> the vehicle's pose at that camera's own time, for every camera of the rig.
         kinematics: acceleration, angular rate and velocity at the frame's time.
         dropped: camera -> why its image is missing.
+        road_normal: (3,) unit vector that points up from the road, ego frame; None for the ego frame's z axis.
         ground_truth: boxes in the world frame.
         ground_truth_map: a map in the bev frame.
         ground_truth_results: further ground truth in the bev frame, each of another type.
@@ -197,6 +198,7 @@ class Frame:
     world_from_ego_at: Mapping[str, Pose]
     kinematics: Kinematics
     dropped: Mapping[str, str] = field(default_factory=dict)
+    road_normal: Array | None = None
     ground_truth: Boxes3D | None = None
     ground_truth_map: BevMap | None = None
     ground_truth_results: tuple[FrameResult, ...] = ()

@@ -199,13 +199,18 @@ def default_ego_from_bev() -> Array:
     return rigid(BEV_ORIGIN_M, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def level_rig(rig: CameraRig, height_m: float) -> CameraRig:
+def level_rig(rig: CameraRig, height_m: float, road_normal: Array | None = None) -> CameraRig:
     """The rig with a level bev frame at a height above the ground, with the origin and heading of the rig's.
 
-    The ground is the plane z = 0 of the ego frame. A rig whose bev frame is so already is returned as it is.
+    The ground is the plane z = 0 of the ego frame, or that with another normal (3,), a unit vector in the ego frame,
+    which meets it under the bev frame's origin. A rig whose bev frame is so already is returned as it is.
     """
     given = rig.ego_from_bev
     level = rigid((*given[:2, 3], height_m), rotation_about_z(yaw_of_rotation(given[:3, :3])))
+    if road_normal is not None:
+        left = np.cross(road_normal, (1.0, 0.0, 0.0)) / np.hypot(*road_normal[1:])
+        turn = np.stack([np.cross(left, road_normal), left, road_normal], axis=1)
+        level = rigid((*given[:2, 3], 0.0) + height_m * road_normal, turn @ level[:3, :3])
     return rig if np.allclose(level, given, rtol=0, atol=1e-6) else replace(rig, ego_from_bev=level)
 
 

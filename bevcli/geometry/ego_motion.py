@@ -1,6 +1,7 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import cv2
@@ -12,6 +13,8 @@ from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation
 
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
 TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
+ROAD_S = 5.0  # the mean of the vehicle's upward axis over this time before and after is taken for the road's
+LONGEST_S = 0.5  # that a pose counts for in that mean
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class EgoMotion:
         angular_rates: (T, 3) rad/s, ego frame.
         velocities: (T, 3) m/s, ego frame.
         velocities_are_stated: whether they come from the input; if not, they are derived from the poses.
+        road_normals: (T, 3) unit vectors that point up from the road, ego frame; None: they are derived from the poses.
     """
 
     timestamps_ns: NDArray[np.int64]
@@ -57,6 +61,7 @@ class EgoMotion:
     angular_rates: Array
     velocities: Array
     velocities_are_stated: bool = field(default=True, kw_only=True)
+    road_normals: Array | None = field(default=None, kw_only=True)
 
     @property
     def first_ns(self) -> int:
@@ -70,8 +75,8 @@ class EgoMotion:
 
     def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
         """The poses and kinematics of some rows, by their increasing indices."""
-        columns = [column.name for column in fields(self) if column.name != "velocities_are_stated"]
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        return replace(self, **{name: x[rows] for name, x in columns.items() if isinstance(x, np.ndarray)})
 
     def covered(self, timestamps_ns: ArrayLike) -> NDArray[np.bool_]:
         """Whether each time is in the stored range, or at most 50 ms outside of it."""
@@ -96,6 +101,29 @@ class EgoMotion:
         later = min(row + 1, len(self.timestamps_ns) - 1)
         columns = self.accelerations, self.angular_rates, self.velocities
         return Kinematics(*(column[row] + fraction * (column[later] - column[row]) for column in columns))
+
+    def road_normal_at(self, timestamp_ns: int) -> Array:
+        """(3,) unit vector that points up from the road, ego frame at a time.
+
+        Where it is not measured, the road is as the vehicle stands on the mean, over which the body pitches and rolls:
+        what poses state against gravity may be the slope of the road. Raises InputError as `pose_at`.
+        """
+        row, fraction = self._locate(timestamp_ns)
+        normal = self._road_normals[row + round(fraction)]
+        return np.asarray(rotation_from_quaternion(self.pose_at(timestamp_ns).quaternion).T @ normal)
+
+    @cached_property
+    def _road_normals(self) -> Array:
+        """(T, 3) in the world frame."""
+        rotations = np.stack([rotation_from_quaternion(q) for q in self.quaternions])
+        if self.road_normals is not None:
+            return np.einsum("tij,tj->ti", rotations, self.road_normals)
+        seconds, upward = (self.timestamps_ns - self.first_ns) / 1e9, rotations[:, :, 2]
+        weights = np.minimum(np.gradient(seconds), LONGEST_S) if len(seconds) > 1 else np.ones(1)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(weights[:, None] * upward, axis=0)])
+        begin, end = np.searchsorted(seconds, seconds - ROAD_S), np.searchsorted(seconds, seconds + ROAD_S, "right")
+        normals = sums[end] - sums[begin]
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
         times, first, last = self.timestamps_ns, self.first_ns, self.last_ns

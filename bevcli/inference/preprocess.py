@@ -56,16 +56,18 @@ class Preprocessor:
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
-        rig_facts = self._of_rig
+        rig_facts, bev_frame = self._of_rig, self.config.bev_frame
         if rig_facts is None or rig_facts.rig is not frame.rig:
-            bev_frame = self.config.bev_frame
             model_rig = level_rig(frame.rig, bev_frame.height_m) if bev_frame.level else frame.rig
             assignment = assign_cameras(frame.rig, self.config.cameras, self._chosen_cameras)
             image = image_for_rig(frame.rig, self.config.image)
             if self.pixels:
                 image = replace(image, mean=(0, 0, 0), std=(1, 1, 1), color_order="bgr")
             rig_facts = self._of_rig = _OfRig(frame.rig, model_rig, assignment, image)
-        frame = frame if frame.rig is rig_facts.model_rig else replace(frame, rig=rig_facts.model_rig)
+        model_rig = rig_facts.model_rig
+        if bev_frame.level and bev_frame.follow_road:
+            model_rig = level_rig(frame.rig, bev_frame.height_m, frame.road_normal)
+        frame = frame if frame.rig is model_rig else replace(frame, rig=model_rig)
         image, assignment = rig_facts.image, rig_facts.assignment
         names = assignment.cameras
         width, height = image.padded_size

@@ -223,6 +223,7 @@ class Session:
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(self.rig.names, pose),
             kinematics=self._meter.kinematics if kinematics is None else kinematics,
+            road_normal=None if self._meter.step is None else self._meter.step.road_normal,
         )
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:

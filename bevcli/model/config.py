@@ -112,10 +112,13 @@ class BevFrameConfig:
         level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
             level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
         height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
+        follow_road: whether a level bev frame stays level with the road where the poses show that the body pitches and
+            rolls over it (`Frame.road_normal`). If false, it pitches and rolls with the body.
     """
 
     level: bool = False
     height_m: float = BEV_ORIGIN_M[2]
+    follow_road: bool = False
 
 
 @dataclass(frozen=True)

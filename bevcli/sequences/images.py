@@ -292,5 +292,6 @@ class ListedDrive(Drive):
             world_from_ego_at=dict(zip(times, poses[1:], strict=True)),
             kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
             dropped=dropped,
+            road_normal=None if motion is None else motion.road_normal_at(frame_ns),
             ground_truth=self._truth.get(index),
         )

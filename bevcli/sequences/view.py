@@ -107,6 +107,7 @@ def _moved(frame: Frame, motion: EgoMotion) -> Frame:
         ground_truth=None if truth is None else truth.transformed(moved),
         world_from_ego_at={name: motion.pose_at(image_time) for name, image_time in times.items()},
         kinematics=motion.kinematics_at(time),
+        road_normal=motion.road_normal_at(time),
         sample_token=None,  # of a submission, whose boxes are in the world of nuScenes
     )
 

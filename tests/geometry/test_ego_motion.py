@@ -42,3 +42,30 @@ def test_time_more_than_50_ms_outside_is_an_error():
     assert (drive.pose_at(last + 50_000_000).translation == drive.translations[-1]).all()
     with pytest.raises(InputError, match="50 ms"):
         drive.pose_at(last + 50_000_001)
+
+
+def upright(pitches, slope_deg=4.0, step_s=0.02):
+    """A straight drive at 10 m/s down a slope, whose body pitches over it. pitches: (T,) degrees."""
+    half = np.radians(slope_deg + pitches) / 2
+    quaternions = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], axis=-1)
+    seconds = step_s * np.arange(len(pitches))
+    times, slope = (seconds * 1e9).astype(np.int64), np.radians(slope_deg)
+    translations = 10 * seconds[:, None] * (np.cos(slope), 0, -np.sin(slope))
+    return EgoMotion(times, translations, quaternions, *derive_kinematics(times, translations, quaternions))
+
+
+def test_the_road_is_as_the_vehicle_stands_on_the_mean():
+    """On a slope too, where gravity tells another direction."""
+    seconds = np.arange(0, 20, 0.02)
+    drive = upright(np.sin(2 * np.pi * seconds / 2))
+    for row in (300, 425, 575, 700):
+        pitch = np.radians(np.sin(np.pi * seconds[row]))
+        normal = drive.road_normal_at(int(drive.timestamps_ns[row]))
+        assert normal == pytest.approx([-np.sin(pitch), 0, np.cos(pitch)], abs=5e-4)  # nose down: up is aft
+
+
+def test_a_body_that_never_moves_stands_on_its_road():
+    drive = upright(np.zeros(50))
+    assert drive.road_normal_at(int(drive.timestamps_ns[20])) == pytest.approx([0, 0, 1])
+    one = drive.of_rows(np.array([3]))
+    assert one.road_normal_at(one.first_ns) == pytest.approx([0, 0, 1])

@@ -44,3 +44,16 @@ def test_kinematics_are_those_of_the_circle() -> None:
     np.testing.assert_allclose(at.velocity, [4, 0, 0], atol=0.05)
     np.testing.assert_allclose(at.angular_rate, [0, 0, 0.4], atol=0.01)
     np.testing.assert_allclose(at.acceleration, [0, 1.6, 9.81], atol=0.05)
+
+
+def test_the_measured_road_is_that_of_each_frame() -> None:
+    """A vehicle that pitches by 1°, nose down, from its second frame on: the direction up from the road is aft then."""
+    angle = np.radians(1.0)
+    pitched = rigid((2, 0, 0), [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    aft = np.array([-np.sin(angle), 0, np.cos(angle)])
+    still = MeasuredStep(rigid((2, 0, 0)), np.eye(6), road_normal=aft)
+    steps = MeasuredStep(pitched, np.eye(6), road_normal=aft), still
+    motion = MeasuredMotion("brakes", np.arange(3, dtype=np.int64) * SECOND, steps).ego_motion
+    for second, expected in enumerate([(0, 0, 1), aft, aft]):
+        np.testing.assert_allclose(motion.road_normal_at(second * SECOND), expected, atol=1e-12)
+    np.testing.assert_allclose(motion.of_rows(np.arange(3)).road_normal_at(0), (0, 0, 1), atol=1e-3)

@@ -9,21 +9,24 @@ from memory_drive import MemoryDrive
 
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import camera_pose_noise
+from bevcli.geometry.cameras import Distortion, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.workshop.robustness.conditions import (
+    BodyPitch,
     CalibrationNoise,
     CameraCrash,
     Draws,
     EgoMotionLost,
     FrameLost,
     TimeOffsets,
+    _turned,
     at_lower_rate,
     motion_during,
 )
 from bevcli.workshop.robustness.stress import split_scenes
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames
+from bevcli.workshop.synth.rig import nuscenes_like_rig, tilt
 
 DRAWS = Draws(0, "test")
 
@@ -187,3 +190,31 @@ def test_kept_frames_are_read_once_while_the_memory_lasts():
 def test_scenes_are_run_one_by_one():
     scenes = split_scenes(MemoryDrive(5, scenes="aabbb"))
     assert [[stamp.scene for stamp in scene.stamps] for scene in scenes] == [["a", "a"], ["b", "b", "b"]]
+
+
+@pytest.mark.parametrize("lens", [None, Distortion("brown_conrady", (-0.2, 0.05, 0.001, 0.0))])
+def test_a_pitching_body_turns_images_about_their_cameras(lens):
+    """A point that is far away is seen where the camera of a pitched vehicle sees it; poses and rig stay."""
+    front = replace(nuscenes_like_rig(320, 180)["CAM_FRONT"], distortion=lens)
+    far = apply(front.ego_from_camera, front.rays([[200.0, 80.0]]) * 1e4)
+    pixels = np.zeros((180, 320, 3), np.uint8)
+    pixels[79:82, 199:202] = 255
+    turned = _turned(pixels, front, tilt(np.radians(2.0), np.radians(-1.0)))
+    expected, _ = front.project_ego(far @ tilt(np.radians(2.0), np.radians(-1.0)))  # level_from_body.T @ point
+    weights = turned[..., 0] / turned[..., 0].sum()
+    found = [(weights * grid).sum() for grid in np.indices((180, 320))[::-1]]
+    assert found == pytest.approx(expected[0].tolist(), abs=0.1)
+    assert expected[0, 1] < 75  # the nose goes down, so what is ahead goes up in the image
+
+
+def test_a_body_pitches_anew_in_each_frame_and_more_at_harder():
+    drive = MemoryDrive(2)
+    clean, frames = drive.load(0), {}
+    for level in (1, 3):
+        frames[level] = [BodyPitch(drive, level, DRAWS).load(place) for place in range(2)]
+        assert frames[level][0].rig is clean.rig
+        assert np.array_equal(frames[level][0].world_from_ego.matrix, clean.world_from_ego.matrix)
+    before, after = (each.images["CAM_FRONT"].pixels_bgr for each in (clean, frames[1][0]))
+    assert not np.array_equal(before, after)
+    draws = [BodyPitch(drive, 1, DRAWS).random(drive.stamps[k], k).standard_normal(2) for k in range(2)]
+    assert not np.allclose(draws[0], draws[1])

@@ -71,7 +71,7 @@ def test_differences_of_the_tests_are_named():
 
 def test_conditions_are_clean_and_each_corruption_by_severity():
     everything = choose_conditions()
-    assert len(everything) == 1 + 8 * 3 + 5 * 3 + 4 + 3 * 3
+    assert len(everything) == 1 + 8 * 3 + 5 * 3 + 4 + 4 * 3
     assert everything[0].name == "clean"
     easy = choose_conditions("easy", ["fog", "calibration_noise"])
     assert [(each.name, each.severity) for each in easy] == [("clean", ""), ("fog", "easy"), ("calibration_noise", "1")]

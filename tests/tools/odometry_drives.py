@@ -1,7 +1,7 @@
 """The rendered drives of `odometry_accuracy.py`: `python tests/tools/odometry_drives.py OUT [--only NAME…]`.
 
-Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns, and two hard drives.
-Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.
+Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns; two hard drives; and
+two with a body that moves. Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from bevcli.printing import say
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.corruptions import blur_kernel, low_light, to_uint8
 from bevcli.workshop.synth.drive import FIRST_TIMESTAMP_NS, RenderedDrive, RenderedFrame, export_drive
+from bevcli.workshop.synth.options import Body
 from bevcli.workshop.synth.rig import EGO_AXES_FROM_CAMERA, DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 
 FRAMES, RATE_HZ = 12, 2.0
@@ -42,6 +43,7 @@ class Plan:
         weather: None for that of the seed.
         look: "", "night", "rain", "bonnet" (a part of each image that never moves) or "black" (four black frames).
         sway_deg: largest pitch of the vehicle; it rolls by half of it.
+        body: of the vehicle; its motion follows the simulation.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Plan:
     weather: str | None = None
     look: str = ""
     sway_deg: float = 0.0
+    body: Body = "still"
 
 
 def _there_and_back(time_s: float) -> float:
@@ -83,6 +86,8 @@ PLANS = (
     # Not among the twenty.
     Plan("hard-black", 1065011, 0, look="black"),
     Plan("hard-queue", 1065028, 1, weather="noon"),
+    Plan("six-body", 1065030, 0, body="moving"),
+    Plan("front-body", 1065009, 2, body="moving"),
 )
 
 
@@ -90,7 +95,7 @@ class PlannedDrive(RenderedDrive):
     """The rendered drive of a plan."""
 
     def __init__(self, plan: Plan, assets: Assets) -> None:
-        drawn = rig_of(plan)
+        drawn = replace(rig_of(plan), body=plan.body)
         samples = 2 if max(camera.width for camera in drawn.rig.cameras) <= 1000 else 1
         super().__init__(plan.seed, SIMULATED, RATE_HZ, drawn, plan.weather, assets, supersampling=samples)
         self.frames, self._plan = FRAMES, plan
@@ -105,7 +110,10 @@ class PlannedDrive(RenderedDrive):
         passed = time_s - begin
         (x, y), yaw = self.simulation.ego.pose(begin + self._plan.way(passed))
         tilt = cv2.Rodrigues(sway * np.array([0.5 * np.sin(3.1 * passed), np.sin(4.3 * passed + 1), 0]))[0]
-        return Pose.from_matrix(rigid((x, y, 0.0), rotation_about_z(yaw) @ tilt))
+        world_from_body = rigid((x, y, 0.0), rotation_about_z(yaw) @ tilt)
+        if self._body is not None:
+            world_from_body = world_from_body @ self._body.level_from_body(time_s)
+        return Pose.from_matrix(world_from_body)
 
     def ego_motion(self, rate_hz: float = 50.0) -> EgoMotion:
         """Poses and kinematics of the drive, `rate_hz` per second."""

@@ -156,6 +156,7 @@ class TableDrive(Drive):
             world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in rig.names},
             kinematics=kinematics.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
+            road_normal=motion.road_normal_at(entry.stamp.timestamp_ns),
             ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )

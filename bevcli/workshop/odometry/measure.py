@@ -5,7 +5,7 @@ smooth. A step is decided when the next one is measured: Viterbi's search with a
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from bevcli.frame import Drive, Frame
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, RecentPoses, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.workshop.odometry import OdometryOptions
-from bevcli.workshop.odometry.step_views import SLOPES, StepViews, exponential, logarithm, motion_of, next_slopes
+from bevcli.workshop.odometry.step_views import COUNT, SLOPES, StepViews, exponential, logarithm, motion_of, next_slopes
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, SeenPoints, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.views import FrameView, Viewer
 
@@ -43,6 +43,7 @@ class MeasuredStep:
     matches: int = 0  # number of matched points that were used
     road_points: int = 0  # number of points of the road that were used
     seen: SeenPoints | None = None  # some of both, for recordings; None where nothing was measured
+    road_normal: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) up, ego frame of the second
 
     @property
     def deviations(self) -> Array:
@@ -87,7 +88,15 @@ class MeasuredMotion:
                 (time, poses[index] @ exponential((time - first) / length * twist))
                 for time in range(start, end + 1, SUBSTEP_NS)
             ]
-        return motion_of_keyframes(_table(list(zip(times.tolist(), poses, strict=True))), _table(between))
+        motion = motion_of_keyframes(_table(list(zip(times.tolist(), poses, strict=True))), _table(between))
+        columns = [np.interp(motion.timestamps_ns, times, column) for column in self.road_normals.T]
+        return replace(motion, road_normals=np.stack(columns, axis=1) / np.linalg.norm(columns, axis=0)[:, None])
+
+    @cached_property
+    def road_normals(self) -> Array:
+        """(F, 3) unit vectors that point up from the road, in the ego frame of each frame."""
+        normals = [step.road_normal for step in self.steps]
+        return np.stack([self.steps[0].ego_a_from_ego_b[:3, :3] @ normals[0], *normals])
 
 
 def _table(poses: Sequence[tuple[int, Array]]) -> tuple[NDArray[np.int64], Array, Array]:
@@ -214,7 +223,7 @@ class MotionMeter:
         if not is_measured(candidate):
             return self._guess(self._seconds, NOT_TOLD)
         of_points = candidate.matches, candidate.road_points, candidate.seen
-        return MeasuredStep(motion_of(candidate.state), candidate.covariance, "", *of_points)
+        return MeasuredStep(motion_of(candidate.state), candidate.covariance, "", *of_points, _normal(candidate.state))
 
     def _expected(self, seconds: float) -> Array | None:
         """(8,) the state of a step at constant velocity."""
@@ -229,8 +238,14 @@ class MotionMeter:
         state = self._expected(seconds)
         wide = seconds * np.sqrt(max(1, self._guessed)) if state is not None else seconds * UNKNOWN
         deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
-        motion = np.eye(4) if state is None else motion_of(state)
-        return MeasuredStep(motion, np.diag(deviations**2), reason)
+        state = np.zeros(COUNT - 1) if state is None else state
+        return MeasuredStep(motion_of(state), np.diag(deviations**2), reason, road_normal=_normal(state))
+
+
+def _normal(state: Array) -> Array:
+    """(3,) the direction up from the road, in the second ego frame of a step with a state (8,)."""
+    normal = np.array([*-next_slopes(state), 1.0])
+    return normal / np.linalg.norm(normal)
 
 
 def measure_steps(drive: Drive, options: OdometryOptions | None = None) -> Iterator[MeasuredStep]:

@@ -9,17 +9,19 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
-from bevcli.geometry.ego_motion import Kinematics, motion_during
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, camera_pose_noise
+from bevcli.geometry.ego_motion import motion_during
+from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.view import select
 from bevcli.workshop.robustness.options import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
+from bevcli.workshop.synth.rig import tilt
 
 LOST_PARTS = 6  # level L loses an image or a pose with probability L/6
 MOST_CRASHES = 5  # draws of cameras at the hardest level
@@ -65,13 +67,18 @@ class CorruptedImages(ChangedDrive):
         self._corrupt = corrupt
 
     def change(self, index: int, frame: Frame) -> Frame:
-        def corrupted(name: str) -> CameraImage:
+        def corrupted(name: str) -> Pixels:
             random = self.random(frame.stamp, frame.stamp.index, name)
-            return _with_pixels(frame.images[name], self._corrupt(frame.images[name].pixels_bgr, self._level, random))
+            return self._corrupt(frame.images[name].pixels_bgr, self._level, random)
 
-        with ThreadPoolExecutor(min(max(len(frame.images), 1), os.cpu_count() or 1)) as threads:
-            images = dict(zip(frame.images, threads.map(corrupted, frame.images), strict=True))
-        return replace(frame, images=images)
+        return _with_images(frame, corrupted)
+
+
+def _with_images(frame: Frame, change: Callable[[str], Pixels]) -> Frame:
+    """The frame with other pixels. change: gives those of a camera; it is called in several threads."""
+    with ThreadPoolExecutor(min(max(len(frame.images), 1), os.cpu_count() or 1)) as threads:
+        changed = dict(zip(frame.images, threads.map(change, frame.images), strict=True))
+    return replace(frame, images={name: _with_pixels(image, changed[name]) for name, image in frame.images.items()})
 
 
 def _with_pixels(image: CameraImage, pixels_bgr: Pixels) -> CameraImage:
@@ -140,6 +147,34 @@ class CalibrationNoise(ChangedDrive):
         return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
 
 
+class BodyPitch(ChangedDrive):
+    """A sequence whose body pitches and rolls, each frame anew; poses and calibration do not tell.
+
+    Level L draws a pitch with a standard deviation of L/2 degrees, and a roll with half of that. All images of a frame
+    are turned together about their cameras, which stay in place. What comes in from outside repeats an image's edge.
+    """
+
+    def change(self, index: int, frame: Frame) -> Frame:
+        draws = self.random(frame.stamp, frame.stamp.index).standard_normal(2)
+        level_from_body = tilt(*np.radians(self._level / 2 * draws * (1, 0.5)))
+
+        def turned(name: str) -> Pixels:
+            return _turned(frame.images[name].pixels_bgr, frame.rig[name], level_from_body)
+
+        return _with_images(frame, turned)
+
+
+def _turned(pixels: Pixels, camera: Camera, level_from_body: Array) -> Pixels:
+    """The image (H, W, 3) of a camera on a turned body, from that on the level one. level_from_body: (3, 3)."""
+    rows, columns = np.indices(pixels.shape[:2])
+    ego_from_camera = camera.ego_from_camera[:3, :3]
+    turn = ego_from_camera.T @ level_from_body @ ego_from_camera
+    seen, _ = camera.project(camera.rays(np.stack([columns, rows], axis=-1)) @ turn.T)
+    at = np.nan_to_num(seen, nan=OUTSIDE).astype(np.float32)
+    turned = cv2.remap(pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return turned.astype(np.uint8, copy=False)
+
+
 class TimeOffsets(ChangedDrive):
     """A sequence whose cameras state wrong capture times: each camera is off by its own constant, for a whole scene.
 
@@ -170,23 +205,25 @@ class EgoMotionLost(ChangedDrive):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._arrived: dict[int, tuple[Pose, Kinematics]] = {}
+        self._arrived: dict[int, Frame] = {}
 
     def change(self, index: int, frame: Frame) -> Frame:
         last = self._last_arrived(index)
         if last not in self._arrived:
             earlier = frame if last == index else self.drive.load(last)
-            self._arrived[last] = earlier.world_from_ego, earlier.kinematics
+            self._arrived[last] = replace(earlier, images={}, ground_truth=None)
         if last == index:
             return frame
-        pose, kinematics = self._arrived[last]
+        arrived = self._arrived[last]
+        pose = arrived.world_from_ego
         stated_from_world = pose.matrix @ inverse(frame.world_from_ego.matrix)
         truth = frame.ground_truth
         return replace(
             frame,
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(frame.world_from_ego_at, pose),
-            kinematics=kinematics,
+            kinematics=arrived.kinematics,
+            road_normal=arrived.road_normal,
             ground_truth=None if truth is None else truth.transformed(stated_from_world),
         )
 
@@ -264,6 +301,7 @@ CORRUPTIONS = (
     _of_images(corruptions.jpeg, 2, 4, 5, group=Group.UNSEEN),
     _of_images(corruptions.saturation, 2, 4, 5, group=Group.UNSEEN),
     Corruption("calibration_noise", {"1": 1, "2": 2, "3": 3, "4": 4}, CalibrationNoise, Group.OTHER),
+    Corruption("body_pitch", _severities(1, 2, 3), BodyPitch, Group.OTHER),
     Corruption("time_offset", _severities(50, 100, 200), TimeOffsets, Group.OTHER),
     Corruption("ego_motion_lost", _severities(2, 4, 5), EgoMotionLost, Group.OTHER),
     Corruption("frame_rate", _severities(2, 3, 4), lambda scene, step, *_: at_lower_rate(scene, step), Group.OTHER),

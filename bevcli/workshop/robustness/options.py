@@ -47,8 +47,8 @@ class StressOutputOptions:
     only: tuple[str, ...] = option(
         default=(),
         help="Only this corruption: camera_crash, frame_lost, color_quantisation, motion_blur, brightness, low_light, "
-        "fog, snow, calibration_noise, time_offset, ego_motion_lost or frame_rate. Repeatable. Clean drives are always "
-        "scored.",
+        "fog, snow, calibration_noise, body_pitch, time_offset, ego_motion_lost or frame_rate. Repeatable. Clean "
+        "drives are always scored.",
         panel="Conditions",
         metavar="NAME",
         repeatable=True,

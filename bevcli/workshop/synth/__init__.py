@@ -3,7 +3,7 @@
 meshes     `mesh` (primitives), `road_users`, `catalog` (what stands still; all annotated objects by class)
 world      `city` (streets, blocks, routes), `looks`, `ground`, `traffic`, `simulation` (all actors), `scenery`
 images     `rig` (cameras and lenses), `shading_kernels`, `photo_kernels`, `material` (a user's photographs), `renderer`
-drives     `drive` (one drive; `render`), `drives` (those of a training, a validation or a stress test)
+drives     `body` (pitch and roll), `drive` (one drive; `render`), `drives` (of a training, a validation, a stress test)
 
 Each module imports only from those before it.
 """

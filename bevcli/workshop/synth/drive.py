@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from bevcli.frame import BevMap, CameraImage, DriveFacts, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.options import gather
 from bevcli.parsing.images import encode_image
 from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
+from bevcli.workshop.synth.body import MIDDLE, BodyMotion
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
@@ -41,7 +42,6 @@ SCENERY_M = 135.0  # scenery is drawn within this distance
 NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
 SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
 TEXELS_M = {500: (0.125, 0.16), 1000: (0.06, 0.08), np.inf: (0.04, 0.06)}  # largest width -> of ground and shadows
-EGO_MIDDLE = (1.4, 0.0, 0.0)  # of the ego vehicle, in the ego frame, metres
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -73,8 +73,8 @@ class RenderedDrive:
         seed: the drive; 0 or greater.
         frames: number of frames.
         rate_hz: frames per second.
-        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s), whether the looks are varied
-            (`Looks`), and their material; default: `nuscenes_like_rig` at 400x225.
+        rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s), the motion of the vehicle's body,
+            whether the looks are varied (`Looks`), and their material; default: `nuscenes_like_rig` at 400x225.
         weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
         assets: the meshes, if they are built already.
         supersampling: samples per pixel along each axis (anti-aliasing).
@@ -115,6 +115,8 @@ class RenderedDrive:
                 self._photo = PhotoLooks.draw(self._looks, material, self.weather)
                 self.weather = self._photo.weather
         self.simulation = Simulation(self._city, self._assets, frames / rate_hz, density)
+        stream, self._is_stated = self._city.stream("body"), drawn.body != "unstated"
+        self._body = None if drawn.body == "still" else BodyMotion.draw(self.simulation.ego, stream)
         self._ground = GroundPlan(self._city)
         width = max(camera.width for camera in self.rig.cameras) * supersampling
         self._texels_m = next(sizes for most, sizes in TEXELS_M.items() if width <= most)
@@ -130,20 +132,27 @@ class RenderedDrive:
     def world_from_ego(self, time_s: float) -> Pose:
         """Pose of the ego vehicle, seconds after the start of the drive."""
         (x, y), yaw = self.simulation.ego.pose(time_s)
-        return Pose.from_matrix(rigid((x, y, 0.0), rotation_about_z(yaw)))
+        pose = rigid((x, y, 0.0), rotation_about_z(yaw))
+        return Pose.from_matrix(pose if self._body is None else pose @ self._body.level_from_body(time_s))
+
+    def stated_pose(self, time_s: float) -> Pose:
+        """The pose that the drive states: `world_from_ego`, without pitch, roll and heave where they are unstated."""
+        pose = self.world_from_ego(time_s)
+        level = rigid((*pose.translation[:2], 0.0), rotation_about_z(pose.yaw))
+        return pose if self._is_stated else Pose.from_matrix(level)
 
     def ego_motion(self, rate_hz: float = 50.0) -> EgoMotion:
         """Poses and kinematics over the whole drive, `rate_hz` per second."""
         last_s = (self.frames - 1) / self.rate_hz + max(self._delays_s.values(), default=0.0)
         count = int(np.ceil(last_s * rate_hz)) + 1
         times = np.arange(count) / rate_hz
-        poses = [self.world_from_ego(float(t)) for t in times]
+        poses = [self.stated_pose(float(t)) for t in times]
+        stamps = FIRST_TIMESTAMP_NS + np.round(times * 1e9).astype(np.int64)
+        table = stamps, np.stack([p.translation for p in poses]), np.stack([p.quaternion for p in poses])
+        if self._body is not None and self._is_stated:
+            return EgoMotion(*table, *derive_kinematics(*table))
         motions = [self.simulation.ego.motion(float(t)) for t in times]
-        return EgoMotion(
-            FIRST_TIMESTAMP_NS + np.round(times * 1e9).astype(np.int64),
-            np.stack([p.translation for p in poses]), np.stack([p.quaternion for p in poses]),
-            *(np.stack([m[k] for m in motions]) for k in range(3)),
-        )  # fmt: skip
+        return EgoMotion(*table, *(np.stack([m[k] for m in motions]) for k in range(3)))
 
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
@@ -156,7 +165,7 @@ class RenderedDrive:
         timestamp_ns = FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz)
         stamp = FrameStamp(index, f"rendered-{self.seed}", timestamp_ns)
         states = [state for _, state in actors]
-        pose = self.world_from_ego(time_s)
+        pose = self.stated_pose(time_s)
         delays = {name: self._delays_s.get(name, 0.0) for name in self.rig.names}
         views: dict[str, RenderedView] = {}
         for delay in sorted(set(delays.values())):
@@ -171,7 +180,7 @@ class RenderedDrive:
         bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
         pieces = self._ground.pieces_around(pose.translation[:2], self._map_half_extent_m * 1.5)
         bev_map = draw_map(pieces, boxes, bev_from_world, self._map_half_extent_m)
-        poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
+        poses = {name: self.stated_pose(time_s + delay) for name, delay in delays.items()}
         times = {name: timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
         return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map, true_lines(pieces, bev_from_world))
 
@@ -195,7 +204,7 @@ class RenderedDrive:
         if self._looks is not None:
             snapshot = replace(snapshot, pattern=self._looks.pattern())
         if self._photo is not None and coats is not None:
-            ego, size = apply(world_from_ego.matrix, EGO_MIDDLE), self.simulation.ego_body.size_lwh
+            ego, size = apply(world_from_ego.matrix, MIDDLE), self.simulation.ego_body.size_lwh
             placed = [(state.position, state.yaw, state.body.size_lwh) for state in states]
             placed.append((ego, world_from_ego.yaw, size))
             strength, waves, hardness = snapshot.pattern
@@ -239,7 +248,7 @@ class RenderedDrive:
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
         """(T, 3, 3) triangles of the ego vehicle, for its shadow."""
-        x, y, _ = apply(world_from_ego.matrix, EGO_MIDDLE)
+        x, y, _ = apply(world_from_ego.matrix, MIDDLE)
         return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
 
     def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
@@ -304,8 +313,9 @@ def drive_of(options: RenderOptions) -> RenderedDrive:
     """The drive that `render` writes. Raises InputError as it does."""
     rig = rig_for_rendering(options.rig, options.resolution)
     samples = options.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
+    drawn = DrawnRig(rig, body=options.body)
     return RenderedDrive(
-        options.seed, options.frames, options.rate_hz, rig, options.weather, supersampling=samples, threads=THREADS
+        options.seed, options.frames, options.rate_hz, drawn, options.weather, supersampling=samples, threads=THREADS
     )
 
 

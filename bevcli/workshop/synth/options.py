@@ -15,6 +15,7 @@ else:  # the command line reads the types, and must not import OpenCV
     CameraRig = Path
 
 Weather = Literal["noon", "evening", "overcast"]
+Body = Literal["still", "moving", "unstated"]
 JPEG_QUALITY = 90
 LIMITS = (16, 8192)  # of width and height of rendered images, pixels
 
@@ -65,6 +66,11 @@ class RenderOptions:
         maximum=LIMITS[1],
     )
     weather: Weather | None = option(default=None, help="Light and sky. Default: drawn from the seed.")
+    body: Body = option(
+        default="still",
+        help="The vehicle's body: still, moving (it pitches and rolls, as the poses state), or moving unstated (the "
+        "poses are level).",
+    )
     quality: int = option(default=JPEG_QUALITY, help="JPEG quality.", minimum=1, maximum=100)
     supersampling: int | None = option(
         default=None,

@@ -5,7 +5,7 @@ A rig is the default one, one from a file, or one drawn at random for training a
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, Distortion, default_ego_from_bev, fisheye_table
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.workshop.synth.options import Body
 
 WIDEST = 4.0  # tangent of the widest angle off the optical axis in one pinhole image; wider ones would be too large
 SMALLEST_ANGLE = np.arctan(WIDEST)  # a lens model that ends inside the image, at a smaller angle, is a mistake
@@ -168,7 +169,7 @@ _CENTER_X_M = 1.4  # middle of the vehicle, ahead of the rear axle
 Range = tuple[float, float]
 _LIMITS: dict[str, Range] = {
     **dict.fromkeys(("random_share", "front_share", "distorted_share", "delayed_share", "supersampled_share"), (0, 1)),
-    **dict.fromkeys(("coarse_share", "varied_share"), (0, 1)),
+    **dict.fromkeys(("coarse_share", "moving_share", "unstated_share", "varied_share"), (0, 1)),
     "cameras": (1, 16),
     "fov_deg": (10, 140),
     "jpeg_quality": (1, 100),
@@ -206,6 +207,8 @@ class RigDistribution:
     coarse_share: float = 0.15  # share of the rigs with images of a lower resolution than the model's,
     coarsest: float = 0.6  # by a factor from this to 1
     jpeg_quality: tuple[int, int] = (60, 95)
+    moving_share: float = 0.0  # share of the drives whose body pitches and rolls
+    unstated_share: float = 0.5  # share of those with level poses, which do not state it
     varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
     material: str = ""  # folder of models and photographs for these drives (`MaterialFolder`); "" for none
 
@@ -229,7 +232,9 @@ class RigDistribution:
 
         Raises InputError where the material's folder is missing or holds nothing of use.
         """
-        values = astuple(self)[:-1] if self.varied_share else astuple(self)[:-2]  # older caches stay valid
+        new = {"moving_share", "unstated_share"} if not self.moving_share else set()  # older caches stay valid
+        new |= {"material"} if self.varied_share else {"material", "varied_share"}
+        values = tuple(value for name, value in vars(self).items() if name not in new)
         if self.material:
             files = material_files(self.material)
             values += tuple((path.parent.name, path.name, path.stat().st_size) for path in files)
@@ -255,6 +260,7 @@ class DrawnRig:
     delays_s: dict[str, float] = field(default_factory=dict)  # camera -> time of its images after the frame's
     supersampling: int = 1  # samples per pixel along each axis
     jpeg_quality: int = 90  # 1 to 100
+    body: Body = "still"  # of the vehicle
     varied: bool = False  # whether the looks of the drive are varied
     material: str = ""  # folder of what they are varied with (`MaterialFolder`); "" for none
 
@@ -276,7 +282,10 @@ def draw_rig(distribution: RigDistribution, seed: int, size: tuple[int, int]) ->
     if random.random() < distribution.delayed_share:
         delays = {name: round(float(random.uniform(0, distribution.delay_s)), 3) for name in rig.names}
     varied = np.random.default_rng([seed, _STREAM, 1]).random() < distribution.varied_share  # leaves the rest as it is
-    return DrawnRig(rig, delays, samples, quality, bool(varied), distribution.material if varied else "")
+    moves, unstated = np.random.default_rng([seed, _STREAM, 2]).random(2)
+    body: Body = "moving" if unstated >= distribution.unstated_share else "unstated"
+    body = body if moves < distribution.moving_share else "still"
+    return DrawnRig(rig, delays, samples, quality, body, bool(varied), distribution.material if varied else "")
 
 
 def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: float, random: Generator) -> CameraRig:
@@ -342,8 +351,11 @@ def _fitting(coefficients: tuple[float, ...], intrinsics: Array, size: tuple[int
 
 
 def _tilt(largest_deg: float, random: Generator) -> Array:
-    """(3, 3) rotation by a pitch about y and a roll about x, in a frame with x forward."""
-    pitch, roll = np.radians(random.uniform(-1, 1, 2) * largest_deg)
+    return tilt(*np.radians(random.uniform(-1, 1, 2) * largest_deg))
+
+
+def tilt(pitch: float, roll: float) -> Array:
+    """(3, 3) rotation by a pitch about y (nose down) and a roll about x (right side down), radians, x forward."""
     about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return np.asarray(about_y @ about_x)

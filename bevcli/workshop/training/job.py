@@ -290,7 +290,7 @@ def prepare_training(
         raise InputError(
             f"{data.split}: states the drives to score on: remove `held_out` (`--held-out`), or `split` (`--split`)"
         )
-    rigs = config.rigs if config.rigs.random_share > 0 or config.rigs.varied_share > 0 else None
+    rigs = config.rigs if max(config.rigs.random_share, config.rigs.moving_share, config.rigs.varied_share) else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     scored_apart = None if data.split is None and config.held_out == 0 else evaluated
     notes = check_training_drives(data, drives, scored_apart, config.clips, model_config)
