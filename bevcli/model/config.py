@@ -15,6 +15,7 @@ from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
 
@@ -188,7 +189,7 @@ class ModelConfig:
     max_gap_s: float = 2.0
     channels: int = 256
     heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
-    backbone: ResNetConfig | EfficientNetLiteConfig = field(default_factory=ResNetConfig)
+    backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = field(default_factory=ResNetConfig)
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)

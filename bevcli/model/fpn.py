@@ -33,8 +33,11 @@ class FPN(nn.Module):
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
 
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """maps: (B, C_i, H_i, W_i), fine to coarse -> `levels` maps (B, C, H_i, W_i), fine to coarse."""
-        merged = [lateral(x) for lateral, x in zip(self.lateral, maps, strict=True)]
+        """maps: (B, C_i, H_i, W_i), fine to coarse -> `levels` maps (B, C, H_i, W_i), fine to coarse.
+
+        A detector has more maps than it takes: the coarsest are for its own boxes.
+        """
+        merged = [lateral(x) for lateral, x in zip(self.lateral, maps, strict=False)]
         for i in range(len(merged) - 1, 0, -1):
             merged[i - 1] = merged[i - 1] + F.interpolate(merged[i], size=merged[i - 1].shape[-2:], mode="nearest")
         outputs = [output(x) for output, x in zip(self.output, merged, strict=True)]

@@ -16,14 +16,16 @@ from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.encoder import FeedForward
 from bevcli.model.kernels.rounding import rounded_products
+from bevcli.model.nanodet import SLOPE, LeakyConvolution
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
-Activation = Literal["none", "relu", "relu6"]
+Activation = Literal["none", "relu", "relu6", "leaky"]
 # What oneDNN calls an activation, with its numbers.
 ACTIVATIONS: dict[Activation, tuple[str, list[float]]] = {
     "none": ("none", []),
     "relu": ("relu", []),
     "relu6": ("hardtanh", [0.0, 6.0]),
+    "leaky": ("leaky_relu", [SLOPE]),
 }
 OPERATORS = (
     "_convolution_pointwise",
@@ -180,6 +182,8 @@ def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
                 fast = PackedSameConvolution(child)
             elif type(child) is nn.Conv2d and child.padding_mode == "zeros" and not isinstance(child.padding, str):
                 fast = PackedConvolution(child)
+            elif type(child) is LeakyConvolution:
+                fast = PackedConvolution(child, "leaky")
             # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
             elif type(child) is nn.Linear:
                 fast = PackedLinear(child, rounds=rounds_child)

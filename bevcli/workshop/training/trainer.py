@@ -146,9 +146,9 @@ class Trainer:
             in_bytes=job.device.type == "cuda",
         )  # fmt: skip
         self._frozen: FrozenStages | None = None
-        if job.config.frozen_stages:
+        if frozen := job.model.backbone.frozen_stages:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
-            self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
+            self._frozen = FrozenStages(job.model.backbone, frozen, dtype)
         if job.group.leads:
             events = event_writer(job.out / "tensorboard", self.done) if job.log else None
             self._loss_curve = LearningCurve(job.out / "loss.csv", self.done, "training", events)
