@@ -5,7 +5,7 @@ from the outer edge of its first pixels to that of its last ones: the whole imag
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,7 +17,8 @@ CANDIDATES = 256  # of an image, the best ones, among which doubles are removed
 ROUNDS = 8  # of the removal: exact unless nine boxes remove each other in a row
 
 
-class ImageBoxes(NamedTuple):
+@dataclass(frozen=True)
+class ImageBoxes:
     """The K best boxes in each of B·N images, by falling score; those with the score 0 are none.
 
     Attributes:

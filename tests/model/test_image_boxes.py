@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from bevcli.model.image_boxes import IMAGE_CLASSES, best_image_boxes, without_doubles
+from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, best_image_boxes, without_doubles
 
 STRIDES, SIZES = (8, 16, 32), ((8, 12), (4, 6), (2, 3))  # of maps of an image of 96 x 64 pixels
 YES = torch.ones(1, 1, dtype=torch.bool)
@@ -32,6 +33,10 @@ def put(predictions: list[Tensor], level: int, row: int, column: int, kind: str,
         cell[7 + 11 * side + distance] = 50
 
 
+def tensors(boxes: ImageBoxes) -> list[Tensor]:
+    return [getattr(boxes, field.name) for field in fields(boxes)]
+
+
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     shared = max(width, 0) * max(height, 0)
@@ -52,7 +57,7 @@ def test_a_box_lies_where_its_cell_and_its_sides_say() -> None:
     put(predictions, 1, 2, 1, "car", 2.0, [1, 2, 3, 1])  # its cell has its centre 24 and 40 pixels from the corner
     put(predictions, 0, 1, 9, "person", 1.0, [0, 2, 1, 3])
     found = best_image_boxes(maps, predictions, STRIDES, YES, most=5)
-    boxes, scores, labels, logits, features, cells = (x[0, 0] for x in found)
+    boxes, scores, labels, logits, features, cells = (x[0, 0] for x in tensors(found))
     assert boxes[:2].tolist() == [[7.5, 7.5, 71.5, 55.5], [75.5, -0.5, 83.5, 35.5]]  # pixel 0 has its centre at 0
     assert [IMAGE_CLASSES[label] for label in labels[:2]] == ["car", "person"]
     assert scores[:2].tolist() == pytest.approx([1 / (1 + math.exp(-2)), 1 / (1 + math.exp(-1))])
@@ -95,7 +100,8 @@ def test_images_of_a_batch_do_not_change_each_other() -> None:
     together = best_image_boxes(maps, predictions, STRIDES, torch.ones(2, 3, dtype=torch.bool))
     for image in range(6):
         alone = [[x[image : image + 1] for x in every] for every in (maps, predictions)]
-        for one, expected in zip(best_image_boxes(*alone, STRIDES, YES), together, strict=True):
+        found = best_image_boxes(*alone, STRIDES, YES)
+        for one, expected in zip(tensors(found), tensors(together), strict=True):
             torch.testing.assert_close(one[0, 0], expected[image // 3, image % 3])
 
 
