@@ -1,9 +1,11 @@
 """The image backbone: what a model, training and the faster kernels ask of one."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import ClassVar
 
 from torch import Tensor, nn
+
+from bevcli.model.image_boxes import ImageBoxes
 
 
 class Backbone(nn.Module):
@@ -65,6 +67,13 @@ class Backbone(nn.Module):
             x = blocks(x)
             maps.append(x)
         return [maps[stage - 1] for stage in self.output_stages]
+
+    def image_boxes(self, maps: Sequence[Tensor], has_image: Tensor) -> ImageBoxes | None:
+        """The boxes in the images that the maps of `forward` tell, of a backbone that is a detector; else None.
+
+        maps: for B·N images. has_image: (B, N) bool; the boxes of a camera without an image have the score 0.
+        """
+        return None
 
 
 class Stage(nn.Sequential):

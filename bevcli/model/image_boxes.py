@@ -4,7 +4,7 @@ Pixels are those of the network's input; the centre of its first pixel is (0, 0)
 from the outer edge of its first pixels to that of its last ones: the whole image is (-0.5, -0.5, W - 0.5, H - 0.5).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,6 +36,20 @@ class ImageBoxes:
     logits: Tensor
     features: Tensor
     cells: Tensor
+
+    @property
+    def by_name(self) -> dict[str, Tensor]:
+        """The outputs of an exported file."""
+        return {"image_boxes": self.boxes, "image_scores": self.scores, "image_labels": self.labels}
+
+    @classmethod
+    def of_names(cls, tensors: Mapping[str, Tensor]) -> "ImageBoxes | None":
+        """The inverse of `by_name`, without numbers of cells; None where there are no boxes in images."""
+        if "image_boxes" not in tensors:
+            return None
+        boxes, scores, labels = (tensors[name] for name in ("image_boxes", "image_scores", "image_labels"))
+        none = boxes.new_zeros(*scores.shape, 0)
+        return cls(boxes, scores, labels, none, none, none)
 
 
 def best_image_boxes(

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.backbone import Backbone
-from bevcli.model.image_boxes import BINS, IMAGE_CLASSES, ImageBoxes, best_image_boxes
+from bevcli.model.image_boxes import BINS, CANDIDATES, IMAGE_CLASSES, ImageBoxes, best_image_boxes
 
 STEM_CHANNELS = 32
 # Of each stage: input channels, blocks, stride. It doubles the channels.
@@ -48,8 +48,8 @@ class NanoDetConfig:
     def __post_init__(self) -> None:
         if not self.output_stages or self.output_stages != (1, 2, 3)[: len(self.output_stages)]:
             raise ValueError("output_stages must be [1], [1, 2] or [1, 2, 3]")
-        if self.max_boxes < 1 or not 0 < self.overlap <= 1:
-            raise ValueError("max_boxes must be positive, overlap above 0 and at most 1")
+        if not 1 <= self.max_boxes <= CANDIDATES or not 0 < self.overlap <= 1:
+            raise ValueError(f"max_boxes must be from 1 to {CANDIDATES}, overlap above 0 and at most 1")
 
     def output_channels(self) -> tuple[int, ...]:
         """Channels of the map of each output stage."""

@@ -53,8 +53,16 @@ class Network(TemporalModel):
 
         images: (B, N, 3, H, W), normalised, padded. camera_index: (N,) or (B, N), the camera embedding of each image.
         """
-        feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
-        return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
+        return self.tokens_of(self.image_maps(images), camera_index)
+
+    def image_maps(self, images: Tensor) -> list[Tensor]:
+        """The maps of the backbone for B·N images. images: (B, N, 3, H, W), normalised, padded."""
+        maps: list[Tensor] = self.backbone(images.flatten(0, 1))
+        return maps
+
+    def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
+        """As `image_features`, of the maps of the backbone."""
+        return self.image_tokens(self.neck(maps)[: self.config.encoder_levels], camera_index)
 
     def detect(self, bev: Tensor) -> ModelOutputs:
         """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""

@@ -17,6 +17,7 @@ from bevcli.geometry.transforms import Pose, wrap_angle
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
+from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
 
@@ -120,6 +121,7 @@ class ModelOutputs:
         class_logits: (L, B, Q, classes) of the L decoder layers.
         box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
         segmentation: outputs of the segmentation head, None without one.
+        image_boxes: boxes in the images, None where the backbone is no detector.
     """
 
     stay_on_device: ClassVar[tuple[str, ...]] = ("bev",)
@@ -128,6 +130,7 @@ class ModelOutputs:
     class_logits: Tensor
     box_codes: Tensor
     segmentation: SegmentationOutputs | None = None
+    image_boxes: ImageBoxes | None = None
 
     @property
     def by_name(self) -> dict[str, Tensor]:
@@ -145,7 +148,8 @@ class ModelOutputs:
         if "mask_logits" in tensors:
             masks, classes = tensors["mask_logits"][None], tensors["mask_class_logits"][None]
             segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
-        return cls(tensors["bev"], tensors["class_logits"][None], tensors["box_codes"][None], segmentation)
+        logits, codes = tensors["class_logits"][None], tensors["box_codes"][None]
+        return cls(tensors["bev"], logits, codes, segmentation, ImageBoxes.of_names(tensors))
 
     @classmethod
     def ports(cls, config: ModelConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:

@@ -16,6 +16,7 @@ from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.workshop.engines.export_form import pixels_of, recurrent_feed
@@ -57,7 +58,7 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
 FAST_BACKBONE = ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8)
 
 
-def model_for_engines(backbone: ResNetConfig | EfficientNetLiteConfig = FAST_BACKBONE) -> BEVFormer:
+def model_for_engines(backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = FAST_BACKBONE) -> BEVFormer:
     """A small model without deformable convolutions, which OpenVINO lacks; duplicates of its boxes merge and fade."""
     return small_model(
         encoder=replace(small_config().encoder, layers=1),

@@ -34,7 +34,7 @@ class EncoderInputs:
     """All that the device part of a step reads, on the device or, small tensors, on the CPU.
 
     Attributes:
-        images: see `ModelInputs`, as for camera_index, can_bus and shift.
+        images: see `ModelInputs`, as for camera_index, has_image, can_bus and shift.
         hits: the cells that each camera sees.
         rays: scale and shift of the image features, of the calibration embedding; None without one.
         history: (B, Y·X, C), the BEV map of the previous frame; None without history.
@@ -43,6 +43,7 @@ class EncoderInputs:
 
     images: Tensor
     camera_index: Tensor
+    has_image: Tensor
     can_bus: Tensor
     shift: Tensor
     hits: PillarHits
@@ -81,6 +82,7 @@ class BEVFormer(Network):
         return EncoderInputs(
             images=inputs.images,
             camera_index=inputs.camera_index,
+            has_image=inputs.has_image,
             can_bus=inputs.can_bus,
             shift=inputs.shift,
             hits=self.pillars(inputs.image_from_bev, size, inputs.has_image),
@@ -93,7 +95,8 @@ class BEVFormer(Network):
     def compute(self, inputs: EncoderInputs, heads: bool = True) -> Any:
         """The device part of a step (the paper's figure 2): its outputs, or without `heads` the BEV map (B, Y·X, C)."""
         inputs = upload_together(inputs, self.device)
-        image_features = self.image_features(inputs.images, inputs.camera_index)
+        maps = self.image_maps(inputs.images)
+        image_features = self.tokens_of(maps, inputs.camera_index)
         if inputs.rays is not None:
             image_features = image_features.scaled(*inputs.rays)
         history = inputs.history
@@ -108,7 +111,9 @@ class BEVFormer(Network):
             history=history,
             shift=inputs.shift,
         )
-        return self.detect(bev) if heads else bev
+        if not heads:
+            return bev
+        return replace(self.detect(bev), image_boxes=self.backbone.image_boxes(maps, inputs.has_image))
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
         """See `TemporalModel`."""
@@ -132,7 +137,8 @@ class BEVFormer(Network):
         """See `Network`."""
         history = torch.empty(1, *self.bev_queries.embedding.shape)
         can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
-        self.compute(EncoderInputs(images, camera_index, can_bus, shift, hits, None, history, rotation))
+        has_image = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
+        self.compute(EncoderInputs(images, camera_index, has_image, can_bus, shift, hits, None, history, rotation))
 
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> Any:

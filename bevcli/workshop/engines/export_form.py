@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.image_boxes import IMAGE_CLASSES
+from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
 from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, with_most_cameras
@@ -130,6 +132,22 @@ def _box_ports(config: ModelConfig) -> Iterator[Port]:
     yield Port("classes", (1, count), "(1, K): index into the metadata's classes.", torch.int64)
 
 
+def _image_box_ports(config: ModelConfig, cameras: int) -> Iterator[Port]:
+    """The boxes in the images, of a backbone that is a detector."""
+    if not isinstance(config.backbone, NanoDetConfig):
+        return
+    shape = (1, cameras, config.backbone.max_boxes)
+    yield Port(
+        "image_boxes",
+        (*shape, 4),
+        "(1, N, K, 4): left, top, right and bottom edge of the boxes in the images, pixels of the resized image, whose "
+        "first pixel has its centre at 0.",
+    )
+    yield Port("image_scores", shape, "(1, N, K): 0 to 1, falling; 0 for none.")
+    names = ", ".join(f"{index} {name}" for index, name in enumerate(IMAGE_CLASSES))
+    yield Port("image_labels", shape, f"(1, N, K): {names}.", torch.int64)
+
+
 def camera_feed(inputs: ModelInputs) -> dict[str, Tensor]:
     """The inputs of `camera_ports` by name. The images of `inputs` are those of `PreparedFrame.pixels`."""
     return {
@@ -166,6 +184,9 @@ class RecurrentForm(ExportForm):
     @property
     def inputs(self) -> tuple[Port, ...]:
         return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
+
+    def outputs(self, *, decode: bool) -> tuple[Port, ...]:
+        return (*super().outputs(decode=decode), *_image_box_ports(self.config, self.cameras))
 
     def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
         inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)

@@ -52,10 +52,14 @@ class ExportedStep(nn.Module):
 
     def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
         """The tokens of images (1, N, H, W, 3) BGR, 0 to 255; camera_index: (N,)."""
+        return self.network.image_features(self.normalised(images), camera_index)
+
+    def normalised(self, images: Tensor) -> Tensor:
+        """Images (1, N, H, W, 3) BGR, 0 to 255 -> (1, N, 3, H, W) as the network takes them."""
         planes = images.permute(0, 1, 4, 2, 3)
         if self.config.image.color_order == "rgb":
             planes = planes.flip(2)
-        return self.network.image_features((planes - self.image_mean) / self.image_std, camera_index)
+        return (planes - self.image_mean) / self.image_std
 
     def hits(self, image_from_bev: Tensor, has_image: Tensor) -> "SlottedHits":
         """The cameras that see each cell, for a batch of one; arguments as for `Pillars.project`."""
@@ -104,7 +108,8 @@ class RecurrentStep(ExportedStep):
     ) -> tuple[Tensor, ...]:
         """One step; `RecurrentForm` documents every input and output."""
         network = self.network
-        image_features = self.image_features(images, camera_index)
+        maps = network.image_maps(self.normalised(images))
+        image_features = network.tokens_of(maps, camera_index)
         if network.calibration_embedding is not None:
             rays = image_from_bev, image_features.level_shapes, self.image_size
             image_features = image_features.scaled(*network.calibration_embedding(*rays))
@@ -121,7 +126,8 @@ class RecurrentStep(ExportedStep):
             assert isinstance(layer, EncoderLayer)
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        return self.outputs(bev, hits.most_cameras)
+        image_boxes = network.backbone.image_boxes(maps, has_image)
+        return (*self.outputs(bev, hits.most_cameras), *(image_boxes.by_name.values() if image_boxes else ()))
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
