@@ -51,6 +51,6 @@ class Boxes2D:
         for class_name, score, corners in zip(self.classes, self.scores, self.corners, strict=True):
             yield Box2D(str(class_name), float(score), corners)
 
-    def select(self, chosen: NDArray[Any]) -> "Boxes2D":
+    def select(self, chosen: NDArray[Any] | np.bool) -> "Boxes2D":
         """Some of the boxes. chosen: a mask (N,) bool, or indices."""
         return Boxes2D(self.corners[chosen], self.classes[chosen], self.scores[chosen])

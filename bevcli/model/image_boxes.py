@@ -136,13 +136,13 @@ def cells_of(maps: Sequence[Tensor], strides: Sequence[int]) -> Tensor:
 
 def features_at(maps: Sequence[Tensor], cells: Tensor) -> Tensor:
     """The features at some cells. maps: (B, C, H_l, W_l). cells: (B, K), index among all maps' -> (B, K, C) float32."""
-    found, first = 0, 0
+    found, first = torch.zeros((), device=cells.device), 0
     for x in maps:
         count = x.shape[-2] * x.shape[-1]
         is_here = (cells >= first) & (cells < first + count)
         here = rows(of_cells(x), (cells - first).clamp(0, count - 1)).float()
         found, first = found + here * is_here[..., None], first + count
-    return found  # type: ignore[return-value]
+    return found
 
 
 def of_cells(x: Tensor) -> Tensor:

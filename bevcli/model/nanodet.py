@@ -112,7 +112,8 @@ class NanoDet(Backbone):
         for stage in self.stages:
             x = stage(x)
             maps.append(x)
-        return self.head(self.pan(maps[1:]))  # type: ignore[no-any-return]
+        heads: list[Tensor] = self.head(self.pan(maps[1:]))
+        return heads
 
     def image_boxes(self, maps: Sequence[Tensor], has_image: Tensor, sizes: Tensor | None = None) -> ImageBoxes:
         """The boxes of COCO's road users in the images, with gradients where the maps or the weights have them.
@@ -200,4 +201,5 @@ class NanoDetHead(nn.Module):
 
     def predict(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """maps: of `forward` -> (B, 7 + 44, H, W): logits of `IMAGE_CLASSES`, then see `image_boxes.distances`."""
-        return [layer(x.to(layer.weight.dtype)) for layer, x in zip(self.gfl_cls, maps, strict=True)]
+        dtype = next(self.gfl_cls.parameters()).dtype
+        return [layer(x.to(dtype)) for layer, x in zip(self.gfl_cls, maps, strict=True)]

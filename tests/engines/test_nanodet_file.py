@@ -62,7 +62,10 @@ def test_int8_finds_most_of_the_boxes(model, file, tmp_path):
     images = [pixels_of(small_inputs(seed).images, model.config.image).movedim(2, -1).numpy() for seed in range(4)]
     quantize(file, images, tmp_path / "int8.onnx")
     with torch.inference_mode():
-        outputs = model(small_inputs()), step_of_file(load_exported(tmp_path / "int8.onnx", "onnxruntime"), small_inputs())
+        outputs = (
+            model(small_inputs()),
+            step_of_file(load_exported(tmp_path / "int8.onnx", "onnxruntime"), small_inputs()),
+        )
     bevs, boxes = [x.bev for x in outputs], [x.image_boxes for x in outputs]
     assert 1e-5 < (bevs[0] - bevs[1]).norm() / bevs[0].norm() < 0.15  # of random weights
     nearest = torch.cdist(boxes[0].boxes[0], boxes[1].boxes[0]).amin(-1)

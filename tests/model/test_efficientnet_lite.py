@@ -119,7 +119,10 @@ def test_the_kind_of_a_backbone_is_read_and_written() -> None:
 @pytest.mark.parametrize(
     ("backbone", "message"),
     [
-        ({"kind": "vgg"}, 'own.toml: "backbone.kind" must be "resnet" or "efficientnet-lite", but is \'vgg\''),
+        (
+            {"kind": "vgg"},
+            'own.toml: "backbone.kind" must be "resnet" or "efficientnet-lite" or "nanodet", but is \'vgg\'',
+        ),
         ({"kind": "efficientnet-lite", "width": 8}, 'own.toml: unknown key "backbone.width"'),
         ({"kind": "efficientnet-lite", "variant": 5}, r"own.toml: \[backbone\]: variant must be from 0 to 4"),
         ({"kind": "efficientnet-lite", "output_stages": [8]}, r"own.toml: \[backbone\]: output_stages must hold"),

@@ -25,7 +25,9 @@ def maps_and_predictions(images: int = 1) -> tuple[list[Tensor], list[Tensor]]:
     return maps, predictions
 
 
-def put(predictions: list[Tensor], level: int, row: int, column: int, kind: str, logit: float, sides: list[int]) -> None:
+def put(
+    predictions: list[Tensor], level: int, row: int, column: int, kind: str, logit: float, sides: list[int]
+) -> None:
     """A box at a cell of the first image, its sides at whole numbers of strides."""
     cell = predictions[level][0, :, row, column]
     cell[IMAGE_CLASSES.index(kind)] = logit

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-import json
 import random
-import re
-from dataclasses import replace
 
 import nanodet as program
 import numpy as np
@@ -16,11 +13,9 @@ import torch.nn.functional as F
 from small_model import small_config, small_inputs, small_model
 from torch import Tensor
 
-from bevcli.checkpoints import expected_state
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError, InputError
 from bevcli.model.fpn import FPNConfig
-from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.nanodet import NanoDet, NanoDetConfig

