@@ -26,12 +26,12 @@ def camera(yaw: float, pitch: float = 0.0) -> np.ndarray:
     return matrix
 
 
-def upright(matrix: np.ndarray, distance: float, yaw: float, height: float, width: float, z: float = 0.0) -> list[float]:
+def upright(
+    matrix: np.ndarray, distance: float, yaw: float, height: float, width: float, z: float = 0.0
+) -> list[float]:
     """Box in the image of a flat upright object that stands `z` above the ground."""
     ahead, side = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
-    points = [
-        [*(distance * ahead + w * width / 2 * side), GROUND_Z + z + h, 1] for w in (-1, 1) for h in (0, height)
-    ]
+    points = [[*(distance * ahead + w * width / 2 * side), GROUND_Z + z + h, 1] for w in (-1, 1) for h in (0, height)]
     projected = np.array(points) @ matrix.T
     pixels = projected[:, :2] / projected[:, 2:3]
     return [*pixels.min(0), *pixels.max(0)]
@@ -43,7 +43,9 @@ def found(boxes: list[list[float]], name: str, score: float = 0.6) -> ImageBoxes
     logits[..., IMAGE_CLASSES.index(name)] = math.log(score / (1 - score))
     shape = logits.shape[:3]
     labels, features = logits.argmax(-1), torch.zeros(*shape, 128)
-    return ImageBoxes(torch.tensor([[boxes]]).float(), torch.full(shape, score), labels, logits, features, torch.zeros(*shape, 3))
+    return ImageBoxes(
+        torch.tensor([[boxes]]).float(), torch.full(shape, score), labels, logits, features, torch.zeros(*shape, 3)
+    )
 
 
 def lifted(lift: Lift, boxes: ImageBoxes, *matrices: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -295,7 +295,9 @@ def bev_from_level(pitch: Tensor, roll: Tensor, ground_z: float = -1.84) -> Tens
 def loss(lift: Lift, frames: dict[str, Tensor]) -> Tensor:
     """How far boxes are off, and how wrong their scores are: a box is as right as the AP says, at its four distances."""
     parts = ("boxes", "scores", "labels", "logits", "features")
-    found = ImageBoxes(*(frames[key].float() if key == "features" else frames[key] for key in parts), cells=frames["boxes"])
+    found = ImageBoxes(
+        *(frames[key].float() if key == "features" else frames[key] for key in parts), cells=frames["boxes"]
+    )
     logits, codes, slopes = lift(found, frames["image_from_bev"], frames["sizes"])
     label, truth, counts = frames["label"].flatten(1), frames["truth"].flatten(1, 2), frames["scores"].flatten(1) > 0
     good = (label >= 0) & counts & (frames["labels"].flatten(1) >= 0)
