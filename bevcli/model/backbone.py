@@ -68,10 +68,11 @@ class Backbone(nn.Module):
             maps.append(x)
         return [maps[stage - 1] for stage in self.output_stages]
 
-    def image_boxes(self, maps: Sequence[Tensor], has_image: Tensor) -> ImageBoxes | None:
+    def image_boxes(self, maps: Sequence[Tensor], has_image: Tensor, sizes: Tensor | None = None) -> ImageBoxes | None:
         """The boxes in the images that the maps of `forward` tell, of a backbone that is a detector; else None.
 
         maps: for B·N images. has_image: (B, N) bool; the boxes of a camera without an image have the score 0.
+        sizes: (B, N, 2) width and height of each image without its padding, pixels; default: with it.
         """
         return None
 

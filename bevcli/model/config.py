@@ -14,6 +14,7 @@ from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.hybrid_queries import HybridQueriesConfig
 from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.nanodet import NanoDetConfig
@@ -199,6 +200,7 @@ class ModelConfig:
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    hybrid_queries: HybridQueriesConfig = field(default_factory=HybridQueriesConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     class_settings: Mapping[str, ClassSettings] = field(default_factory=dict)
 
@@ -210,6 +212,8 @@ class ModelConfig:
         if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
             raise ValueError("bev_grid: each range goes from a smaller to a larger number")
         object_classes(self.classes, self.class_settings)
+        if self.hybrid_queries.count and not isinstance(self.backbone, NanoDetConfig):
+            raise ValueError('hybrid_queries needs a backbone that is a detector, such as "nanodet"')
         if not self.cameras or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
             raise ValueError("cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
         if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):

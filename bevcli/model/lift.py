@@ -1,8 +1,8 @@
 """Boxes of a detector put into the bev frame: where on the ground, how large, and how likely.
 
-Three distances are measured of each box: the ray of its foot meets the ground, and its height and its width are those of
-an object of its class. All boxes of a frame tell by how much the ground slopes, or the vehicle pitches: a foot is seen
-lower or higher than the height says. A small network weighs the distances, and corrects them and the score.
+Three distances are measured of each box: the ray of its foot meets the ground, and its height and its width are those
+of an object of its class. All boxes of a frame tell by how much the ground slopes, or the vehicle pitches: a foot is
+seen lower or higher than the height says. A small network weighs the distances, and corrects them and the score.
 """
 
 from dataclasses import dataclass
@@ -67,8 +67,8 @@ class Lift(nn.Module):
         )  # fmt: skip
         self.class_scale = nn.Parameter(torch.ones(len(classes)))
         for last in (self.tilt[-1], self.network[-1]):
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            for weights in last.parameters():
+                nn.init.zeros_(weights)
 
     def forward(self, found: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Class logits (B, N · K, classes), box codes (B, N · K, 10) and the slopes of the ground (B, 2) along x and y.

@@ -12,6 +12,7 @@ from bevcli.model.decoder import Decoder, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
+from bevcli.model.hybrid_queries import HybridQueries
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.segmentation import SegmentationHead
@@ -45,6 +46,11 @@ class Network(TemporalModel):
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
+        hybrid, decoder = config.hybrid_queries, config.decoder
+        self.hybrid_queries = None
+        if hybrid.count:
+            height_m = config.bev_frame.height_m
+            self.hybrid_queries = HybridQueries(hybrid, decoder, channels, config.classes, grid, height_m)
         segments = "segmentation" in config.heads
         self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if segments else None
 
@@ -99,6 +105,10 @@ class Network(TemporalModel):
         yield from _layer_names("decoder", layers, attentions)
         yield f"detection head: {layers} class branches", "detection_head.class_branches"
         yield f"detection head: {layers} box branches", "detection_head.box_branches"
+        yield "hybrid queries: lift of boxes in images", "hybrid_queries.lift"
+        yield "hybrid queries: content, position", "hybrid_queries.content", "hybrid_queries.position"
+        yield "hybrid queries: layers", "hybrid_queries.layers"
+        yield "hybrid queries: corrections", "hybrid_queries.class_correction", "hybrid_queries.box_correction"
         yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
         yield "segmentation: location decoder", "segmentation_head.location_decoder"
         for layer in range(self.config.segmentation.mask_layers):

@@ -70,6 +70,7 @@ class ModelInputs:
         image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
         camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
         has_image: (B, N) bool; a camera without an image sees no BEV cell.
+        image_sizes: (B, N, 2) float32, width and height of the images within their padding.
         can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
         shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
         rotation_deg: (B,) float32, rotation of the history map.
@@ -79,6 +80,7 @@ class ModelInputs:
     image_from_bev: Tensor
     camera_index: Tensor
     has_image: Tensor
+    image_sizes: Tensor
     can_bus: Tensor
     shift: Tensor
     rotation_deg: Tensor
@@ -189,6 +191,18 @@ class ModelOutputs:
         best = best_boxes(self.class_logits[-1].detach(), self.box_codes[-1].detach(), config.decoder)
         return best.decoded(config.classes)
 
+    def with_queries(self, class_logits: Tensor, box_codes: Tensor) -> Self:
+        """The outputs with further queries after those of the decoder, the same ones in all layers.
+
+        class_logits: (B, H, classes). box_codes: (B, H, 10).
+        """
+        logits, codes = (x.expand(len(self.class_logits), *x.shape) for x in (class_logits, box_codes))
+        return replace(
+            self,
+            class_logits=torch.cat([self.class_logits, logits], 2),
+            box_codes=torch.cat([self.box_codes, codes], 2),
+        )
+
     def last_layers(self) -> Self:
         """The outputs of the last layers, all that results are decoded from."""
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()
@@ -208,10 +222,22 @@ def model_inputs(prepared: PreparedFrame, previous_pose: Pose | None, config: Mo
         image_from_bev=prepared.image_from_bev.round(decimals=12).float(),
         camera_index=prepared.camera_index,
         has_image=prepared.has_image,
+        image_sizes=_image_sizes(prepared, config),
         can_bus=torch.from_numpy(motion.can_bus)[None],
         shift=torch.from_numpy(motion.shift)[None],
         rotation_deg=torch.tensor([motion.rotation_deg], dtype=torch.float32),
     )
+
+
+def _image_sizes(prepared: PreparedFrame, config: ModelConfig) -> Tensor:
+    """See `ModelInputs.image_sizes`."""
+    left, top, right, bottom = config.image.crop_box if config.image.crop is not None else (0, 0, np.inf, np.inf)
+    cameras = [prepared.frame.rig[name] for name in prepared.assignment.cameras]
+    sizes = [
+        (min(scale * camera.width, right) - left, min(scale * camera.height, bottom) - top)
+        for camera, scale in zip(cameras, prepared.scales, strict=True)
+    ]
+    return torch.tensor(sizes, dtype=torch.float32)[None]
 
 
 def joined_inputs(parts: Sequence[ModelInputs]) -> ModelInputs:

@@ -77,6 +77,7 @@ def small_inputs(seed: int = 0, batch: int = 1) -> ModelInputs:
         images=torch.randn(batch, 2, 3, HEIGHT, WIDTH, generator=random),
         image_from_bev=projections.expand(batch, -1, -1, -1) + 0.1 * torch.randn(batch, 1, 1, 1, generator=random),
         camera_index=torch.arange(2),
+        image_sizes=torch.tensor([WIDTH, HEIGHT], dtype=torch.float32).expand(batch, 2, 2),
         has_image=torch.ones(batch, 2, dtype=torch.bool),
         can_bus=torch.randn(batch, 18, generator=random),
         shift=0.1 * torch.randn(batch, 2, generator=random),

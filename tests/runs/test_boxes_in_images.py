@@ -39,7 +39,7 @@ def model(mini_config, monkeypatch) -> Model:
 
 
 def test_a_prediction_has_the_boxes_of_each_camera(model, mini_model):
-    [(frame, prediction)] = run(model, MemoryDrive(1))
+    [(_, prediction)] = run(model, MemoryDrive(1))
     assert list(prediction.image_boxes) == list(prediction.camera_embeddings)
     strong, weak = prediction.image_boxes["CAM_BACK"]
     assert (strong.class_name, strong.score, weak.score) == ("person", pytest.approx(0.9), pytest.approx(0.1))
@@ -49,7 +49,7 @@ def test_a_prediction_has_the_boxes_of_each_camera(model, mini_model):
 
 
 def test_a_plot_shows_those_of_its_score(model):
-    [(frame, prediction)] = run(model, MemoryDrive(1))
+    [(_, prediction)] = run(model, MemoryDrive(1))
     images = [replace(prediction, image_boxes=boxes).plot("CAM_FRONT") for boxes in (prediction.image_boxes, None)]
     rows, columns = np.nonzero((images[0] != images[1]).any(-1))
     np.testing.assert_allclose((columns.min(), rows.min(), columns.max(), rows.max()), IN_IMAGE, atol=2)

@@ -13,7 +13,7 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
-from bevcli.model.upload import on_device, upload, upload_together
+from bevcli.model.upload import on_device, upload, upload_together, without_autocast
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class EncoderInputs:
     """All that the device part of a step reads, on the device or, small tensors, on the CPU.
 
     Attributes:
-        images: see `ModelInputs`, as for camera_index, has_image, can_bus and shift.
+        images: see `ModelInputs`, as for image_from_bev, camera_index, has_image, image_sizes, can_bus and shift.
         hits: the cells that each camera sees.
         rays: scale and shift of the image features, of the calibration embedding; None without one.
         history: (B, Y·X, C), the BEV map of the previous frame; None without history.
@@ -42,8 +42,10 @@ class EncoderInputs:
     """
 
     images: Tensor
+    image_from_bev: Tensor
     camera_index: Tensor
     has_image: Tensor
+    image_sizes: Tensor
     can_bus: Tensor
     shift: Tensor
     hits: PillarHits
@@ -81,8 +83,10 @@ class BEVFormer(Network):
             rotation = map_rotation(inputs.rotation_deg, self.config.bev_grid, center)
         return EncoderInputs(
             images=inputs.images,
+            image_from_bev=inputs.image_from_bev,
             camera_index=inputs.camera_index,
             has_image=inputs.has_image,
+            image_sizes=inputs.image_sizes,
             can_bus=inputs.can_bus,
             shift=inputs.shift,
             hits=self.pillars(inputs.image_from_bev, size, inputs.has_image),
@@ -113,7 +117,13 @@ class BEVFormer(Network):
         )
         if not heads:
             return bev
-        return replace(self.detect(bev), image_boxes=self.backbone.image_boxes(maps, inputs.has_image))
+        boxes = self.backbone.image_boxes(maps, inputs.has_image, inputs.image_sizes)
+        outputs = self.detect(bev)
+        if self.hybrid_queries is not None and boxes is not None:
+            with without_autocast(bev.device):
+                cameras = inputs.image_from_bev, inputs.image_sizes
+                outputs = outputs.with_queries(*self.hybrid_queries(bev.float(), boxes, *cameras))
+        return replace(outputs, image_boxes=boxes)
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
         """See `TemporalModel`."""
@@ -138,7 +148,9 @@ class BEVFormer(Network):
         history = torch.empty(1, *self.bev_queries.embedding.shape)
         can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
         has_image = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
-        self.compute(EncoderInputs(images, camera_index, has_image, can_bus, shift, hits, None, history, rotation))
+        projections, sizes = torch.eye(4).expand(*images.shape[:2], 4, 4), torch.ones(*images.shape[:2], 2)
+        cameras = projections, camera_index, has_image, sizes
+        self.compute(EncoderInputs(images, *cameras, can_bus, shift, hits, None, history, rotation))
 
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> Any:

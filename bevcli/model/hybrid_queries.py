@@ -1,0 +1,93 @@
+"""Hybrid object queries: boxes in the images, put on the ground, become queries of their own beside the learned ones.
+
+BEVFormerV2 (Yang et al. 2023) calls so the queries of its second stage that come from the first. Here the first stage
+is a detector of photographs and `Lift`, which knows from the box where its object stands. The queries start as these
+boxes; what the layers read of the BEV map (the ground, other cameras, the history) only corrects them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, branch
+from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
+from bevcli.model.lift import NO_BOX, Lift, LiftConfig
+
+RANGE_SCALE = 0.05  # of metres, as they enter a layer
+
+
+@dataclass(frozen=True)
+class HybridQueriesConfig:
+    """The [hybrid_queries] table of a model whose backbone is a detector.
+
+    Attributes:
+        count: of queries, the best boxes of all cameras; 0 for none.
+        layers: that correct them.
+        features: channels of the backbone's maps.
+    """
+
+    count: int = 0
+    layers: int = 2
+    features: int = 128
+
+    def __post_init__(self) -> None:
+        if self.count < 0 or self.layers < 1 or self.features < 1:
+            raise ValueError("count must be 0 or more, layers and features 1 or more")
+
+
+class HybridQueries(nn.Module):
+    """Lifted boxes, corrected by what the BEV map knows. Without training they stay as `Lift` gives them."""
+
+    range_start: Tensor
+    range_extent: Tensor
+
+    def __init__(
+        self,
+        config: HybridQueriesConfig,
+        decoder: DecoderConfig,
+        channels: int,
+        classes: tuple[str, ...],
+        grid: BevGrid,
+        height_m: float,
+    ) -> None:
+        """Random weights, without effect. height_m: of the bev frame above the ground."""
+        super().__init__()
+        self.config, shape = config, (grid.rows, grid.columns)
+        self.lift = Lift(LiftConfig(), classes, config.features, -height_m)
+        self.content = nn.Linear(config.features + len(IMAGE_CLASSES) + len(classes), channels)
+        self.position = branch(BOX_CODE_SIZE, 1, channels)
+        self.layers = nn.ModuleList(DecoderLayer(decoder, channels, shape) for _ in range(config.layers))
+        self.class_correction = nn.Linear(channels, len(classes))
+        self.box_correction = nn.Linear(channels, BOX_CODE_SIZE)
+        for last in (self.class_correction, self.box_correction):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+        ranges = torch.tensor([grid.x_range_m, grid.y_range_m])
+        self.register_buffer("range_start", ranges[:, 0], persistent=False)
+        self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
+
+    def forward(self, bev: Tensor, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+        """Class logits (B, H, classes) and box codes (B, H, 10) of the hybrid queries.
+
+        Args:
+            bev: (B, Y·X, C).
+            boxes: of N cameras.
+            image_from_bev: (B, N, 4, 4), bev metres to pixels of the network's input.
+            sizes: (B, N, 2) width and height of the images within their padding, pixels.
+        """
+        with torch.no_grad():
+            logits, codes, _ = self.lift(boxes, image_from_bev, sizes)
+            place = (codes[..., :2] - self.range_start) / self.range_extent
+            is_inside = ((place > 0) & (place < 1)).all(-1, keepdim=True)
+            logits = logits.where(is_inside, NO_BOX)
+            count = min(self.config.count, logits.shape[1])
+            index = logits.amax(-1).topk(count).indices
+            logits, codes, place = rows(logits, index), rows(codes, index), rows(place, index).clamp(0, 1)
+            seen = rows(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), index)
+        query = self.content(torch.cat([seen, logits], -1))
+        position = self.position(torch.cat([codes[..., :2] * RANGE_SCALE, codes[..., 2:]], -1))
+        for layer in self.layers:
+            query = layer(query, position, place, bev)
+        return logits + self.class_correction(query), codes + self.box_correction(query)
