@@ -75,7 +75,7 @@ class EgoMotion:
 
     def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
         """The poses and kinematics of some rows, by their increasing indices."""
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        columns: dict[str, Any] = {column.name: getattr(self, column.name) for column in fields(self)}
         return replace(self, **{name: x[rows] for name, x in columns.items() if isinstance(x, np.ndarray)})
 
     def covered(self, timestamps_ns: ArrayLike) -> NDArray[np.bool_]:

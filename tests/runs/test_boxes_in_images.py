@@ -18,7 +18,7 @@ from bevcli.model.nanodet import NanoDet, NanoDetConfig
 from bevcli.recording import entities
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video.video import RecordedImages, draw_frame, tiles
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 IN_IMAGE = [32.5, 18.5, 160.5, 90.5]  # of the box in the images of 320 x 180, of which the network sees half
 PERSON = np.array(NUSCENES_CLASSES["pedestrian"].color)
