@@ -75,8 +75,9 @@ class EgoMotion:
 
     def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
         """The poses and kinematics of some rows, by their increasing indices."""
-        columns: dict[str, Any] = {column.name: getattr(self, column.name) for column in fields(self)}
-        return replace(self, **{name: x[rows] for name, x in columns.items() if isinstance(x, np.ndarray)})
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        chosen: dict[str, Any] = {name: x[rows] for name, x in columns.items() if isinstance(x, np.ndarray)}
+        return replace(self, **chosen)
 
     def covered(self, timestamps_ns: ArrayLike) -> NDArray[np.bool_]:
         """Whether each time is in the stored range, or at most 50 ms outside of it."""
