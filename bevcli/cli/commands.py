@@ -81,7 +81,7 @@ def viz(
         viewing.record_drive(shown, options, recording, source, format_options)
         return
     kinds = (ViewOptions, RecordingOptions, InputOptions, *formats())
-    usual = {name: (kind, value) for kind in kinds for name, value in defaults(kind).items()}
+    usual = {name: (cls, value) for cls in kinds for name, value in defaults(cls).items()}
     for_drives = {
         "boxes": options.boxes,
         "out": options.out,
@@ -89,8 +89,8 @@ def viz(
         **vars(source),
         **format_options,
     }
-    if given := [name for name, value in for_drives.items() if value != usual[name][1]]:
-        option = named(usual[given[0]][0], given[0])
+    if changed := [name for name, value in for_drives.items() if value != usual[name][1]]:
+        option = named(usual[changed[0]][0], changed[0])
         raise InputError(f"{shown}: is a recording, and {option} is for a drive: remove it, or pass the drive")
     viewing.show(viewing.recording_in(shown), options)
 
@@ -127,17 +127,17 @@ def project_debug(
     """
     from bevcli.rig.check_calibration import model_notes
 
-    given = {name: value for name, value in format_options.items() if value not in (None, {})}
-    if options.sequence is not None and "calibration" in given:
+    drive_options = {name: value for name, value in format_options.items() if value not in (None, {})}
+    if options.sequence is not None and "calibration" in drive_options:
         raise InputError("--calibration and --sequence exclude each other: pass the drive, and its --calibration")
     check = bevcli.check_calibration(
-        input, options.sequence, options.frame, allow_outside=source.allow_outside, **given
+        input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
     )
     model, gap = options.model or "demo", None
     if not check.errors:
         if options.sequence is not None:
-            given["calibration"] = input
-        how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
+            drive_options["calibration"] = input
+        how = {"ground_truth": False, "allow_outside": source.allow_outside, **drive_options}
         open_drive = partial(bevcli.open_sequence, options.sequence or input, **how)
         if options.motion:
             from bevcli.workshop.calibration.core_options import check_motion

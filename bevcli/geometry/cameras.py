@@ -204,9 +204,9 @@ def level_rig(rig: CameraRig, height_m: float) -> CameraRig:
 
     The ground is the plane z = 0 of the ego frame. A rig whose bev frame is so already is returned as it is.
     """
-    given = rig.ego_from_bev
-    level = rigid((*given[:2, 3], height_m), rotation_about_z(yaw_of_rotation(given[:3, :3])))
-    return rig if np.allclose(level, given, rtol=0, atol=1e-6) else replace(rig, ego_from_bev=level)
+    ego_from_bev = rig.ego_from_bev
+    level = rigid((*ego_from_bev[:2, 3], height_m), rotation_about_z(yaw_of_rotation(ego_from_bev[:3, :3])))
+    return rig if np.allclose(level, ego_from_bev, rtol=0, atol=1e-6) else replace(rig, ego_from_bev=level)
 
 
 def distort(rays: ArrayLike, distortion: Distortion) -> Array:

@@ -145,9 +145,9 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     findings += _direction(drive)
     moving = speeds > MIN_MOVING_SPEED
     if not findings and ego_motion.velocities_are_stated and moving.any():
-        stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
-        if not 1 / SPEED_FACTOR <= float(np.median(stated / speeds[moving])) <= SPEED_FACTOR:
-            found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
+        stated_speeds = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
+        if not 1 / SPEED_FACTOR <= float(np.median(stated_speeds / speeds[moving])) <= SPEED_FACTOR:
+            found = f"stated {np.median(stated_speeds):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
             message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
             expected = f"equal within a factor of {SPEED_FACTOR:g}"
             findings.append(Finding("ego-speed", "error", None, message, found, expected, advice))
@@ -159,7 +159,7 @@ def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[F
     changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
     times = ego_motion.timestamps_ns
     rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
-    return tuple(f for part in rows if len(part) > 1 for f in check_ego_motion(ego_motion.of_rows(part)))
+    return tuple(f for scene in rows if len(scene) > 1 for f in check_ego_motion(ego_motion.of_rows(scene)))
 
 
 def _units(drive: _Drive) -> Finding | None:

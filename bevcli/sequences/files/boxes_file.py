@@ -60,14 +60,14 @@ class ClassNames:
         self.known = tuple(classes)
         self._by_name: dict[str, str] = {name: name for name in self.known}
         self._by_lower_case = {name.lower(): name for name in reversed(self.known)}
-        known = dict(self._by_lower_case)
+        targets = dict(self._by_lower_case)
         for name, target in (renames or {}).items():
-            if target.lower() not in known:
+            if target.lower() not in targets:
                 raise InputError(
                     f'`class_map` (`--class-map`) {name}={target}: "{target}" is not a class (expected one of '
                     f"{', '.join(self.known)})"
                 )
-            exact = target if target in self.known else known[target.lower()]
+            exact = target if target in self.known else targets[target.lower()]
             self._by_lower_case[name.lower()] = self._by_name[name] = exact
 
     @staticmethod
@@ -117,11 +117,11 @@ class ClassNames:
 
 def read_class_map(path: Path) -> dict[str, str]:
     """A class map in TOML, one `"Name in the file" = "class"` a line. Raises InputError if it is not one."""
-    stated = parse_toml(read_text(path, TOML_BYTES), path)
-    for name, target in stated.items():
+    class_map = parse_toml(read_text(path, TOML_BYTES), path)
+    for name, target in class_map.items():
         if not isinstance(target, str):
             raise InputError(f'{path}: {name}: expected the name of a class, such as "truck", found {target!r:.40}')
-    return stated
+    return class_map
 
 
 def count_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
@@ -171,9 +171,9 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         raise InputError(f"{where}: box {index}: {mistake}") from None
     columns: dict[str, NDArray[Any] | None] = {}
     for name, column in OPTIONAL_COLUMNS.items():
-        given = [getattr(row, column.key) for row in rows]
-        known = [column.unknown if value is UNSET or value is None else value for value in given]
-        columns[name] = None if given.count(UNSET) == len(given) else np.array(known)
+        raw = [getattr(row, column.key) for row in rows]
+        filled = [column.unknown if value is UNSET or value is None else value for value in raw]
+        columns[name] = None if raw.count(UNSET) == len(raw) else np.array(filled)
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
@@ -250,9 +250,9 @@ def _mistake(box: Any) -> str:
     return ""
 
 
-def _description(kind: Any) -> str:
+def _description(hint: Any) -> str:
     """The description in a type, or in one of the types of a union."""
-    notes = [note for part in (kind, *get_args(kind)) for note in getattr(part, "__metadata__", ())]
+    notes = [note for argument in (hint, *get_args(hint)) for note in getattr(argument, "__metadata__", ())]
     return str(notes[0].description)
 
 
@@ -348,8 +348,8 @@ def read_boxes(
     with without_garbage_collection():
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
         reference, rows = content["frame_of_reference"], content["frames"]
-        stated = _stated_classes(content, path) if "classes" in content else None
-        names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
+        own_classes = _stated_classes(content, path) if "classes" in content else None
+        names = ClassNames(class_map, classes or own_classes or NUSCENES_CLASSES)
         frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
     moments: set[tuple[str, int]] = set()
     for stamp in (frame.stamp for frame in frames):
@@ -365,7 +365,7 @@ def read_boxes(
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
         {key: value for key, value in content.items() if key not in _FILE_KEYS},
-        stated,
+        own_classes,
     )
 
 
@@ -431,12 +431,12 @@ def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_name
     where = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
         raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')
-    stated = row.get("world_from_ego")
-    if stated is None and frame_of_reference == "world":
+    pose = row.get("world_from_ego")
+    if pose is None and frame_of_reference == "world":
         raise InputError(f'{where}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
     return FrameBoxes(
         stamp,
-        None if stated is None else pose_from_json(stated, "world_from_ego", where),
+        None if pose is None else pose_from_json(pose, "world_from_ego", where),
         boxes_from_json(row["boxes"], where, class_names),
         {key: value for key, value in row.items() if key not in _FRAME_KEYS},
     )

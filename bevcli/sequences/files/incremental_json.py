@@ -161,9 +161,9 @@ def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -
     """
     missing = f'the file is missing (expected {kind}, "format": "{form}")'
     content = read_entries(path, missing=missing)
-    stated = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if stated != form:
-        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {stated!r:.40}')
+    actual_form = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if actual_form != form:
+        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {actual_form!r:.40}')
     reference = content.get("frame_of_reference")
     if reference not in references:
         expected = f"{', '.join(references[:-1])} or {references[-1]}"
