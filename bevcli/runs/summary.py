@@ -165,7 +165,7 @@ class RunSummary:
             "camera_embeddings": counts.embeddings,
             "dropped_images": [{"frame": f, "camera": c, "reason": why} for f, c, why in counts.dropped],
             "skipped_frames": counts.skipped,
-            "not_finite_frames": [{"frame": f, "where": where} for f, where in counts.not_finite],
+            "not_finite_frames": [{"frame": f, "where": layer} for f, layer in counts.not_finite],
             "started_anew": [{"frame": f, "reason": why} for f, why in counts.started_anew],
             "notes": [*self._drive.notes, *self._input_notes()],
             "files": [str(path) for path in self.files],

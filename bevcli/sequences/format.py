@@ -132,7 +132,7 @@ def _drives_below(folder: Path, formats: Iterable[type[Format]], depth: int) -> 
                 yield from _drives_below(path, formats, depth - 1)
 
 
-def check_options(values: Mapping[str, Any], classes: Iterable[type[Format]], where: str) -> None:
+def check_options(values: Mapping[str, Any], classes: Iterable[type[Format]], location: str) -> None:
     """Check that formats have the options that are given. Values that are the default are accepted for every format.
 
     where: start of a message. Raises InputError for an option that only other formats have; TypeError for one that no
@@ -146,7 +146,7 @@ def check_options(values: Mapping[str, Any], classes: Iterable[type[Format]], wh
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0])[name]:
             option = named(having[0], name)
-            raise InputError(f"{where}: {option} is for {_either([form.name for form in having])}: remove it")
+            raise InputError(f"{location}: {option} is for {_either([form.name for form in having])}: remove it")
 
 
 def _either(names: list[str]) -> str:

@@ -99,7 +99,7 @@ class ClassNames:
             renamed[self[name]] += count
         return renamed
 
-    def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
+    def note(self, counts: Mapping[str, int], location: str, use: str = "scored") -> tuple[str, ...]:
         """A note about boxes whose class is not known, if there are any.
 
         counts: number of boxes by the file's names. where: the file or the side that has them. use: what is not done
@@ -110,7 +110,7 @@ class ClassNames:
             return ()
         named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
         return (
-            f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
+            f"{location}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
             f'(`class_map` (`--class-map`) "{min(others)}={self.known[0]}" renames a class)',
         )
 
@@ -153,7 +153,7 @@ _Box: Any = msgspec.defstruct(
 )
 
 
-def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
+def boxes_from_json(objects: Any, location: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
     """N boxes from a list of N JSON objects. A missing or null velocity becomes NaN.
 
     where: start of an error message, such as "boxes.json: frame 3". class_names: maps the classes; names that it does
@@ -161,14 +161,14 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     Raises InputError that names the first invalid box by its index in the list.
     """
     if not isinstance(objects, list):
-        raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
+        raise InputError(f'{location}: "boxes" must be a list, found {objects!r:.40}')
     if not objects:
         return Boxes3D.empty()
     try:
         rows = msgspec.convert(objects, list[_Box])
     except msgspec.ValidationError:
         index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
-        raise InputError(f"{where}: box {index}: {mistake}") from None
+        raise InputError(f"{location}: box {index}: {mistake}") from None
     columns: dict[str, NDArray[Any] | None] = {}
     for name, column in OPTIONAL_COLUMNS.items():
         raw = [getattr(row, column.key) for row in rows]
@@ -181,11 +181,11 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
         **columns,
-        **(_futures(rows, where) if any(row.futures for row in rows) else {}),
+        **(_futures(rows, location) if any(row.futures for row in rows) else {}),
     )
     without = [index for index, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
-        raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
+        raise InputError(f'{location}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
     sizes = boxes.sizes_lwh
     checks: list[tuple[str, NDArray[Any], NDArray[np.bool_], str]] = [
         (column.key, shares, ((shares >= 0) & (shares <= 1)) | np.isnan(shares), "0 to 1")
@@ -197,7 +197,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     for key, values, good, expected in (*checks, ("size_lwh", sizes, sizes > 0, "numbers above 0")):
         if not good.all():
             index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-            raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
+            raise InputError(f"{location}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
     return boxes
 
 
@@ -269,7 +269,7 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D, futures: Arr
             box["future_scores"] = boxes.future_scores[index].tolist()
 
 
-def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
+def _futures(rows: Sequence[Any], location: str) -> dict[str, Any]:
     """The columns `futures` and `future_scores` of Boxes3D, of rows of which one or more have futures."""
     having = {index: row for index, row in enumerate(rows) if row.futures}
     first = next(iter(having.values()))
@@ -279,7 +279,7 @@ def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
         counts = [len(mode) for mode in row.futures or ()]
         if counts != [steps] * modes or len(row.future_times_s) != steps or len(row.future_scores or counts) != modes:
             raise InputError(
-                f"{where}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
+                f"{location}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
                 f"{steps}, as in the other boxes of the frame, with a score for each mode and a time for each step)"
             )
         futures[index, ..., 0] = row.future_times_s
@@ -428,15 +428,15 @@ def write_boxes(boxes: BoxesFile, path: Path) -> int:
 
 def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
     stamp = stamp_from_json(row, f"{path}: entry {index} of frames")
-    where = f"{path}: frame {stamp.index}"
+    location = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
-        raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')
+        raise InputError(f'{location}: "boxes" is missing (expected a list, empty for a frame without boxes)')
     pose = row.get("world_from_ego")
     if pose is None and frame_of_reference == "world":
-        raise InputError(f'{where}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
+        raise InputError(f'{location}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
     return FrameBoxes(
         stamp,
-        None if pose is None else pose_from_json(pose, "world_from_ego", where),
-        boxes_from_json(row["boxes"], where, class_names),
+        None if pose is None else pose_from_json(pose, "world_from_ego", location),
+        boxes_from_json(row["boxes"], location, class_names),
         {key: value for key, value in row.items() if key not in _FRAME_KEYS},
     )

@@ -260,9 +260,9 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
-def checked_camera(camera: Camera, where: Path | str) -> Camera:
+def checked_camera(camera: Camera, location: Path | str) -> Camera:
     """A camera that calibration.json may hold. where: start of an error message. Raises InputError for any other."""
-    return require(parse_camera, camera.name, _camera_to_json(camera), where=where, camera=camera.name)
+    return require(parse_camera, camera.name, _camera_to_json(camera), where=location, camera=camera.name)
 
 
 def is_file_name(name: str) -> bool:

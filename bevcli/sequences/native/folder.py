@@ -94,11 +94,11 @@ class FolderDrive(ListedDrive):
         # Tables and videos, but no images, which are in folders.
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
-    def _frame(self, place: int, entry: FrameEntry) -> Frame:
+    def _frame(self, position: int, entry: FrameEntry) -> Frame:
         index, time = entry.stamp.index, entry.stamp.timestamp_ns
         boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
         bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
-        frame = replace(super()._frame(place, entry), ground_truth=boxes, ground_truth_map=bev_map)
+        frame = replace(super()._frame(position, entry), ground_truth=boxes, ground_truth_map=bev_map)
         lines = self._true_lines(frame) if self._true_lines and self.has_ego_motion else None
         return frame if lines is None else replace(frame, ground_truth_results=(lines,))
 
