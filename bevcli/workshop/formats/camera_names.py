@@ -20,7 +20,7 @@ LOOKED_AT = 50  # entries of a folder
 def words_of(name: str) -> frozenset[str]:
     """The words of a camera's name, without order, such as front and left for CAM_FRONT_LEFT, frontLeft and fl."""
     words = [word.lstrip("0") or "0" if word.isdigit() else word for word in WORD.findall(name.lower())]
-    return frozenset(part for word in words for part in SHORT.get(word, word).split()) - ANY
+    return frozenset(long_word for word in words for long_word in SHORT.get(word, word).split()) - ANY
 
 
 def match_names(cameras: Iterable[str], found: Iterable[str]) -> dict[str, str]:
@@ -31,11 +31,11 @@ def match_names(cameras: Iterable[str], found: Iterable[str]) -> dict[str, str]:
     cameras, found = list(cameras), list(found)
     matched: dict[str, str] = {}
     for key in (str, str.lower, words_of):
-        left = [name for name in cameras if name not in matched]
+        unmatched = [name for name in cameras if name not in matched]
         free = [name for name in found if name not in matched.values()]
-        for camera in left:
+        for camera in unmatched:
             fitting = [name for name in free if key(name) and key(name) == key(camera)]
-            if len(fitting) == 1 and sum(key(name) == key(camera) for name in left) == 1:
+            if len(fitting) == 1 and sum(key(name) == key(camera) for name in unmatched) == 1:
                 matched[camera] = fitting[0]
     return {camera: matched[camera] for camera in cameras if camera in matched}
 

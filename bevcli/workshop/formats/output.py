@@ -89,8 +89,8 @@ class FolderWriter(ExitStack):
         self.enter_context(whole_folder(folder, parts))
         self.push(self._close)
 
-    def _close(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is None:
+    def _close(self, error_type: type[BaseException] | None, *error: object) -> None:
+        if error_type is None:
             self._finish()
             try:
                 self._read_back()
@@ -246,16 +246,16 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
     )
 
 
-def same_rig(one: CameraRig, other: CameraRig) -> bool:
+def same_rig(first: CameraRig, second: CameraRig) -> bool:
     """True if all names and numbers of two rigs are equal."""
     return (
-        one.names == other.names
-        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        first.names == second.names
+        and np.array_equal(first.ego_from_bev, second.ego_from_bev)
         and all(
             (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
             and np.array_equal(a.intrinsics, b.intrinsics)
             and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(one.cameras, other.cameras, strict=True)
+            for a, b in zip(first.cameras, second.cameras, strict=True)
         )
     )
 

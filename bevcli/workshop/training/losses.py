@@ -147,10 +147,10 @@ def assigned_loss(
         truth: of B frames.
         objects: (..., B, Q) int64, the object of each query, -1 for none.
     """
-    assigned, chosen = objects >= 0, objects.clamp(min=0)
+    assigned, object_index = objects >= 0, objects.clamp(min=0)
     leading = objects.shape[:-2]
-    labels = truth.labels.expand(*leading, -1, -1).gather(-1, chosen)  # (..., B, Q)
-    index = chosen[..., None].expand(*chosen.shape, box_codes.shape[-1])
+    labels = truth.labels.expand(*leading, -1, -1).gather(-1, object_index)  # (..., B, Q)
+    index = object_index[..., None].expand(*object_index.shape, box_codes.shape[-1])
     codes = truth.codes.expand(*leading, -1, -1, -1).gather(-2, index)  # (..., B, Q, 10)
     qualities = qualities_of(box_codes, codes, config.quality_m) * assigned
     class_targets = torch.zeros_like(class_logits).scatter_(-1, labels[..., None], qualities[..., None])
@@ -171,8 +171,8 @@ def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: Detec
 
     predicted and truth: (..., 10).
     """
-    known = (assigned & truth.isfinite().all(-1))[..., None]
-    predicted, truth = predicted.where(known, 0), truth.where(known, 0)
+    is_compared = (assigned & truth.isfinite().all(-1))[..., None]
+    predicted, truth = predicted.where(is_compared, 0), truth.where(is_compared, 0)
     errors = F.l1_loss(predicted, truth, reduction="none")  # (..., 10)
     moving = truth[..., VELOCITY_START:].norm(dim=-1) >= MIN_MOVING_MPS
     weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)

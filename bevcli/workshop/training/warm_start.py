@@ -89,13 +89,13 @@ class NamedRows:
     starts: Starts
     remark: str = ""
 
-    def fit(self, rows: Tensor, own: Tensor) -> bool:
+    def fit(self, rows: Tensor, tensor: Tensor) -> bool:
         """The file names the rows of its tensor, and they have the size of the model's."""
-        return len(rows) == len(self.source) and rows.shape[1:] == own.shape[1:]
+        return len(rows) == len(self.source) and rows.shape[1:] == tensor.shape[1:]
 
-    def filled(self, rows: Tensor, own: Tensor) -> Tensor:
+    def filled(self, rows: Tensor, tensor: Tensor) -> Tensor:
         """The model's tensor, with the rows that the file has for its names."""
-        filled = own.clone()
+        filled = tensor.clone()
         for index, origins in enumerate(self.starts.values()):
             if origins:
                 filled[index] = rows[[self.source.index(name) for name in origins]].float().mean(0)
@@ -203,7 +203,7 @@ def _class_keys(model: Network) -> list[str]:
         f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
         for branch, modules in model.detection_head.class_branches.named_children()
     ]
-    return [f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias")]
+    return [f"{layer}.{parameter}" for layer in layers for parameter in ("weight", "bias")]
 
 
 def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes", "cameras"]) -> tuple[str, ...]:
