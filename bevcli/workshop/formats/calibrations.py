@@ -200,9 +200,9 @@ def _bev_frame(path: Path) -> Array | None:
 def _along_chain(cameras: Cameras) -> Cameras:
     """Poses of cameras without one by that of a neighbour in Kalibr's chain, in the file's order."""
     linked, pairs = dict(cameras), list(pairwise(cameras))
-    for known, other in [*pairs, *((name, earlier) for earlier, name in reversed(pairs))]:
-        is_next = (known, other) in pairs
-        link, pose = linked[other if is_next else known].from_previous, linked[known].pose
+    for neighbour, other in [*pairs, *((name, earlier) for earlier, name in reversed(pairs))]:
+        is_next = (neighbour, other) in pairs
+        link, pose = linked[other if is_next else neighbour].from_previous, linked[neighbour].pose
         if linked[other].pose is None and pose is not None and link is not None:
             linked[other] = replace(linked[other], pose=pose.moved(inverse(link) if is_next else link))
     return linked

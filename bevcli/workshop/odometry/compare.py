@@ -83,15 +83,15 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         reasons = [step.reason for step in measured.steps if step.reason]
         return (not_compared(f"{counted(used, 'steps')} could be measured" + (f": {reasons[0]}" if reasons else "")),)
     steps = steps_between(poses)
-    chosen = as_it_is = _candidate(shown, steps)
+    outcome = as_it_is = _candidate(shown, steps)
     if not _stands(shown, shown.steps):  # else any scale near 0 fits
         fitting = [candidate for candidate in (as_it_is, *_candidates(shown, rows, steps)) if candidate.share >= MOST]
         least = min((candidate.cost for candidate in fitting), default=np.inf)
         best = next((candidate for candidate in fitting if candidate.cost <= least + SAME), as_it_is)
-        chosen = best if as_it_is.cost - best.cost > MUCH else as_it_is
+        outcome = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
-    if chosen.share >= MOST:
-        return chosen.findings or _jumps(shown, chosen.steps, numbers)
+    if outcome.share >= MOST:
+        return outcome.findings or _jumps(shown, outcome.steps, numbers)
     return (_wrong(shown, steps),)
 
 

@@ -252,11 +252,11 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
 class VehicleReader:
     """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
-    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
-        self._bag, self._finder, self._stated = bag, finder, stated
+    def __init__(self, bag: Bag, finder: TopicFinder, stated_topics: StatedTopics) -> None:
+        self._bag, self._finder, self._stated = bag, finder, stated_topics
         static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
         self._tree, self._moving = TransformTree([*static, *changing]), {transform.child for transform in changing}
-        self.ego_frame = stated.ego_frame
+        self.ego_frame = stated_topics.ego_frame
 
     def rig(self) -> CameraRig:
         """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
