@@ -178,12 +178,12 @@ def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]
     for value in (*graph.input, *graph.output):
         value.doc_string = meanings[value.name]
     for node in graph.node:
-        node.name = f"{_part(node)}/{node.name}"
+        node.name = f"{_block_of(node)}/{node.name}"
         # Where a node came from in our source code: a third of the file, and of use to nobody who runs it.
         del node.metadata_props[:]
 
 
-def _part(node: object) -> str:
+def _block_of(node: object) -> str:
     """The part of the network that a node belongs to, such as "backbone.stages.0.0"; "" outside of all parts."""
     scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
     parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")

@@ -69,7 +69,7 @@ def read_rig(
         return _guessed_rig(drive, fov_deg, height, yaw_deg)
     if fov_deg is not None:
         raise InputError("`calibration` (`--calibration`) and `fov_deg` (`--fov`) exclude each other: pass one of them")
-    format_name, cameras = _stated(calibration)
+    format_name, cameras = _read_cameras(calibration)
     if extrinsics is not None:
         poses = _extrinsics(extrinsics)
         for name in poses.keys() - cameras.keys():
@@ -165,7 +165,7 @@ def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:
 # Kinds of files
 
 
-def _stated(path: Path) -> tuple[str, Cameras]:
+def _read_cameras(path: Path) -> tuple[str, Cameras]:
     """What a calibration is, in words, and its cameras."""
     for format_name, (recognises, read) in KINDS.items():
         if recognises(path):
@@ -187,7 +187,7 @@ def _extrinsics(path: Path) -> Cameras:
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
         )
-    return _stated(path)[1]
+    return _read_cameras(path)[1]
 
 
 def _bev_frame(path: Path) -> Array | None:

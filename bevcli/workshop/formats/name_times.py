@@ -87,7 +87,7 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
     """
     columns = list(_columns(where, names))
     if kind is not None:
-        return _stated(where, columns, names, kind)
+        return _in_unit(where, columns, names, kind)
     dates = _dates(names)
     if dates is not None and (_has_rate(dates.values) or not _steps(dates.values)):
         return _in_time_zone(dates, motion)
@@ -245,7 +245,7 @@ def _in_time_zone(dates: Reading, motion: EgoMotion | None) -> Reading:
     return fitting[0] if len(fitting) == 1 else dates
 
 
-def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
+def _in_unit(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
     """The reading of the kind that the user states, of the column that fits best."""
     made = [_dates(names)] if kind == "date" else [_read(column, kind) for column in columns]
     possible = [reading for reading in made if reading is not None]

@@ -119,7 +119,7 @@ class NewTables:
         """log: name of the drive."""
         self.rows: dict[str, list[Row]] = {name: [] for name in TABLES}
         self._log = log
-        self._known: set[str] = set()  # tokens of rows that several frames share
+        self._shared: set[str] = set()  # tokens of rows that several frames share
         self._rigs: dict[str, CameraRig] = {}  # by scene
         self._samples: dict[str, list[Row]] = {}  # by scene
         self._streams: dict[tuple[str, str], list[Row]] = {}  # sample_data by scene and channel
@@ -220,8 +220,8 @@ class NewTables:
 
     def _share(self, table: str, row_token: str, **columns: Any) -> str:
         """Add a row that several frames refer to once; returns its token."""
-        if row_token not in self._known:
-            self._known.add(row_token)
+        if row_token not in self._shared:
+            self._shared.add(row_token)
             self.rows[table].append({"token": row_token, **columns})
         return row_token
 

@@ -141,7 +141,7 @@ class NativeWriter(FolderWriter):
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
         super().__init__(folder, PARTS, force=force)
-        self._facts = facts or DriveFacts()
+        self._drive_facts = facts or DriveFacts()
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
         self._numbers: set[int] = set()
@@ -176,7 +176,7 @@ class NativeWriter(FolderWriter):
         if self._with_ego_motion:
             self._check_scenes()
             write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
-        write_calibration(self.folder / "calibration.json", self._rig, self._facts)
+        write_calibration(self.folder / "calibration.json", self._rig, self._drive_facts)
 
     def _read_back(self) -> None:
         FolderDrive(self.folder, InputOptions(ego_motion="optional"))

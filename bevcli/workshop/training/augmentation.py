@@ -372,7 +372,7 @@ def _inside(x: Tensor) -> Tensor:
 
 def _convolved(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
     """(M, 3, H, W) of which some are mixed with a random convolution that keeps their contrast."""
-    selected = _chosen(len(x), config.convolution, generator)
+    selected = _random_indices(len(x), config.convolution, generator)
     sizes = torch.randint(len(KERNEL_SIZES), (len(selected),), generator=generator)
     shares = torch.rand(len(selected), 1, 1, 1, generator=generator)
     y = x.clone()
@@ -414,12 +414,12 @@ def _recolored(x: Tensor, config: RandomisationConfig, image: ImageConfig, gener
 
 
 def _blurred(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
-    index = upload(_chosen(len(x), config.blur, generator), x.device)
+    index = upload(_random_indices(len(x), config.blur, generator), x.device)
     return x.index_copy(0, index, F.avg_pool2d(x[index], 3, 1, padding=1, count_include_pad=False))
 
 
 def _noisy(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:
-    selected = _chosen(len(x), config.noise, generator)
+    selected = _random_indices(len(x), config.noise, generator)
     low, high = NOISE_RANGE
     deviation = low + (high - low) * torch.rand(len(selected), 1, 1, 1, generator=generator)
     deviation = deviation / torch.tensor(image.std)[:, None, None]  # (K, 3, 1, 1)
@@ -429,6 +429,6 @@ def _noisy(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator
     return x.index_add(0, upload(selected, x.device), noise * upload(deviation, x.device))
 
 
-def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
+def _random_indices(count: int, share: float, generator: torch.Generator) -> Tensor:
     """Indices of images, each chosen with a probability."""
     return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]

@@ -290,12 +290,12 @@ def segmentation_loss(
     of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
     classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
 
-    logits = _chosen(outputs.mask_logits, queries)  # (M, B, G, Y·X)
+    logits = _of_queries(outputs.mask_logits, queries)  # (M, B, G, Y·X)
     logits = torch.cat([outputs.mask_logits[:, :, :first], logits], 2)
     masks = torch.cat([truth.stuff, truth.things], 1).expand_as(logits)
     losses = config.dice_weight * dice_loss(logits, masks)
     losses = (losses + config.pixel_weight * focal_loss(logits, masks).mean(-1)) * assigned
-    errors = (_chosen(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
+    errors = (_of_queries(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
     return {
         "map classes": config.class_weight * classes,
         "masks": losses[..., :first].sum() / stuff + losses[..., first:].sum() / things,
@@ -303,7 +303,7 @@ def segmentation_loss(
     }
 
 
-def _chosen(tensor: Tensor, queries: Tensor) -> Tensor:
+def _of_queries(tensor: Tensor, queries: Tensor) -> Tensor:
     """(M, B, Q, ...) -> (M, B, G, ...), those of the queries (B, G)."""
     index = queries[None, ..., None].expand(len(tensor), -1, -1, tensor.shape[-1])
     return tensor.gather(2, index)

@@ -244,7 +244,7 @@ class TopicFinder:
 
     def __init__(self, bag: Bag, stated: StatedTopics, calibrated: Iterable[str] | None = None) -> None:
         """calibrated: the cameras of a calibration file, which all must be found. None: the bag is the calibration."""
-        self._bag, self._stated = bag, stated
+        self._bag, self._topics = bag, stated
         self._kinds = {
             name: KINDS[topic.short_type]
             for name, topic in bag.topics.items()
@@ -280,7 +280,7 @@ class TopicFinder:
 
     def pose_topic(self) -> str | None:
         """The topic of the vehicle's poses: Odometry rather than a pose. None: they may be in the transforms."""
-        stated_topic = self._stated.ego_motion
+        stated_topic = self._topics.ego_motion
         if stated_topic:
             self._check_exists(stated_topic)
             return stated_topic if self._kinds[stated_topic] == "pose" else None
@@ -303,10 +303,10 @@ class TopicFinder:
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
         used = {name for _, name in rows}
         rows += [("not used", name) for name in self._bag.topics if name not in used]
-        lines = [(f"  {role}", name, *self._facts(name)) for role, name in rows]
+        lines = [(f"  {role}", name, *self._type_and_count(name)) for role, name in rows]
         return "topics:\n" + aligned(lines, left=range(4))
 
-    def _facts(self, name: str) -> tuple[str, str]:
+    def _type_and_count(self, name: str) -> tuple[str, str]:
         times = self._bag.times(name)
         rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
         return self._bag.topics[name].short_type, counted(len(times), "messages") + rate
@@ -321,9 +321,9 @@ class TopicFinder:
 
     def _found_images(self) -> dict[str, str]:
         """Camera -> image topic: the stated ones, and one for each other group of topics."""
-        if self._stated.cameras:
-            return {**self._stated.cameras, **self._stated.renamed}
-        taken = {_camera_path(name) for name in self._stated.renamed.values()}
+        if self._topics.cameras:
+            return {**self._topics.cameras, **self._topics.renamed}
+        taken = {_camera_path(name) for name in self._topics.renamed.values()}
         groups: dict[tuple[str, ...], list[str]] = {}
         for name in sorted([*self.of_kind("image"), *self.of_kind("video")]):
             if not NOT_A_CAMERA.search(name.lower()) and _camera_path(name) not in taken:
@@ -332,15 +332,15 @@ class TopicFinder:
             path: min(topics, key=lambda name: (self._preference(name), not RECTIFIED.search(name), name))
             for path, topics in groups.items()
         }
-        return {**self._stated.renamed, **dict(_named(best))}
+        return {**self._topics.renamed, **dict(_named(best))}
 
     def _preference(self, name: str) -> int:
         return list(KINDS).index(self._bag.topics[name].short_type)
 
     def _calibration_of(self, camera: str, images: str) -> str | None:
         """The calibration topic in the nearest namespace around the images, or else with the same frame."""
-        if camera in self._stated.calibration:
-            return self._stated.calibration[camera]
+        if camera in self._topics.calibration:
+            return self._topics.calibration[camera]
         infos = self.of_kind("calibration")
         around = [name for name in infos if images.startswith(name.rpartition("/")[0] + "/")]
         nested = [name for name in around if name.rpartition("/")[0]]

@@ -253,7 +253,7 @@ class VehicleReader:
     """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
     def __init__(self, bag: Bag, finder: TopicFinder, stated_topics: StatedTopics) -> None:
-        self._bag, self._finder, self._stated = bag, finder, stated_topics
+        self._bag, self._finder, self._topics = bag, finder, stated_topics
         static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
         self._tree, self._moving = TransformTree([*static, *changing]), {transform.child for transform in changing}
         self.ego_frame = stated_topics.ego_frame
@@ -261,7 +261,7 @@ class VehicleReader:
     def rig(self) -> CameraRig:
         """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
         cameras = self._finder.cameras
-        frames = {camera.camera: self._stated.frames.get(camera.camera) or self._frame_of(camera) for camera in cameras}
+        frames = {camera.camera: self._topics.frames.get(camera.camera) or self._frame_of(camera) for camera in cameras}
         self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
         placed = tuple(self._camera(camera, self._ego_from(frames[camera.camera], camera.camera)) for camera in cameras)
         return CameraRig(placed, default_ego_from_bev(), ego_from_bev_assumed=True)
@@ -361,8 +361,8 @@ class VehicleReader:
     def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
         path = list(self._tree.up(ego_frame))
-        if self._stated.world_frame in path:
-            path = path[: path.index(self._stated.world_frame) + 1]
+        if self._topics.world_frame in path:
+            path = path[: path.index(self._topics.world_frame) + 1]
         moving = [index for index, frame in enumerate(path[:-1]) if frame in self._moving]
         # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
         path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
