@@ -2,9 +2,8 @@
 
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -138,15 +137,15 @@ def project_debug(
         if options.sequence is not None:
             drive_options["calibration"] = input
         how = {"ground_truth": False, "allow_outside": source.allow_outside, **drive_options}
-        open_drive = partial(bevcli.open_sequence, options.sequence or input, **how)
+        path = options.sequence or input
         if options.motion:
             from bevcli.workshop.calibration.core_options import check_motion
 
-            check = check.with_findings(check_motion(open_drive))
+            check = check.with_findings(check_motion(_drive_of(path, **how)))
         if options.model is not None or options.against is not None:
             from bevcli.workshop.trust.gap_option import gap_of_rigs
 
-            gap = gap_of_rigs(check, model, options.against, open_drive)
+            gap = gap_of_rigs(check, model, options.against, _drive_of(path, **{**how, "ego_motion": "optional"}))
             check = replace(check, further={"rig_gap": gap.to_dict()})
     folder = options.out or Path("runs") / f"{check.name}-project-debug"
     written = check.write(folder) + (gap.write(folder) if gap else [])
@@ -161,3 +160,11 @@ def project_debug(
         say(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
+
+
+def _drive_of(path: Path, **options: Any) -> "bevcli.Drive | None":
+    """The drive in a path; None of a calibration alone, or of a drive with errors, which the check reports."""
+    try:
+        return bevcli.open_sequence(path, **options)
+    except InputError:
+        return None
