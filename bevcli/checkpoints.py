@@ -16,7 +16,6 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
-from bevcli.model.official_keys import from_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
 from bevcli.parsing.pth import Placeholder, read_pth
@@ -158,6 +157,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     _check_numbers(path, state)
     official = any(key.startswith(OFFICIAL) for key in state)
     if official:
+        from bevcli.model.official_keys import from_official
+
         state, parts = from_official(state)
         left_out += [parts] if parts else []
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)

@@ -14,7 +14,7 @@ from bevcli.frame import Drive, FrameStamp
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig import mistakes, rig_checks
+from bevcli.rig import rig_checks
 
 BEV_ASSUMED = Finding(
     "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
@@ -60,7 +60,13 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     poses, swapped, bev = list[Finding](), list[Finding](), list[Finding]()
     wrong = {finding.camera for finding in errors_of(found_before)}
     cameras = [camera for camera in rig.cameras if camera.name not in wrong]
-    if any(map(rig_checks.pose_defects, cameras)):
+    has_defects, has_bev = (
+        any(map(rig_checks.pose_defects, cameras)),
+        rig_checks.is_plausible_bev_frame(rig.ego_from_bev),
+    )
+    if has_defects or not has_bev:
+        from bevcli.rig import mistakes  # explains what a sound rig does not have
+    if has_defects:
         poses = mistakes.pose_errors(cameras)
         # Swapped names of cameras whose poses share another mistake, such as all inverted, are seen once it is undone.
         swapped = [
@@ -71,7 +77,7 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     badly_posed = {finding.camera for finding in poses}
     names = rig_checks.check_names([camera for camera in cameras if camera.name not in badly_posed])
     if None not in wrong:
-        if rig_checks.is_plausible_bev_frame(rig.ego_from_bev):
+        if has_bev:
             bev = rig_checks.bev_warnings(rig.ego_from_bev)
         else:
             bev = [mistakes.bev_frame_error(rig.ego_from_bev)]
